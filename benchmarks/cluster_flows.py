@@ -32,12 +32,13 @@ from sympflow.training.starts import Primed
 DENSITY = 0.02, 0.2
 NAME, T, OUTPUTS, LONGER = "lennard_jones", 10.0, 20, 10
 FOLDER = Path(__file__).parents[1] / "out" / "cluster_flows"
-LADDER = {
-    Primed(0.05, 4, 8, first="kick", force_gradient=(1, 3)): 6,
-    Primed(0.05, 5, 8, force_gradient=(1, 3)): 6,
-    Primed(0.036, 8, 8, force_gradient=(1, 6)): 4,
+LADDER: dict[Primed, dict[str, int]] = {
+    Primed(0.075, 3, 8, force_gradient=(1,)): {"restarts": 8, "label_times": 2},
+    Primed(0.05, 4, 8, first="kick", force_gradient=(1, 3)): {"restarts": 6},
+    Primed(0.05, 5, 8, force_gradient=(1, 3)): {"restarts": 6},
+    Primed(0.036, 8, 8, force_gradient=(1, 6)): {"restarts": 4},
 }
-"""The flows, and the starts of their searches. The fastest frequency is 26."""
+"""The flows, and options of their fits. The fastest frequency is 26."""
 QUICK = {**FIT, "steps": 150, "points": 16, "reference_states": 10, "frozen_weight": 1000.0, "runs": 32}
 
 
@@ -59,8 +60,8 @@ def main() -> None:
     system = cluster(options.bodies)
     assert system.domain is not None
     rest = float(system.hamiltonian(system.domain.at_rest))
-    for start, restarts in LADDER.items():
-        flows_of(system, options.flows, [start], {**QUICK, "restarts": restarts})
+    for start, fit in LADDER.items():
+        flows_of(system, options.flows, [start], {**QUICK, **fit})
     flows = [Runner.of_flow(flow, system) for flow in flows_of(system, options.flows, [])]
     race = Race(system, flows, schemes(system), T, OUTPUTS, rest, LONGER)
     if "steps" not in found:
