@@ -3,10 +3,10 @@
     python benchmarks/cluster_flows.py [--out docs/measured]
     python benchmarks/cluster_flows.py --json found.json --search   steps alone, to be timed when all is quiet
 
-The flows are fitted first by seeded recipes, some twenty minutes of one core, and kept in a folder. The race is that of
-`large_flows.py` on 147 bodies with energies of 0.02 to 0.2 above the minimum of V, each, up to T = 10, some forty
-periods of the fastest vibration: the largest energy error, relative to the energy above the minimum, the median over a
-few held-out states. Then all run in turn over ten times that, one thread, one state of which the end is kept.
+The flows are fitted first by seeded recipes, some twenty-five minutes of one core, and kept in a folder. The race is
+that of `large_flows.py` on 147 bodies with energies of 0.02 to 0.2 above the minimum of V, each, up to T = 10, some
+forty periods of the fastest vibration: the largest energy error, relative to the energy above the minimum, the median
+over twenty held-out states. Then all run in turn over ten times that, one thread, one state of which the end is kept.
 """
 
 # ruff: noqa: E402

@@ -130,7 +130,6 @@ def test_sheets_in_vector_registers(boundary, method):
         assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("definition", "shape"),
     [
@@ -162,6 +161,7 @@ def test_a_bond_that_is_not_there_may_be_infinite():
     assert compared(system, "verlet", y0) == LOOPS_AND_ARRAYS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [None, 0.3])
 def test_two_fields_on_a_sheet_in_vector_registers(damping):
     system = HamiltonianSystem.lattice(
