@@ -12,7 +12,7 @@ import bisect
 import heapq
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import sympy as sp
@@ -337,9 +337,37 @@ def _chains(items: Sequence[tuple[float, tuple[_Item, ...]]], n: int, add: float
 
 # polynomials in the form that is known soonest: nested, what is known late taken in last -------------------------
 
-_Powers = tuple[int, ...]
-_Term = tuple[_Powers, int]  # exponents, and which coefficient
+_Term = tuple[int, int]  # exponents, packed, and which coefficient
 _Sum = frozenset[_Term]
+
+
+class _Packing:
+    """Exponents of a product, each less than `most`, as digits of one number, with a bit to spare above each.
+
+    Numbers are in the order of the exponents, and a product over one that divides it is their difference.
+    """
+
+    def __init__(self, most: int, length: int) -> None:
+        self._shifts = [k * (most.bit_length() + 1) for k in reversed(range(length))]
+        self._mask = (1 << most.bit_length()) - 1
+        self._spare = sum((self._mask + 1) << shift for shift in self._shifts)
+
+    def packed(self, exponents: Iterable[int]) -> int:
+        return sum(n << shift for n, shift in zip(exponents, self._shifts, strict=True))
+
+    def exponents(self, powers: int) -> list[int]:
+        return [powers >> shift & self._mask for shift in self._shifts]
+
+    def divides(self, m: int, powers: int) -> bool:
+        return (powers | self._spare) - m & self._spare == self._spare  # no digit borrows
+
+    def divisors(self, powers: int) -> Iterator[int]:
+        """All but 1."""
+        choices = [
+            range(0, (n + 1) << shift, 1 << shift)
+            for n, shift in zip(self.exponents(powers), self._shifts, strict=True)
+        ]
+        return filter(None, map(sum, itertools.product(*choices)))
 
 
 class _Form(NamedTuple):
@@ -347,7 +375,7 @@ class _Form(NamedTuple):
 
     time: float
     operations: float
-    split: tuple[_Powers, _Sum] | None = None
+    split: tuple[int, _Sum] | None = None
 
 
 def nested(
@@ -370,15 +398,19 @@ def nested(
     """
     x = [symbol for symbol in known if symbol != first]
     coefficients: list[sp.Expr] = []
-    exponents: list[_Powers] = []
+    exponents: list[tuple[int, ...]] = []
     for term in terms:
         coefficient, product = term.as_independent(*x, as_Add=False)
         powers = product.as_powers_dict()
         coefficients.append(coefficient)
         exponents.append(tuple(int(powers.get(s, 0)) for s in x))
     times = [known[s] for s in x]
+    packing = _Packing(1 + max((n for powers in exponents for n in powers), default=0), len(x))
     few = len(exponents) <= FEW_TERMS
     found: dict[tuple[_Sum, bool], _Form] = {}
+    splits_of = cache(partial(_splits, packing=packing, few=few))
+    degree = cache(lambda powers: sum(packing.exponents(powers)))
+    product_known = cache(lambda powers, *others: _product_known(times, packing.exponents(powers), *others))
 
     def best(terms: _Sum, with_first: bool) -> _Form:
         key = terms, with_first
@@ -388,17 +420,17 @@ def nested(
         return found[key]
 
     def forms(terms: _Sum, with_first: bool) -> Iterator[_Form]:
-        if not any(any(powers) for powers, _ in terms):
+        if not any(powers for powers, _ in terms):
             yield _Form(known[first] if with_first and first is not None else ALWAYS, float(len(terms)))
         elif len(terms) == 1 and not with_first:
             ((powers, _),) = terms
-            yield _Form(_product_known(times, powers, ALWAYS), sum(powers))
+            yield _Form(product_known(powers, ALWAYS), degree(powers))
         else:
-            splits = _splits(terms, few)
-            for m, inside in splits if len(found) < MOST_FORMS else itertools.islice(splits, 1):
+            splits = splits_of(terms)
+            for m, inside in splits if len(found) < MOST_FORMS else splits[:1]:
                 inner, outside = best(_divided(inside, m), False), terms - inside
-                ready = max(inner.time, _product_known(times, m))
-                operations = inner.operations + (1.0 if sum(m) == 1 else 1.5)  # a product of x may be shared
+                ready = max(inner.time, product_known(m))
+                operations = inner.operations + (1.0 if degree(m) == 1 else 1.5)  # a product of x may be shared
                 if outside or with_first:
                     rest = best(outside, with_first)
                     ready = max(ready, rest.time)
@@ -406,35 +438,38 @@ def nested(
                 else:
                     yield _Form(ready + MULTIPLY, operations, (m, inside))
 
+    def monomial(powers: int) -> sp.Expr:
+        return sp.Mul(*[s**n for s, n in zip(x, packing.exponents(powers), strict=True)])
+
     def built(terms: _Sum, with_first: bool) -> sp.Expr:
         split = best(terms, with_first).split
         if split is None:
-            values = [_times(coefficients[i], _monomial(x, n)) for n, i in sorted(terms)]
+            values = [_times(coefficients[i], monomial(n)) for n, i in sorted(terms)]
             return sp.Add(*([first] if with_first else []), *values, evaluate=len(values) > 1)
         m, inside = split
-        product = _times(built(_divided(inside, m), False), _monomial(x, m))
+        product = _times(built(_divided(inside, m), False), monomial(m))
         if inside == terms and not with_first:
             return product
         return sp.Add(*sp.Add.make_args(built(terms - inside, with_first)), product, evaluate=False)
 
-    return built(frozenset(zip(exponents, range(len(exponents)), strict=True)), first is not None)
+    return built(frozenset(zip(map(packing.packed, exponents), range(len(exponents)), strict=True)), first is not None)
 
 
-def _splits(terms: _Sum, few: bool) -> Iterator[tuple[_Powers, _Sum]]:
+def _splits(terms: _Sum, packing: _Packing, few: bool) -> list[tuple[int, _Sum]]:
     """Each m with all terms that it divides and, of few terms, with those of them that another m does not divide."""
-    divisors = {m for powers, _ in terms for m in itertools.product(*(range(n + 1) for n in powers)) if any(m)}
-    divided = {m: frozenset(t for t in terms if all(map(int.__ge__, t[0], m))) for m in sorted(divisors)}
+    divisors = {m for powers, _ in terms for m in packing.divisors(powers)}
+    divided = {m: frozenset(t for t in terms if packing.divides(m, t[0])) for m in sorted(divisors)}
+    splits: list[tuple[int, _Sum]] = []
     for m, all_of_them in divided.items():
         sums = {all_of_them: None}  # a set in order
         if few:
             sums |= dict.fromkeys(all_of_them - others for others in divided.values())
-        for inside in sums:
-            if inside:
-                yield m, inside
+        splits += [(m, inside) for inside in sums if inside]
+    return splits
 
 
-def _divided(terms: _Sum, m: _Powers) -> _Sum:
-    return frozenset((tuple(map(int.__sub__, powers, m)), i) for powers, i in terms)
+def _divided(terms: _Sum, m: int) -> _Sum:
+    return frozenset((powers - m, i) for powers, i in terms)
 
 
 def _product_known(times: Sequence[float], powers: Sequence[int], *others: float) -> float:
@@ -444,10 +479,6 @@ def _product_known(times: Sequence[float], powers: Sequence[int], *others: float
         _, later, *factors = factors
         bisect.insort(factors, later + MULTIPLY)
     return factors[0]
-
-
-def _monomial(x: Sequence[sp.Symbol], powers: _Powers) -> sp.Expr:
-    return sp.Mul(*[s**n for s, n in zip(x, powers, strict=True)])
 
 
 def _times(f: sp.Expr, monomial: sp.Expr) -> sp.Expr:
