@@ -4,7 +4,7 @@
     python benchmarks/large_flows.py --only fput_beta,toda_chain  some of the lattices
     python benchmarks/large_flows.py --flows folder             with the flows of a folder beside those that ship
     python benchmarks/large_flows.py --json found.json --search   numbers of steps alone, to be timed when all is quiet
-    python benchmarks/large_flows.py --sites 10000              another size of chains and, squared, of sheets
+    python benchmarks/large_flows.py --sites 10000 --states 4   another size of chains and, squared, of sheets
 
 Lattices of 1024 sites at energy densities of 0.02 to 0.2 above rest. The flows are those that ship, fitted on 6 or
 4 × 4 sites by the recipes of `sympflow/training/shipped/rows.py`, whose Δt were chosen on other states. The error is
@@ -101,6 +101,7 @@ class Race:
     schemes: list[Runner]
     t_end: float = T
     outputs: int = OUTPUTS
+    states: int = STATES
     rest: float = 0.0
     longer: int = LONGER
     _fine: np.ndarray | None = None
@@ -131,7 +132,7 @@ class Race:
 
     def y0(self) -> np.ndarray:
         assert self.system.domain is not None
-        return self.system.domain.sample(STATES, SEED)
+        return self.system.domain.sample(self.states, SEED)
 
     def steps(self, target: float) -> dict[str, int]:
         """The fewest steps up to T of each that meets a target."""
@@ -246,6 +247,7 @@ def main() -> None:
     parser.add_argument("--only", help=f"some of {', '.join(LATTICES)}, with commas")
     parser.add_argument("--flows", type=Path, default=SHIPPED, help="folder of flows beside those that ship")
     parser.add_argument("--sites", type=int, default=1024)
+    parser.add_argument("--states", type=int, default=STATES)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--json", type=Path, help="file for what is found; what is in it is not measured again")
     parser.add_argument("--search", action="store_true", help="leave the times to a later call with this file")
@@ -256,7 +258,7 @@ def main() -> None:
     for name in names:
         mine = found.setdefault(name, {})
         if "rows" not in mine:
-            entrants = Race.of(lattice(name, options.sites), options.flows)
+            entrants = Race.of(lattice(name, options.sites), options.flows, states=options.states)
             if "steps" not in mine:
                 mine["steps"] = [entrants.steps(target) for target in TARGETS]
             if not options.search:

@@ -260,7 +260,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         from sympflow.integrators.diagnosis import note_singularities
 
         note_singularities(outcome, integrator, problem)
-    if system.leaps_over and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
+    if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
     if system.functions_given and readable(outcome.y):
         system.check_functions_along(outcome.y)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+import math
 from typing import Any
 
 import numpy as np
@@ -170,6 +170,8 @@ def newton_matrix(
 ) -> tuple[Array, Array]:
     """M = I − h (scale_i A_ij f'(Y_i)), (..., s·2d, s·2d), and f'(Y), (..., s, 2d, 2d)."""
     d, (s, n) = system.ndof, Y.shape[-2:]
+    if system.local is not None:
+        system.local.check_dense(float(math.prod(Y.shape)) * s * n, "the matrix of the equations of an implicit step")
     tau: Any = None
     if system.friction is not None:
         tau = A @ scale * h
@@ -233,7 +235,7 @@ def gauss_legendre(stages: int) -> Tableau:
     P = np.polynomial.legendre.legvander(nodes, stages - 1) * np.sqrt(2 * np.arange(stages) + 1)
     S = np.zeros((stages, stages))
     for k in range(1, stages):
-        S += (np.outer(P[:, k], P[:, k - 1]) - np.outer(P[:, k - 1], P[:, k])) / (2 * sqrt(4 * k * k - 1))
+        S += (np.outer(P[:, k], P[:, k - 1]) - np.outer(P[:, k - 1], P[:, k])) / (2 * math.sqrt(4 * k * k - 1))
     larger = 0.5 + np.abs(S)
     ratios = np.where(S >= 0, larger, 1 - larger)
     half = [0.5 * w for w in weights.tolist()]

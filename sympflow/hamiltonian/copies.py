@@ -121,7 +121,8 @@ def coupling_strength(system: HamiltonianSystem) -> float:
         y = system.domain.sample(STATES, 0)
     else:
         raise ValueError(
-            f"`system` {system.name!r} has neither a `y0` nor a domain to take the coupling from: give `omega`."
+            f"`system` {system.name!r} has neither a `y0` of its own nor a domain to take the coupling from: give "
+            "`omega`, or the system one of these."
         )
     t0, t1 = system.t_span
     times = [t0] if system.autonomous else probe_times(t0, t1 if system.period is None else t0 + system.period)

@@ -44,8 +44,8 @@ class Definition:
         `sympflow.hamiltonian.local`.
     instead : str
         The methods that are advised where H is not separable, in words.
-    leaps_over : int
-        Places where V is infinite and which a step may leap over, such as pairs of bodies; 0 for none.
+    leaps : bool
+        True if V is infinite in places that a step may leap over, such as of bodies that meet: then there is `leapt`.
     """
 
     ndof: int
@@ -60,7 +60,7 @@ class Definition:
     shortest_piece: float = inf
     has_third_derivative: bool = False
     loops: str = ""
-    leaps_over: int = 0
+    leaps: bool = False
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
@@ -85,12 +85,22 @@ class Definition:
         """∇²V(q)·v: (..., d), each, to (..., d)."""
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
 
-    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
-        """Remark on a state (2d,) of a run that gained energy from nothing since its start (2d,): a clause, or nothing.
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
+        """Whether runs from states (n, 2d) to others leapt over a place where V is infinite, as far as is seen: (n,).
 
-        Only of a system with places where V is infinite, which a step may leap over: see `leaps_over`.
+        Parameters
+        ----------
+        starts, ends : ndarray of shape (n, 2d)
+        n_steps : int
+            Steps of a run, beside which the answer should take little time.
+        conserves : bool
+            True if the exact solution keeps H.
         """
-        return ""
+        raise NotImplementedError(f"{type(self).__name__} must define leapt().")
+
+    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
+        """Remark on a state (2d,) of a run from a start (2d,) that leapt over such a place: a clause."""
+        raise NotImplementedError(f"{type(self).__name__} must define leap().")
 
     def remark(self, q: np.ndarray) -> str:
         """Remark on the last positions (d,) of a run that could not go on: a clause, or nothing."""

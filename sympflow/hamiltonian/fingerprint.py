@@ -37,6 +37,8 @@ def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
     Of a driven system each of the 8 has its own time, at which H at the ninth is taken too.
     """
     states = _fixed_states(system.ndof)
+    if system.local is not None:
+        states[:, : system.ndof] *= system.local.apart
     ninth = np.broadcast_to(states[0], states[1:].shape)
     H = _energies(system, states[1:]) - _energies(system, ninth)
     friction = () if system.damping is None else system.damping.ravel().tolist()

@@ -464,12 +464,16 @@ class Hamiltonian:
         return self._definition.instead
 
     @property
-    def leaps_over(self) -> int:
-        """Places where V is infinite and which a step may leap over, such as pairs of bodies; 0 for none."""
-        return self._definition.leaps_over
+    def leaps(self) -> bool:
+        """True if V is infinite in places that a step may leap over, such as of bodies that meet."""
+        return self._definition.leaps
+
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int) -> np.ndarray:
+        """Whether runs from states (n, 2d) to others leapt over such a place, as far as is seen: (n,)."""
+        return self._definition.leapt(starts, ends, n_steps, self.conservative and self.autonomous)
 
     def leap(self, y: np.ndarray, start: np.ndarray) -> str:
-        """A clause on a state (2d,) of a run that gained energy from nothing since its start (2d,); or nothing."""
+        """A clause on a state (2d,) of a run from a start (2d,) that did."""
         return self._definition.leap(y, start)
 
     def remark(self, q: np.ndarray) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import product
 from typing import TYPE_CHECKING, Any, Self
@@ -17,6 +17,7 @@ from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, concatenate, is_tensor, library
 from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+from sympflow.hamiltonian.poles import Poles
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.normal_modes import SpectralPart
@@ -189,6 +190,29 @@ class LatticeHamiltonian(LocalHamiltonian):
                 kept.append(x)
         return kept
 
+    @cached_property
+    def leaps(self) -> bool:  # type: ignore[override]
+        return Poles(self).there_are
+
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
+        return Poles(self).passed(starts[:, : self.ndof], ends[:, : self.ndof])
+
+    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
+        poles, q0 = Poles(self), start[: self.ndof]
+        if beyond := poles.where(q0, q0):
+            return f"V of {beyond} is no number: take another `y0`"
+        passed = poles.where(q0, y[: self.ndof])
+        return (
+            f"{passed} passed a place where V is infinite between two steps, which saw nothing of it: take shorter ones"
+        )
+
+    def remark(self, q: np.ndarray) -> str:
+        if not self.leaps:
+            return ""
+        return (
+            f"{Poles(self).nearest(q)} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
+        )
+
     def written_out(self) -> sp.Expr:
         """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""
         index, n = np.arange(self.sites).reshape(self.shape), self.sites
@@ -360,14 +384,36 @@ class LatticeHamiltonian(LocalHamiltonian):
     # array functions, positions (..., d) ------------------------------------------------------------------------------
 
     def potential(self, q: Array) -> Array:
-        x = self._on_sites(q)
-        V: Any = 0.0
+        values = [f for _, _, (f,) in self.of_terms("", lambda f, _: [f], q)]
+        return sum((_total(f, self.shape) for f in values), start=0.0)
+
+    def of_terms(
+        self, key: str, expressions: Callable[[sp.Expr, tuple[sp.Symbol, ...]], list[sp.Expr]], q: Array
+    ) -> list[tuple[int | None, int, list[Array]]]:
+        """The values of expressions of U and of each bond along each axis, at all sites and bonds.
+
+        Parameters
+        ----------
+        key : str
+            A name, under which generated functions are kept.
+        expressions : callable
+            Of U in the fields, and of V in the differences along a bond.
+        q : array or Tensor of shape (..., d)
+
+        Returns
+        -------
+        list of axis, distance, values (..., *sites or bonds)
+            None and 0 for the sites. Bonds stand in the order of their first ends; of fixed ends those to the wall
+            before come first.
+        """
+        x, found = self._on_sites(q), list[tuple[int | None, int, list[Array]]]()
         if self.U != 0:
-            V = _total(self._site_values("onsite", [self.U], self.x, x)[0], self.shape)
+            found.append((None, 0, self._site_values(f"onsite {key}", expressions(self.U, self.x), self.x, x)))
         for axis, k in self._kinds():
-            values = self._bond_values(axis, k, "", [self.bonds[k]], self.r, self._differences(x, axis, k))[0]
-            V = V + _total(self._own_bonds(values, axis, k), self.shape)
-        return V
+            of_bond = expressions(self.bonds[k], self.r)
+            values = self._bond_values(axis, k, key, of_bond, self.r, self._differences(x, axis, k))
+            found.append((axis, k, [self._own_bonds(value, axis, k) for value in values]))
+        return found
 
     def potential_gradient(self, q: Array) -> Array:
         def slopes(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:

@@ -144,6 +144,11 @@ class LocalHamiltonian(Definition, ABC):
         return self.ndof
 
     @property
+    def apart(self) -> float:
+        """A distance at which the terms of the system differ from others, if positions drawn about 0 do not tell."""
+        return 1.0
+
+    @property
     def numbers(self) -> int:
         """Numbers that a force by array operations handles."""
         return 2 * self.ndof
@@ -174,14 +179,23 @@ class LocalHamiltonian(Definition, ABC):
             If that has more than 5e7 entries: `hessian_vector` needs none of them.
         """
         d = self.ndof
-        if np.prod(q.shape, dtype=float) * d > MOST_DENSE:
-            raise ValueError(
-                f"`system` has {d:,} degrees of freedom, of which a dense ∇²V has {float(d) * d:.3g} entries for each "
-                "state: take a method with force gradients or none, which need ∇²V·v alone, or a piece of the system."
-            )
+        self.check_dense(np.prod(q.shape, dtype=float) * d, "∇²V")
         xp = library(q)
         basis = xp.eye(d, dtype=q.dtype, device=q.device) if is_tensor(q) else np.eye(d, dtype=q.dtype)
         return self.hessian_vector(q[..., None, :], basis + 0 * q[..., None, :], *t)
+
+    def check_dense(self, entries: float, what: str) -> None:
+        """Refuse a matrix with more than 5e7 entries: ∇²V, or that of the equations of an implicit step.
+
+        Raises
+        ------
+        ValueError
+        """
+        if entries > MOST_DENSE:
+            raise ValueError(
+                f"`system` has {self.ndof:,} degrees of freedom, of which {what} is dense, with {entries:.3g} entries: "
+                "take a splitting method such as 'srkn6b', which needs no matrix, or a piece of the system."
+            )
 
     def energy_density(self, y: Array, *t: Array) -> Array:
         """H at each site or body, which add up to H: (..., 2d) to (..., n)."""

@@ -204,6 +204,29 @@ class ExactParts:
                 Y = Y + each_mode(m.gradient) * self.force_gradient(m.part, X, m.filters, *time)
         return X, Y
 
+    def pushed(
+        self, maps: Sequence[Map], x: tuple[Array, Array], w: tuple[Array, Array], t: Any = 0.0, h: Any = 0.0
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]] | None:
+        """The modes (..., d) after the maps, and vectors (..., k, d) moved by the derivative of these.
+
+        None where that takes more than second derivatives of potentials: of force gradients, filters and other parts.
+        """
+        (X, Y), (U, P), linear, d = x, w, self.linear, self.ndof
+        if linear is None:
+            return None
+        for m in maps:
+            if m.part == LINEAR:
+                (X, Y), (U, P) = self.linear_flow(X, Y, m.length), self.linear_flow(U, P, m.length[..., None, :])
+                continue
+            of, plain = self.rest[m.part - 1], isinstance(m.gradient, float) and m.gradient == 0.0
+            if of.turns or not of.of_positions or m.filters is not None or not plain:
+                return None
+            time = (stage_time(t, m.at, h),) if self.timed(m.part) else ()
+            y, length = self._state(m.part, X, Y, None), each_mode(m.length)
+            Y = Y - length * linear.slopes(of.gradient(y, *time)[..., :d])
+            P = P - each_mode(length) * linear.slopes(of.hessian_vector(y[..., None, :], linear.positions(U), *time))
+        return (X, Y), (U, P)
+
     def _turned(self, m: Map, X: Array, Y: Array) -> tuple[Array, Array]:
         """The flow of a part that brings its own: its change alone is transformed, so that transforms add no drift."""
         y = self.from_modes(X, Y)

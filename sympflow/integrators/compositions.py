@@ -106,6 +106,10 @@ class Composition(ABC):
         """The step and its Jacobian (..., 2d, 2d); None where `step` itself is to be differentiated."""
         return None
 
+    def pushed(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
+        """The step and the vectors W (..., 2d, k) moved by its derivative; None likewise."""
+        return None
+
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
     ) -> tuple[Array, np.ndarray]:
@@ -217,30 +221,41 @@ class KineticPotential(Composition):
         return concatenate([q, p])
 
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
-        if self.scheme.level:  # would need third derivatives of V: differentiate the step itself
-            return None
+        y = to_numpy(y)
+        n = y.shape[-1]
+        return self.pushed(y, h, np.broadcast_to(np.eye(n, dtype=y.dtype), (*y.shape, n)).copy(), t)
+
+    def pushed(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         system, d = self.system, self.system.ndof
+        local = system.local is not None
+        if self.scheme.level > (FORCE_GRADIENT if local else 0):  # needs higher derivatives of V
+            return None
         y = to_numpy(y)
         times = self._times(t, np.broadcast_to(h, y.shape[:-1]))
         q, p, h = y[..., :d], y[..., d:], np.asarray(h, dtype=y.dtype)[..., None]
         if not system.has_hessian_vector:
             system.potential_hessian(q, t)  # which says so, before anything large is made
-        A = np.broadcast_to(np.eye(2 * d, dtype=y.dtype), (*y.shape, 2 * d)).copy()
-        for (kind, c, *_), at in zip(self.scheme.substeps, times, strict=True):
-            if kind == "drift":
+        U, P = W[..., :d, :], W[..., d:, :]
+        for substep, at in zip(self.scheme.substeps, times, strict=True):
+            c = substep.one
+            if substep.kind == "drift":
                 if system.friction is not None:
-                    mean, end = system.friction.drift(A[..., d:, :].swapaxes(-1, -2), c * h[..., None])
-                    A[..., :d, :] += system.kinetic_hessian(p) @ mean.swapaxes(-1, -2)
-                    A[..., d:, :] = end.swapaxes(-1, -2)
+                    mean, end = system.friction.drift(P.swapaxes(-1, -2), c * h[..., None])
+                    U = U + _velocities(system, p, mean.swapaxes(-1, -2))
+                    P = end.swapaxes(-1, -2)
                 elif system.kinetic_timed:
-                    A[..., :d, :] += system.drift_jacobian(p, at, c * h[..., 0]) @ A[..., d:, :]
+                    U = U + system.drift_jacobian(p, at, c * h[..., 0]) @ P
                 else:
-                    A[..., :d, :] += c * h[..., None] * (system.kinetic_hessian(p) @ A[..., d:, :])
+                    U = U + c * h[..., None] * _velocities(system, p, P)
                 q, p = _drift(system, q, p, c * h, at)
             else:
-                A[..., d:, :] -= c * h[..., None] * (system.potential_hessian(q, at) @ A[..., :d, :])
-                p = p + c * h * system.force(q, at)
-        return np.concatenate([q, p], axis=-1), A
+                change = (c * h)[..., None] * _bends(system, q, U, at)
+                if substep.three:
+                    G = (substep.three * h**3)[..., None] * _bends_of_gradient(system, q, U, at)
+                    change = change + G
+                P = P - change
+                p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
+        return np.concatenate([q, p], axis=-1), np.concatenate([U, P], axis=-2)
 
     def kernel(self, compensated: bool) -> Kernel:
         loops = _splitting_loops()(self.system)
@@ -290,6 +305,28 @@ def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials:
     return change
 
 
+def _velocities(system: HamiltonianSystem, p: Array, P: np.ndarray) -> np.ndarray:
+    """∇²T(p)·P of vectors (..., d, k)."""
+    if not system.quadratic_kinetic:
+        return system.kinetic_hessian(p) @ P
+    return system.velocity(P.swapaxes(-1, -2)).swapaxes(-1, -2)
+
+
+def _bends(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
+    """∇²V(q)·U of vectors (..., d, k), of a system by one piece without the matrix."""
+    if system.local is None:
+        return system.potential_hessian(q, t) @ U
+    return system.hessian_vector(q[..., None, :], U.swapaxes(-1, -2), t).swapaxes(-1, -2)
+
+
+def _bends_of_gradient(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
+    """The derivatives along vectors (..., d, k) of the force gradient's ∇²V·M⁻¹F, F = −∇V; of a system by one piece."""
+    x, along = q[..., None, :], U.swapaxes(-1, -2)
+    v = system.velocity(system.force(q, t))[..., None, :]
+    turned = system.hessian_vector(x, system.velocity(system.hessian_vector(x, along, t)), t)
+    return (system.third_derivative(x, v + 0 * along, along, t) - turned).swapaxes(-1, -2)
+
+
 # exact flows of parts ------------------------------------------------------------------------------
 
 
@@ -322,6 +359,19 @@ class ExactMaps(Composition):
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         parts = self.parts
         return parts.from_modes(*parts.apply(self.maps(h), *parts.to_modes(y), t, h))
+
+    def pushed(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
+        parts, linear, d = self.parts, self.parts.linear, self.parts.ndof
+        if linear is None:
+            return None
+        y, w = to_numpy(y), W.swapaxes(-1, -2)
+        vectors = linear.coordinates(w[..., :d]), linear.slopes(w[..., d:])
+        found = parts.pushed(self.maps(np.asarray(h)), parts.to_modes(y), vectors, t, h)
+        if found is None:
+            return None
+        U, P = found[1]
+        moved = np.concatenate([linear.positions(U), linear.momenta(P)], axis=-1)
+        return parts.from_modes(*found[0]), moved.swapaxes(-1, -2)
 
     def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         parts = self.parts

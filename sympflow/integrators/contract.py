@@ -32,7 +32,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -305,6 +305,27 @@ class Integrator:
         """The Jacobian (..., n, n) of a step from y in the phase space where steps are made; n = 2d but if extended."""
         return self.tangent(system, t, y, h)[1]
 
+    def pushed(self, system: HamiltonianSystem, t: Any, y: Array, h: Array, W: np.ndarray) -> np.ndarray:
+        """Vectors W (..., 2d, k) moved by the derivative of the step from y (..., 2d)."""
+        return self.tangent(system, t, y, h)[1] @ W
+
+    def pushing(
+        self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]]:
+        """The steps of the run, one by one: times and lengths (...), and what moves vectors W (..., 2d, k).
+
+        Of a system by one piece, which may be large, as products with second derivatives, else as Jacobians.
+        """
+        if system.local is None:
+            for times, lengths, jacobians in self.executed(system, t_span, y0):
+                yield from ((t, h, A.__matmul__) for t, h, A in zip(times, lengths, jacobians, strict=True))
+            return
+        for times, states, lengths in self.steps(system, t_span, y0):
+            for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
+                at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
+                start = float(at.flat[0]) if system.autonomous else at
+                yield at, length, partial(self.pushed, system, start, y, length.astype(y.dtype))
+
     def executed(
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -351,17 +372,21 @@ def in_blocks(steps: Steps) -> Steps:
             yield times[i : i + n], states[i : i + n], lengths[i : i + n]
 
 
-def forward_tangent(step: Callable[[Any, Any], Any], y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-    """step(y, h) and its Jacobian in y, (..., n) and (..., n, n), by forward-mode differentiation of tensors."""
+def forward_tangent(
+    step: Callable[[Any, Any], Any], y: Array, h: Array, W: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """step(y, h) and its Jacobian in y, (..., n) and (..., n, n), by forward-mode differentiation of tensors.
+
+    Of given vectors W (..., n, k) their images, the product with the Jacobian.
+    """
     import torch
 
     x = torch.as_tensor(to_numpy(y))
     lengths = torch.as_tensor(h, dtype=x.dtype)
+    directions = torch.eye(x.shape[-1], dtype=x.dtype) if W is None else torch.as_tensor(W, dtype=x.dtype)
     columns = []
-    for i in range(x.shape[-1]):
-        direction = torch.zeros_like(x)
-        direction[..., i] = 1
-        y_next, column = jvp(lambda z: step(z, lengths), x, direction)
+    for direction in directions.unbind(-1):
+        y_next, column = jvp(lambda z: step(z, lengths), x, direction.expand_as(x))
         columns.append(column)
     return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
 

@@ -323,6 +323,12 @@ class Splitting(OwnStepper):
         known = None if self.keeps else self.composed(system).tangent(y, h, t)
         return super().tangent(system, t, y, h) if known is None else known
 
+    def pushed(self, system: HamiltonianSystem, t: Any, y: Array, h: Array, W: np.ndarray) -> np.ndarray:
+        if self.keeps or self.on_clock(system) is not None:
+            return super().pushed(system, t, y, h, W)
+        known = self.composed(system).pushed(y, h, W, t)
+        return known[1] if known else forward_tangent(lambda x, s: self.step(system, t, x, s), y, h, W)[1]
+
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
         scheme = self.kicks_and_drifts
         if scheme is None or self.compensated:
@@ -380,7 +386,7 @@ class Splitting(OwnStepper):
             yield from clock.steps(t_span, y0)
             return
         composition = self.composed(system)
-        for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
+        for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
             yield times, composition.project(states), lengths
 
 

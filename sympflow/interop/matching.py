@@ -23,6 +23,7 @@ OF_A_FLOW = (1e-3, 0.1)  # of the largest velocity, at best and at worst: a flow
 NEAR = (0.02, 0.1, 0.3, 0.6, 1.0)  # distances from the start, in sizes of q and of p
 N_WITHIN = 6  # states of the domain
 MOST_ROWS = 256  # of a batch, whose velocities are compared
+SHOWN = 4  # numbers of a state, in messages
 FIRST_LOOK, LONGEST_GAP = 13, 64  # steps of a run before it is compared again
 
 MOST_FUNCTIONS = 64  # right-hand sides that a system remembers
@@ -258,9 +259,15 @@ class Comparison:
 
     def _refuse(self, t: float, y: np.ndarray, slope: np.ndarray, velocity: np.ndarray) -> None:
         what = "its flow moves it" if self.system is None else f"{self.system.name!r} moves it"
+        apart = np.abs(slope - velocity).ravel()
+        i = int(np.argmax(np.where(np.isnan(apart), np.inf, apart)))
+        where = ""
+        if i >= SHOWN:
+            where = f" The entry {i} differs most: {slope.ravel()[i]:.6g} and {velocity.ravel()[i]:.6g}."
         raise ValueError(
             f"`{self.argument}` is not the system that method {self.integrator.name!r} solves: at t = {t:.6g} it moves "
-            f"the state {_short(y)} with velocity {_short(slope)}, and {what} with {_short(velocity)}. {self.remedy}"
+            f"the state {_short(y)} with velocity {_short(slope)}, and {what} with {_short(velocity)}.{where} "
+            f"{self.remedy}"
         )
 
     def _refuse_time(self, t0: float, t: float, y: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
@@ -350,5 +357,5 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
 
 
 def _short(v: np.ndarray) -> str:
-    shown = ", ".join(f"{x:.6g}" for x in v.ravel()[:4])
-    return f"({shown}{', …' if v.size > 4 else ''})"
+    shown = ", ".join(f"{x:.6g}" for x in v.ravel()[:SHOWN])
+    return f"({shown}{', …' if v.size > SHOWN else ''})"

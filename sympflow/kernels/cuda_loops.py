@@ -62,7 +62,9 @@ def cuda_kernel(system: HamiltonianSystem, scheme: Scheme, compensated: bool) ->
         If the system has no such form, or there is no GPU, with the reason.
     """
     reason = None
-    if system.symbols is None:
+    if system.local is not None:
+        reason = f"is a {system.local.noun}, whose loops run on processors alone"
+    elif system.symbols is None:
         reason = "is not symbolic: define it with HamiltonianSystem.from_sympy"
     elif not system.separable:
         reason = "is not separable"

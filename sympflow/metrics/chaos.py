@@ -10,7 +10,6 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -369,7 +368,7 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, bel
         run.spread[rows, column] = _spread(W[rows], kind)
         run.elapsed[rows, column] = elapsed[rows]
 
-    for t, h, A in _each_step(orbits):
+    for t, h, move in orbits.integrator.pushing(orbits.system, orbits.t_span, orbits.rows):
         ends = t + h - t0
         if n:
             due = running & (position < n)
@@ -379,7 +378,7 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, bel
                 position[due] += 1
                 due &= position < n
         with np.errstate(all="ignore"):
-            moved = A @ W
+            moved = move(W)
             finite = np.isfinite(np.square(moved).sum(axis=1)).all(axis=-1)
         run.status[running & ~finite] = -1
         running &= finite
@@ -404,12 +403,6 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, bel
         late = reached[position[reached] <= column]
         note(late, np.full(len(late), column))
     return run
-
-
-def _each_step(orbits: Orbits) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Steps one by one: times and lengths (N,), Jacobians (N, 2d, 2d)."""
-    for t, h, A in orbits.integrator.executed(orbits.system, orbits.t_span, orbits.rows):
-        yield from zip(t, h, A, strict=True)
 
 
 def _spread(W: np.ndarray, kind: int) -> np.ndarray:

@@ -246,3 +246,42 @@ def test_what_is_better_a_lattice_is_told_so():
 def test_a_time_is_answered_with_what_can_be_done(make):
     with pytest.raises(TypeError, match=r"^`time` is for systems that are written out.*from_sympy"):
         make()
+
+
+class TestPoles:
+    """Of bonds and sites at which V is infinite, over which a step leaps without a trace."""
+
+    LENNARD_JONES = "(1 + r)**-12 - 2*(1 + r)**-6"
+
+    @pytest.mark.parametrize(
+        ("definition", "dt", "where"),
+        [
+            ({"bond": LENNARD_JONES, "boundary": "free"}, 0.05, "the bond of 2 and 3 and 2 more passed"),
+            ({"bond": "-log(1 - r**2/c**2)/2", "params": {"c": 1.2}}, 0.2, "the bond of 3 and 4 passed"),
+            ({"onsite": "-1/(q - 1)**2/8"}, 0.15, "the site 4 passed"),
+            ({"bond": "log(3 + r)"}, 0.1, "V of the bond of 4 and 5 is no number"),
+        ],
+    )
+    def test_a_run_that_passed_one_is_told_of(self, definition, dt, where):
+        system = HamiltonianSystem.lattice(**definition, shape=6)
+        y0 = np.zeros((2, 12))
+        y0[1, 10] = 5.0
+        if "log(3" in definition.get("bond", ""):
+            y0[1, 4] = 4.0
+        with pytest.warns(RuntimeWarning, match=re.escape(where)) as found:
+            sol = sf.solve(system, "verlet", (0, 1), y0, dt=dt)
+        assert sol.success
+        assert "The energy of trajectory 1, the first of 1, went from" in str(found[0].message)
+        sf.solve(system, "verlet", (0, 1), y0[0], dt=dt)  # and the one that did not is not
+
+    def test_a_start_at_one_is_named(self):
+        system = HamiltonianSystem.lattice(bond="1/(1 + r)", shape=(4, 4), boundary=("fixed", "periodic"))
+        y0 = np.zeros(32)
+        y0[5] = 1.0
+        sol = sf.solve(system, "verlet", (0, 1), y0, dt=0.01)
+        assert sol.status == -1
+        assert "the bond of (1, 1) and (1, 2) is nearest to a place where V is infinite" in sol.message
+
+    @pytest.mark.parametrize("bond", ["r**2/2 + r**4/4", "1/(1 + r**2)", "sqrt(1 + r**2)", "exp(-r) + r"])
+    def test_where_there_are_none_nothing_is_looked_at(self, bond):
+        assert not HamiltonianSystem.lattice(bond=bond, shape=6).leaps

@@ -7,6 +7,8 @@ from scipy.interpolate import CubicSpline
 
 import sympflow
 from sympflow import HamiltonianSystem
+from sympflow.integrators.contract import forward_tangent
+from sympflow.integrators.registry import build
 from sympflow.systems import henon_heiles, henon_heiles_escape
 
 CHAOTIC, REGULAR = [0.0, -0.25, 0.42081, 0.0], [0.0, 0.55, 0.2417, 0.0]  # E = 1/8, of Skokos (2001), figure 1
@@ -184,3 +186,64 @@ def test_bad_arguments(wells, arguments, message):
 def test_more_vectors_than_dimensions(wells):
     with pytest.raises(ValueError, match="`k` must be from 2 to 4"):
         sympflow.gali(wells, "verlet", k=5)
+
+
+LATTICES = {
+    "chain": {"bond": "r**2/2 + r**3/9 + r**4/4", "onsite": "1 - cos(q)", "shape": 7, "boundary": "free"},
+    "masses": {"bond": "r**2/2 + r**4/4", "kinetic": "p**2/(2*m)", "params": {"m": 1 + np.arange(6) / 5}, "shape": 6},
+    "two fields": {
+        "fields": ("u", "v"),
+        "onsite": "u**2*v**2/2 + u**4/4",
+        "bond": "r_u**2/2 + r_v**2",
+        "kinetic": "p_u**2/2 + p_v**2/6",
+        "shape": (2, 3),
+        "boundary": "fixed",
+    },
+    "relativistic": {"bond": "r**2/2 + r**4/4", "kinetic": "sqrt(1 + p**2)", "shape": 5},
+    "damped": {"bond": "r**2/2 + r**4/4", "damping": 0.3, "shape": 5},
+}
+
+
+def in_pairs():
+    return HamiltonianSystem.pairs("-1/r", masses=[1.0, 2.0, 0.5], dim=2, softening=0.3)
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *(("chain", m) for m in ("verlet", "chin4a", "linear_srkn6b", "linear_omelyan4", "mollified_impulse", "rk4")),
+        *(("masses", m) for m in ("srkn6b", "chin4a")),
+        *(("two fields", m) for m in ("verlet", "omelyan4", "linear_srkn6b")),
+        *(("relativistic", m) for m in ("leapfrog", "gauss_legendre4")),
+        *(("damped", m) for m in ("verlet", "chin4a")),
+        *(("pairs", m) for m in ("verlet", "chin4a")),
+    ],
+)
+def test_vectors_of_large_systems_are_moved_by_the_derivative_of_the_step(name, method):
+    system = in_pairs() if name == "pairs" else HamiltonianSystem.lattice(**LATTICES[name])
+    integrator = build(method, {"dt": 0.1})
+    rng = np.random.default_rng(3)
+    y, W = rng.normal(size=(2, 2 * system.ndof)), rng.normal(size=(2, 2 * system.ndof, 3))
+    h = np.array([0.1, -0.2])
+    moved = integrator.pushed(system, 0.0, y, h, W)
+    expected = forward_tangent(lambda x, s: integrator.step(system, 0.0, x, s), y, h)[1] @ W
+    np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["srkn6b", "chin4a", "linear_srkn6b"])
+def test_the_exponent_of_a_lattice_is_that_of_its_coordinates(method):
+    lattice = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=8)
+    written = HamiltonianSystem.from_sympy(str(lattice.local.written_out()))
+    y0 = np.random.default_rng(0).normal(size=16) / 2
+    found = [sympflow.lyapunov(system, method, (0, 10), y0, dt=0.05) for system in (lattice, written)]
+    assert found[0].value == pytest.approx(found[1].value, abs=1e-12)
+
+
+def test_a_large_lattice_has_vectors_without_matrices():
+    lattice = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=40_000)
+    found = sympflow.sali(lattice, "srkn6b", (0, 0.5), np.random.default_rng(0).normal(size=80_000) / 3, dt=0.05)
+    assert found.status == 0
+    with pytest.raises(
+        ValueError, match=r"^`system` has 40,000 degrees of freedom.*equations of an implicit step.*srkn6b"
+    ):
+        sympflow.solve(lattice, "gauss_legendre4", (0, 0.1), np.zeros(80_000), dt=0.1)

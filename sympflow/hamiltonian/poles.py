@@ -1,0 +1,106 @@
+"""Where the potential of a lattice is infinite, over which a step may leap without a trace."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import sympy as sp
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.lattice import LatticeHamiltonian
+
+__all__ = ["Poles"]
+
+
+class Poles:
+    """The places at which a term of a lattice divides by 0, or takes the logarithm of 0.
+
+    No solution passes them. So what a term divides by has the same sign all along, at each site and bond, and what it
+    takes a logarithm of is positive.
+
+    Parameters
+    ----------
+    lattice : LatticeHamiltonian
+
+    Attributes
+    ----------
+    there_are : bool
+    """
+
+    def __init__(self, lattice: LatticeHamiltonian) -> None:
+        self._lattice = lattice
+        terms = [(lattice.U, lattice.x), *((V, lattice.r) for V in lattice.bonds.values())]
+        self.there_are = any(_vanishing(f, x) for f, x in terms)
+
+    def passed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Whether positions (n, d) are on the other side of a pole than those of the start (n, d): (n,)."""
+        found = np.zeros(len(ends), dtype=bool)
+        for _, _, beyond in self._beyond(starts, ends):
+            found |= beyond.reshape(len(ends), -1).any(-1)
+        return found
+
+    def where(self, start: np.ndarray, q: np.ndarray) -> str:
+        """The first site or bond of positions (d,) that is on the other side, and how many more, in words."""
+        found = [(axis, k, beyond) for axis, k, beyond in self._beyond(start, q) if beyond.any()]
+        if not found:
+            return ""
+        axis, k, beyond = found[0]
+        more = sum(int(each.sum()) for _, _, each in found) - 1
+        return self._place(axis, k, int(np.argmax(beyond)), beyond.shape) + (f" and {more} more" if more else "")
+
+    def nearest(self, q: np.ndarray) -> str:
+        """The site or bond of positions (d,) that is nearest to a pole, in words."""
+        places = []
+        for axis, k, values in self._lattice.of_terms("poles", _vanishing, q):
+            for value in values:
+                i = int(np.argmin(np.abs(value)))
+                places.append((abs(float(value.flat[i])), self._place(axis, k, i, value.shape)))
+        return min(places)[1]
+
+    def _beyond(self, starts: np.ndarray, ends: np.ndarray) -> list[tuple[int | None, int, np.ndarray]]:
+        lattice, found = self._lattice, []
+        with np.errstate(all="ignore"):
+            before, after = (lattice.of_terms("poles", _vanishing, q) for q in (starts, ends))
+            for (axis, k, olds), (_, _, news), of in zip(before, after, self._signed(), strict=True):
+                for old, new, positive in zip(olds, news, of, strict=True):
+                    found.append((axis, k, ~(new > 0) if positive else np.sign(new) != np.sign(old)))
+        return found
+
+    def _signed(self) -> list[list[bool]]:
+        """Of each that vanishes, whether it has to be positive, in the order of `LatticeHamiltonian.of_terms`."""
+
+        def signed(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[bool]:
+            arguments = {log.args[0] for log in f.atoms(sp.log)}
+            return [g in arguments for g in _vanishing(f, x)]
+
+        lattice = self._lattice
+        onsite = [signed(lattice.U, lattice.x)] if lattice.U != 0 else []
+        return onsite + [signed(V, lattice.r) for _ in lattice.shape for V in lattice.bonds.values()]
+
+    def _place(self, axis: int | None, k: int, i: int, shape: tuple[int, ...]) -> str:
+        first = [int(n) for n in np.unravel_index(i, shape)]
+        if axis is None:
+            return f"the site {_name(first)}"
+        n, boundary = self._lattice.shape[axis], self._lattice.boundary[axis]
+        if boundary == "fixed":
+            first[axis] -= k  # bonds to the wall before the first sites come first
+        last = [*first]
+        last[axis] += k
+        if boundary == "periodic":
+            last[axis] %= n
+        ends = [_name(end) if 0 <= end[axis] < n else "the wall" for end in (first, last)]
+        return f"the bond of {ends[0]} and {ends[1]}"
+
+
+def _name(site: Sequence[int]) -> str:
+    return str(site[0]) if len(site) == 1 else f"({', '.join(map(str, site))})"
+
+
+def _vanishing(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
+    """What f divides by, or takes the logarithm of, that depends on x and may be 0 for all that SymPy knows."""
+    found = {power.base for power in f.atoms(sp.Pow) if power.exp.is_nonnegative is not True}
+    found |= {log.args[0] for log in f.atoms(sp.log)}
+    found |= {sp.cos(g.args[0]) for g in f.atoms(sp.tan, sp.sec)} | {sp.sin(g.args[0]) for g in f.atoms(sp.cot, sp.csc)}
+    return sorted((g for g in found if g.free_symbols & set(x) and g.is_positive is not True), key=str)
