@@ -46,6 +46,7 @@ from sympflow.flow.primed import PrimedFlow
 from sympflow.training.starts import Primed
 
 TARGETS = (1e-4, 1e-6, 1e-8)
+SITES = 1024
 T, OUTPUTS, STATES, SEED = 100.0, 100, 20, 20_261_126
 LONGER = 50  # times T, of a run that is timed: of a shorter one the fixed costs of a call are several per cent
 SHORT, FINE = 0.1, ("srkn14a", 4000)  # of T, after which states are compared with a scheme's that takes so many in T
@@ -246,7 +247,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", help=f"some of {', '.join(LATTICES)}, with commas")
     parser.add_argument("--flows", type=Path, default=SHIPPED, help="folder of flows beside those that ship")
-    parser.add_argument("--sites", type=int, default=1024)
+    parser.add_argument("--sites", type=int, default=SITES)
     parser.add_argument("--states", type=int, default=STATES)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--json", type=Path, help="file for what is found; what is in it is not measured again")
@@ -271,9 +272,10 @@ def main() -> None:
         return
     rows = [row for name in names for row in found[name]["rows"] if row is not None]
     costs = {name: found[name]["gradient"] for name in names}
+    size = "" if options.sites == SITES else f"-{options.sites}"
     for name, body in (
-        ("large-flows", fragment(rows, {name: lattice[0] for name, lattice in LATTICES.items()})),
-        ("large-gradients", gradients_fragment(costs)),
+        (f"large-flows{size}", fragment(rows, {name: lattice[0] for name, lattice in LATTICES.items()})),
+        (f"large-gradients{size}", gradients_fragment(costs)),
     ):
         fragments.write(options.out, name, body)
         print(body)

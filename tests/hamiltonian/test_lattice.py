@@ -256,8 +256,8 @@ class TestPoles:
     @pytest.mark.parametrize(
         ("definition", "dt", "where"),
         [
-            ({"bond": LENNARD_JONES, "boundary": "free"}, 0.05, "the bond of 2 and 3 and 2 more passed"),
-            ({"bond": "-log(1 - r**2/c**2)/2", "params": {"c": 1.2}}, 0.2, "the bond of 3 and 4 passed"),
+            ({"bond": LENNARD_JONES, "boundary": "free"}, 0.05, "the bond of 2 and 3 and 1 more passed"),
+            ({"bond": "-log(1 - r**2/c**2)/2", "params": {"c": 1.2}}, 0.2, "the bond of 3 and 4 and 1 more passed"),
             ({"onsite": "-1/(q - 1)**2/8"}, 0.15, "the site 4 passed"),
             ({"bond": "log(3 + r)"}, 0.1, "V of the bond of 4 and 5 is no number"),
         ],
