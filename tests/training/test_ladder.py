@@ -341,7 +341,9 @@ def test_what_costs_more_is_more_accurate(name):
         f"{name}-{r.name}" for r in LADDERS[name] if r.name.startswith("polynomial") and r.fits[0].energy_weight == 0.0
     }
     of_state.add("driven_pendulum-primed-8-0.5")  # a third of the state error of the rung before
-    of_state.add("fput_beta-primed-5-0.62")  # a 13th of the state error of the rung before; its limit is of rare states
+    of_state.add(
+        "fput_beta-primed-5-0.68"
+    )  # a seventh of the state error of the rung before; its limit is of rare states
     cheaper = [(f, g) for f in rungs for g in rungs if g.cost <= f.cost and g.energy_error < f.energy_error]
     assert not [(f.name, g.name) for f, g in cheaper if f.name not in of_state]  # no rung is dominated by another
     assert not [(f.name, g.name) for f, g in cheaper if g.one_step_error / g.dt < f.one_step_error / f.dt]

@@ -133,8 +133,8 @@ def ladders() -> list[Recipe]:
         lattice_rung(SYSTEMS["toda-chain"], 0.5, fit=LONG_RUNS, stages=6, force_gradient=(1, 4)),
         lattice_rung(SYSTEMS["toda-chain"], 0.48, fit=LONG_RUNS, stages=6),
         lattice_rung(SYSTEMS["fput-beta"], 0.96, 6, LONG_RUNS, stages=3),
-        lattice_rung(SYSTEMS["fput-beta"], 0.62, 6, LONG_RUNS, stages=5, force_gradient=(1, 3)),
-        lattice_rung(SYSTEMS["fput-beta"], 0.36, 8, LONG_RUNS, stages=6, force_gradient=(1, 4)),
+        lattice_rung(SYSTEMS["fput-beta"], 0.68, 10, LONG_RUNS, stages=5, force_gradient=(1, 3)),
+        lattice_rung(SYSTEMS["fput-beta"], 0.39, 12, LONG_RUNS, stages=6, force_gradient=(1, 4)),
         *(lattice_rung(SYSTEMS["fput-beta"], dt, 6) for dt in (0.8, 0.55, 0.15)),
         lattice_rung(coupled_pendulums, 1.25, fit=FEWER_RUNS, stages=2, first="kick"),
         *(lattice_rung(coupled_pendulums, dt, fit=FEWER_RUNS) for dt in (2.1, 1.08, 0.43)),
@@ -210,7 +210,7 @@ def lattice_rung(
     """A primed flow of a lattice of any n, fitted on a few sites, and judged on 256 at these energy densities.
 
     Force gradients of a polynomial bond are polynomials of a higher degree: those of a processor of 12, one after the
-    other, spoil the rare states with much energy in a few sites.
+    other, spoil the rare states with much energy in a few sites, where Δt is long.
     """
     many = partial(system, n=256)
     return Recipe(
