@@ -421,6 +421,13 @@ def test_curvature_terms_come_nearer_at_the_same_step():
     assert with_it < without / 3
 
 
+def test_shorter_times_between_kicks_are_more_accurate():
+    options = {"restarts": 1, "steps": 5, "points": 40, "reference_states": 10}
+    table = primed_ideas.spacing(10.0, (0.1, 0.4), (2,), n=32, **options)
+    short, long = (float(error) for error in table.splitlines()[-1].split("|")[2:4])
+    assert 0 < short < long / 10
+
+
 def test_a_network_on_top_of_a_primed_flow_starts_as_nothing_and_trains():
     system = henon_heiles()
     well = SympFlow.primed(system, 2, dt=0.5, processor=2).requires_grad_(False)

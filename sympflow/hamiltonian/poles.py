@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,7 +72,7 @@ class Poles:
     def _signed(self) -> list[list[bool]]:
         """Of each that vanishes, whether it has to be positive, in the order of `LatticeHamiltonian.of_terms`."""
 
-        def signed(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[bool]:
+        def signed(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[bool]:
             arguments = {log.args[0] for log in f.atoms(sp.log)}
             return [g in arguments for g in _vanishing(f, x)]
 
@@ -98,7 +99,8 @@ def _name(site: Sequence[int]) -> str:
     return str(site[0]) if len(site) == 1 else f"({', '.join(map(str, site))})"
 
 
-def _vanishing(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
+@lru_cache(maxsize=64)
+def _vanishing(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
     """What f divides by, or takes the logarithm of, that depends on x and may be 0 for all that SymPy knows."""
     found = {power.base for power in f.atoms(sp.Pow) if power.exp.is_nonnegative is not True}
     found |= {log.args[0] for log in f.atoms(sp.log)}
