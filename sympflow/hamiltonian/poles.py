@@ -4,15 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 import sympy as sp
 
-if TYPE_CHECKING:
-    from sympflow.hamiltonian.lattice import LatticeHamiltonian
-
 __all__ = ["Poles"]
+
+
+class _Lattice(Protocol):
+    """What is asked of a `LatticeHamiltonian`."""
+
+    shape: tuple[int, ...]
+    boundary: tuple[str, ...]
+    U: sp.Expr
+    x: tuple[sp.Symbol, ...]
+    r: tuple[sp.Symbol, ...]
+    bonds: dict[int, sp.Expr]
+
+    def of_terms(self, key: str, expressions: Any, q: Any) -> list[tuple[int | None, int, list[Any]]]: ...
 
 
 class Poles:
@@ -30,7 +40,7 @@ class Poles:
     there_are : bool
     """
 
-    def __init__(self, lattice: LatticeHamiltonian) -> None:
+    def __init__(self, lattice: _Lattice) -> None:
         self._lattice = lattice
         terms = [(lattice.U, lattice.x), *((V, lattice.r) for V in lattice.bonds.values())]
         self.there_are = any(_vanishing(f, x) for f, x in terms)
