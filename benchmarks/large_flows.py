@@ -273,10 +273,11 @@ def main() -> None:
     rows = [row for name in names for row in found[name]["rows"] if row is not None]
     costs = {name: found[name]["gradient"] for name in names}
     size = "" if options.sites == SITES else f"-{options.sites}"
-    for name, body in (
-        (f"large-flows{size}", fragment(rows, {name: lattice[0] for name, lattice in LATTICES.items()})),
-        (f"large-gradients{size}", gradients_fragment(costs)),
-    ):
+    titles = {name: lattice[0] for name, lattice in LATTICES.items()}
+    bodies = {f"large-flows{size}": fragment(rows, titles)}
+    if not size:
+        bodies["large-gradients"] = gradients_fragment(costs)
+    for name, body in bodies.items():
         fragments.write(options.out, name, body)
         print(body)
 
