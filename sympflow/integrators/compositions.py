@@ -221,20 +221,26 @@ class KineticPotential(Composition):
         return concatenate([q, p])
 
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
+        if not self._pushes:
+            return None
         y = to_numpy(y)
         n = y.shape[-1]
+        if not self.system.has_hessian_vector:
+            self.system.potential_hessian(y[..., : self.system.ndof], t)  # which says so, before anything large is made
         return self.pushed(y, h, np.broadcast_to(np.eye(n, dtype=y.dtype), (*y.shape, n)).copy(), t)
 
+    @property
+    def _pushes(self) -> bool:
+        """True if the step is differentiated by second derivatives of V, or by third ones known as products."""
+        return self.scheme.level <= (0 if self.system.local is None else FORCE_GRADIENT)
+
     def pushed(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
-        system, d = self.system, self.system.ndof
-        local = system.local is not None
-        if self.scheme.level > (FORCE_GRADIENT if local else 0):  # needs higher derivatives of V
+        if not self._pushes:
             return None
+        system, d = self.system, self.system.ndof
         y = to_numpy(y)
         times = self._times(t, np.broadcast_to(h, y.shape[:-1]))
         q, p, h = y[..., :d], y[..., d:], np.asarray(h, dtype=y.dtype)[..., None]
-        if not system.has_hessian_vector:
-            system.potential_hessian(q, t)  # which says so, before anything large is made
         U, P = W[..., :d, :], W[..., d:, :]
         for substep, at in zip(self.scheme.substeps, times, strict=True):
             c = substep.one
