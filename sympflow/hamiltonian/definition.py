@@ -86,7 +86,7 @@ class Definition:
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
-        """Whether runs from states (n, 2d) to others leapt over a place where V is infinite, as far as is seen: (n,).
+        """Return True for each run from states (n, 2d) to others that is seen to have leapt over an infinite V: (n,).
 
         Parameters
         ----------

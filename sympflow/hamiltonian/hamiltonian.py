@@ -469,7 +469,7 @@ class Hamiltonian:
         return self._definition.leaps
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int) -> np.ndarray:
-        """Whether runs from states (n, 2d) to others leapt over such a place, as far as is seen: (n,)."""
+        """Return True for each run from states (n, 2d) to others that is seen to have leapt over such a place: (n,)."""
         return self._definition.leapt(starts, ends, n_steps, self.conservative and self.autonomous)
 
     def leap(self, y: np.ndarray, start: np.ndarray) -> str:

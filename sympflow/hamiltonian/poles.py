@@ -13,7 +13,7 @@ __all__ = ["Poles"]
 
 
 class _Lattice(Protocol):
-    """What is asked of a `LatticeHamiltonian`."""
+    """The attributes of a `LatticeHamiltonian` that poles need."""
 
     shape: tuple[int, ...]
     boundary: tuple[str, ...]
@@ -46,7 +46,7 @@ class Poles:
         self.there_are = any(_vanishing(f, x) for f, x in terms)
 
     def passed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Whether positions (n, d) are on the other side of a pole than those of the start (n, d): (n,)."""
+        """Return True for positions (n, d) on the other side of a pole than those of the start (n, d): (n,)."""
         found = np.zeros(len(ends), dtype=bool)
         for _, _, beyond in self._beyond(starts, ends):
             found |= beyond.reshape(len(ends), -1).any(-1)
@@ -80,7 +80,7 @@ class Poles:
         return found
 
     def _signed(self) -> list[list[bool]]:
-        """Of each that vanishes, whether it has to be positive, in the order of `LatticeHamiltonian.of_terms`."""
+        """True for each expression that has to be positive, in the order of `LatticeHamiltonian.of_terms`."""
 
         def signed(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[bool]:
             arguments = {log.args[0] for log in f.atoms(sp.log)}
@@ -111,8 +111,22 @@ def _name(site: Sequence[int]) -> str:
 
 @lru_cache(maxsize=64)
 def _vanishing(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
-    """What f divides by, or takes the logarithm of, that depends on x and may be 0 for all that SymPy knows."""
-    found = {power.base for power in f.atoms(sp.Pow) if power.exp.is_nonnegative is not True}
-    found |= {log.args[0] for log in f.atoms(sp.log)}
+    """Denominators and arguments of logarithms in f that depend on x and may be 0 for all that SymPy knows.
+
+    An exponent by a parameter counts as negative where it is written so.
+    """
+    found = {power.base for power in f.atoms(sp.Pow) if power.exp.could_extract_minus_sign()}
     found |= {sp.cos(g.args[0]) for g in f.atoms(sp.tan, sp.sec)} | {sp.sin(g.args[0]) for g in f.atoms(sp.cot, sp.csc)}
-    return sorted((g for g in found if g.free_symbols & set(x) and g.is_positive is not True), key=str)
+    found = {g.args[0] if isinstance(g, sp.Abs) else g for g in found}
+    logarithms = {log.args[0] for log in f.atoms(sp.log)}
+    may_vanish = (g for g in found | logarithms if g.free_symbols & set(x) and g.is_positive is not True)
+    return sorted((g for g in may_vanish if g in logarithms or not _removable(f, g)), key=str)
+
+
+def _removable(f: sp.Expr, g: sp.Expr) -> bool:
+    """Return True if f is finite where g vanishes, a polynomial in one letter of degree 1 or 2, as sin(r)/r at 0."""
+    if len(f.free_symbols) != 1 or not g.is_polynomial(*g.free_symbols) or sp.degree(g) > 2:
+        return False
+    (x,) = f.free_symbols
+    values = [sp.limit(f, x, root) for root in sp.real_roots(sp.Poly(g, x))]
+    return all(value.is_finite for value in values)

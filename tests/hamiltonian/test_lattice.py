@@ -249,7 +249,7 @@ def test_a_time_is_answered_with_what_can_be_done(make):
 
 
 class TestPoles:
-    """Of bonds and sites at which V is infinite, over which a step leaps without a trace."""
+    """Bonds and sites at which V is infinite, over which a step leaps without a trace."""
 
     LENNARD_JONES = "(1 + r)**-12 - 2*(1 + r)**-6"
 
@@ -282,6 +282,15 @@ class TestPoles:
         assert sol.status == -1
         assert "the bond of (1, 1) and (1, 2) is nearest to a place where V is infinite" in sol.message
 
-    @pytest.mark.parametrize("bond", ["r**2/2 + r**4/4", "1/(1 + r**2)", "sqrt(1 + r**2)", "exp(-r) + r"])
+    @pytest.mark.parametrize("bond", ["r**4/4", "1/(1 + r**2)", "exp(-r) + r", "sin(r)/r", "r**n", "log(cosh(r))"])
     def test_where_there_are_none_nothing_is_looked_at(self, bond):
-        assert not HamiltonianSystem.lattice(bond=bond, shape=6).leaps
+        params = {"n": 4.0} if "n" in bond.replace("sin", "") else None
+        assert not HamiltonianSystem.lattice(bond=bond, params=params, shape=6).leaps
+
+    @pytest.mark.parametrize(
+        "bond", ["1/r", "(1 + r)**-n", "1/sqrt(r**2)", "log(r)", "tan(r)", "1/(r**2 - 4)", "r/(1 + r)"]
+    )
+    def test_where_there_are_some_they_are_found(self, bond):
+        assert HamiltonianSystem.lattice(
+            bond=bond, params={"n": 6.0} if "n)" not in bond and "-n" in bond else None, shape=6
+        ).leaps
