@@ -32,7 +32,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from enum import Enum
-from functools import cache, partial
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -312,19 +312,9 @@ class Integrator:
     def pushing(
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]]:
-        """The steps of the run, one by one: times and lengths (...), and what moves vectors W (..., 2d, k).
-
-        Of a system by one piece, which may be large, as products with second derivatives, else as Jacobians.
-        """
-        if system.local is None:
-            for times, lengths, jacobians in self.executed(system, t_span, y0):
-                yield from ((t, h, A.__matmul__) for t, h, A in zip(times, lengths, jacobians, strict=True))
-            return
-        for times, states, lengths in self.steps(system, t_span, y0):
-            for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
-                at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
-                start = float(at.flat[0]) if system.autonomous else at
-                yield at, length, partial(self.pushed, system, start, y, length.astype(y.dtype))
+        """The steps of the run, one by one: times and lengths (...), and what moves vectors W (..., 2d, k)."""
+        for times, lengths, jacobians in self.executed(system, t_span, y0):
+            yield from ((t, h, A.__matmul__) for t, h, A in zip(times, lengths, jacobians, strict=True))
 
     def executed(
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array

@@ -5,13 +5,13 @@ from __future__ import annotations
 import copyreg
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from sympflow.arguments import check_flag, check_number
-from sympflow.arrays import Array
+from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep, KernelStepper, OwnStepper, Stepper, compiled_loops
@@ -328,6 +328,19 @@ class Splitting(OwnStepper):
             return super().pushed(system, t, y, h, W)
         known = self.composed(system).pushed(y, h, W, t)
         return known[1] if known else forward_tangent(lambda x, s: self.step(system, t, x, s), y, h, W)[1]
+
+    def pushing(
+        self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]]:
+        """The same, of a system by one piece, which may be large, without Jacobians."""
+        if system.local is None:
+            yield from super().pushing(system, t_span, y0)
+            return
+        for times, states, lengths in self.steps(system, t_span, y0):
+            for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
+                at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
+                start = float(at.flat[0]) if system.autonomous else at
+                yield at, length, partial(self.pushed, system, start, y, length.astype(y.dtype))
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
         scheme = self.kicks_and_drifts
