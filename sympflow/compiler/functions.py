@@ -1,0 +1,119 @@
+"""The table of functions: of each its value with arrays and tensors, its derivatives, its cost.
+
+Machine code of each is in `control` (one instruction) or `elementary` (several). A function that is in no table cannot
+be traced. Derivatives are written with numbers of any kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["FUNCTIONS", "Function"]
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of real numbers.
+
+    Attributes
+    ----------
+    numpy : callable
+        Of arrays.
+    tensor : str
+        Its name in torch, or that of the function in `tensor_functions`.
+    partials : callable, optional
+        Of the value y and the arguments x…: the derivative by each argument, 0.0 where it is none.
+    cost : int
+        The length of its chain of operations, in additions: the same on every machine, so that programs are.
+    infix : str
+        Its sign between two arguments, as a program prints it.
+    """
+
+    numpy: Callable[..., Any]
+    tensor: str
+    partials: Callable[..., tuple[Any, ...]] | None = None
+    cost: int = 1
+    infix: str = ""
+
+    def torch(self, *args: Any) -> Any:
+        """Return the value of tensors and floats."""
+        import torch
+
+        return getattr(torch, self.tensor)(*_alike(args))
+
+
+def _alike(args: tuple[Any, ...]) -> list[Any]:
+    """The arguments as tensors of the dtype and device of those that are."""
+    import torch
+
+    like = next(x for x in args if isinstance(x, torch.Tensor) and x.dtype != torch.bool)
+    return [x if isinstance(x, torch.Tensor) else like.new_tensor(x) for x in args]
+
+
+def _call(name: str, *args: Any) -> Any:
+    from sympflow.compiler.numbers import apply
+
+    return apply(name, *args)
+
+
+def _power_rule(y: Any, x: Any, n: Any) -> tuple[Any, Any]:
+    by_n = 0.0 if isinstance(n, float | int) else _call("mul", y, _call("log", x))
+    return _call("mul", n, _call("pow", x, n - 1.0)), by_n
+
+
+def _chosen(sign: float) -> Callable[..., tuple[Any, Any]]:
+    """Derivatives of the larger (1) or smaller (−1) of two; at a tie those of the first."""
+
+    def partials(y: Any, a: Any, b: Any) -> tuple[Any, Any]:
+        first = _call("le", b, a) if sign > 0 else _call("le", a, b)
+        return _call("where", first, 1.0, 0.0), _call("where", first, 0.0, 1.0)
+
+    return partials
+
+
+# fmt: off
+FUNCTIONS: dict[str, Function] = {
+    "add": Function(np.add, "add", lambda y, a, b: (1.0, 1.0), 1, "+"),
+    "sub": Function(np.subtract, "sub", lambda y, a, b: (1.0, -1.0), 1, "-"),
+    "mul": Function(np.multiply, "mul", lambda y, a, b: (b, a), 1, "*"),
+    "div": Function(np.divide, "div", lambda y, a, b: (1.0 / b, -(y / b)), 4, "/"),
+    "neg": Function(np.negative, "neg", lambda y, a: (-1.0,), 0),
+    "fma": Function(lambda a, b, c: a * b + c, "addcmul_last", lambda y, a, b, c: (b, a, 1.0), 1),
+    "pow": Function(np.power, "pow", _power_rule, 30, "**"),
+    "sqrt": Function(np.sqrt, "sqrt", lambda y, x: (0.5 / y,), 5),
+    "abs": Function(np.abs, "abs", lambda y, x: (_call("sign", x),), 0),
+    "sign": Function(np.sign, "sign", lambda y, x: (0.0,), 1),
+    "min": Function(np.minimum, "minimum", _chosen(-1.0), 1),
+    "max": Function(np.maximum, "maximum", _chosen(1.0), 1),
+    "floor": Function(np.floor, "floor", lambda y, x: (0.0,), 2),
+    "mod": Function(np.mod, "remainder", lambda y, a, b: (1.0, -_call("floor", a / b)), 8),
+    "lt": Function(np.less, "lt", None, 1, "<"),
+    "le": Function(np.less_equal, "le", None, 1, "<="),
+    "eq": Function(np.equal, "eq", None, 1, "=="),
+    "and": Function(np.logical_and, "logical_and", None, 1, "&"),
+    "or": Function(np.logical_or, "logical_or", None, 1, "|"),
+    "not": Function(np.logical_not, "logical_not", None, 1),
+    "where": Function(np.where, "where", lambda y, c, a, b: (0.0, _call("where", c, 1.0, 0.0), _call("where", c, 0.0, 1.0)), 1),
+    "exp": Function(np.exp, "exp", lambda y, x: (y,), 11),
+    "expm1": Function(np.expm1, "expm1", lambda y, x: (y + 1.0,), 12),
+    "log": Function(np.log, "log", lambda y, x: (1.0 / x,), 14),
+    "log1p": Function(np.log1p, "log1p", lambda y, x: (1.0 / (1.0 + x),), 15),
+    "sin": Function(np.sin, "sin", lambda y, x: (_call("cos", x),), 12),
+    "cos": Function(np.cos, "cos", lambda y, x: (-_call("sin", x),), 12),
+    "tan": Function(np.tan, "tan", lambda y, x: (1.0 + y * y,), 16),
+    "atan": Function(np.arctan, "atan", lambda y, x: (1.0 / (1.0 + x * x),), 16),
+    "tanh": Function(np.tanh, "tanh", lambda y, x: (1.0 - y * y,), 15),
+    "asin": Function(np.arcsin, "asin", lambda y, x: (1.0 / _call("sqrt", (1.0 - x) * (1.0 + x)),), 40),
+    "acos": Function(np.arccos, "acos", lambda y, x: (-1.0 / _call("sqrt", (1.0 - x) * (1.0 + x)),), 40),
+    "atan2": Function(np.arctan2, "atan2", lambda y, a, b: (b / (a * a + b * b), -(a / (a * a + b * b))), 40),
+    "sinh": Function(np.sinh, "sinh", lambda y, x: (_call("cosh", x),), 40),
+    "cosh": Function(np.cosh, "cosh", lambda y, x: (_call("sinh", x),), 40),
+    "asinh": Function(np.arcsinh, "asinh", lambda y, x: (1.0 / _call("sqrt", 1.0 + x * x),), 40),
+    "acosh": Function(np.arccosh, "acosh", lambda y, x: (1.0 / _call("sqrt", (x - 1.0) * (x + 1.0)),), 40),
+    "atanh": Function(np.arctanh, "atanh", lambda y, x: (1.0 / ((1.0 - x) * (1.0 + x)),), 40),
+}
+# fmt: on
