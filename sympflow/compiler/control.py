@@ -8,7 +8,8 @@ reassociates or fuses: a scalar and every lane of a register get the same operat
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from sympflow.compiler.numbers import Number
@@ -58,6 +59,24 @@ class Value(Number):
         return f"{self.type} {self.name}"
 
 
+class Variable:
+    """A place that holds one value after the other."""
+
+    __slots__ = ("_code", "_place", "_type")
+
+    def __init__(self, code: Code, x: Value) -> None:
+        self._code, self._type, self._place = code, x.type, code.memory(1, x.type)
+        self.value = x
+
+    @property
+    def value(self) -> Value:
+        return self._code.load(self._place, 0, self._type)
+
+    @value.setter
+    def value(self, x: Value) -> None:
+        self._code.store(x, self._place)
+
+
 class Module:
     """The functions of one piece of machine code, and what they need.
 
@@ -102,7 +121,7 @@ def literal(x: float, type: Type) -> str:
     return text if type.width == 1 else f"splat ({type.scalar} {text})"
 
 
-_PLAIN = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
+_PLAIN = {"add": "fadd", "sub": "fsub", "mul": "fmul", "times": "fmul", "div": "fdiv"}
 _INTEGER = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or"}
 _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "eq": ("oeq", "eq")}
 _INTRINSIC = {"sqrt": "llvm.sqrt", "abs": "llvm.fabs", "floor": "llvm.floor"}
@@ -234,10 +253,11 @@ class Code:
         index = self.operand(index, INT)
         return self._new(POINTER, f"getelementptr inbounds {scalar}, ptr {pointer.name}, i64 {index.name}")
 
-    def load(self, pointer: Value, index: Any = 0, type: Type = DOUBLE) -> Value:
-        """The value at an index of an array of scalars; aligned as these are."""
+    def load(self, pointer: Value, index: Any = 0, type: Type = DOUBLE, shared: bool = False) -> Value:
+        """The value at an index of an array of scalars, aligned as these are; `shared` if another thread changes it."""
         place = self.at(pointer, index, type.scalar)
-        return self._new(type, f"load {type}, ptr {place.name}, align {_SIZES[type.scalar]}")
+        kind = "load volatile" if shared else "load"
+        return self._new(type, f"{kind} {type}, ptr {place.name}, align {_SIZES[type.scalar]}")
 
     def store(self, x: Value, pointer: Value, index: Any = 0) -> None:
         place = self.at(pointer, index, x.type.scalar)
@@ -250,7 +270,41 @@ class Code:
         self._entry.append(f"  {name} = alloca [{count} x {type}], align 64")
         return Value(self, POINTER, name)
 
+    def variable(self, x: Value) -> Variable:
+        """A variable with this value; the machine keeps it in a register."""
+        return Variable(self, x)
+
     # control ------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def over(self, count: Any) -> Iterator[Value]:
+        """Execute what is written inside for k = 0 … count − 1, none if the count is not positive."""
+        k = self.variable(self.constant(0, INT))
+        with self.during(lambda: k.value < count):
+            yield k.value
+            k.value = k.value + 1
+
+    @contextmanager
+    def during(self, condition: Callable[[], Value]) -> Iterator[None]:
+        """Execute what is written inside again and again while a condition holds."""
+        head, inside, after = self._label(), self._label(), self._label()
+        self._branch(head)
+        self._begin(head)
+        self._lines.append(f"  br i1 {condition().name}, label %{inside}, label %{after}")
+        self._begin(inside)
+        yield
+        self._branch(head)
+        self._begin(after)
+
+    @contextmanager
+    def given(self, condition: Value) -> Iterator[None]:
+        """Execute what is written inside if a condition holds."""
+        inside, after = self._label(), self._label()
+        self._lines.append(f"  br i1 {condition.name}, label %{inside}, label %{after}")
+        self._begin(inside)
+        yield
+        self._branch(after)
+        self._begin(after)
 
     def loop(self, count: Any, carried: Sequence[Value], body: Callable[..., Sequence[Value]]) -> list[Value]:
         """Execute `body(k, values)` for k = 0 … count − 1, none if the count is not positive.

@@ -80,6 +80,7 @@ FUNCTIONS: dict[str, Function] = {
     "add": Function(np.add, "add", lambda y, a, b: (1.0, 1.0), 1, "+"),
     "sub": Function(np.subtract, "sub", lambda y, a, b: (1.0, -1.0), 1, "-"),
     "mul": Function(np.multiply, "mul", lambda y, a, b: (b, a), 1, "*"),
+    "times": Function(np.multiply, "mul", lambda y, a, b: (b, a), 1, "*"),
     "div": Function(np.divide, "div", lambda y, a, b: (1.0 / b, -(y / b)), 4, "/"),
     "neg": Function(np.negative, "neg", lambda y, a: (-1.0,), 0),
     "fma": Function(lambda a, b, c: a * b + c, "addcmul_last", lambda y, a, b, c: (b, a, 1.0), 1),

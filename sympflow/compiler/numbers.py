@@ -13,7 +13,7 @@ import numpy as np
 
 from sympflow.compiler.functions import FUNCTIONS
 
-__all__ = ["Number", "apply", "dot", "fma", "where"]
+__all__ = ["Number", "apply", "dot", "fma", "times", "where"]
 
 
 class Number:
@@ -80,6 +80,15 @@ class Number:
     def __ge__(self, other: Any) -> Any:
         return self.apply("le", (other, self))
 
+    def __and__(self, other: Any) -> Any:
+        return self.apply("and", (self, other))
+
+    def __or__(self, other: Any) -> Any:
+        return self.apply("or", (self, other))
+
+    def __invert__(self) -> Any:
+        return self.apply("not", (self,))
+
     def __bool__(self) -> bool:
         raise TypeError("a number that is traced has no value yet: write where(condition, a, b) in place of a branch.")
 
@@ -100,6 +109,11 @@ def apply(name: str, *args: Any) -> Any:
 def fma(x: Any, y: Any, z: Any) -> Any:
     """Return x·y + z, in compiled code rounded once."""
     return apply("fma", x, y, z)
+
+
+def times(x: Any, y: Any) -> Any:
+    """Return x·y, a product of sums that may be multiplied out."""
+    return apply("times", x, y)
 
 
 def where(condition: Any, x: Any, y: Any) -> Any:

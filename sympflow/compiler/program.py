@@ -75,7 +75,7 @@ def _place(x: Any) -> tuple[int, float]:
     return (1, x.order) if isinstance(x, Traced) else (0, x)
 
 
-_COMMUTE = {"add", "mul", "min", "max", "eq", "and", "or"}
+_COMMUTE = {"add", "mul", "times", "min", "max", "eq", "and", "or"}
 
 
 def _sum(a: Any, b: Any) -> Any:
@@ -138,6 +138,7 @@ _SIMPLER: dict[str, Callable[..., Any]] = {
     "add": _sum,
     "sub": _difference,
     "mul": _product,
+    "times": _product,
     "div": _quotient,
     "neg": _negative,
     "pow": _power,
