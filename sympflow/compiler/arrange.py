@@ -9,7 +9,7 @@ trajectory and the lanes of registers, so that their bits agree.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from sympflow.compiler.functions import FUNCTIONS
@@ -62,11 +62,16 @@ class Polynomial(Number):
 
 
 class Plan(NamedTuple):
-    """A way to compute a polynomial: how long its chain is, how many operations, and what writes it."""
+    """A way to compute a polynomial: when it is known, in cycles, how many operations it takes, and what writes it."""
 
     depth: int
     operations: int
     write: Callable[[], Any]
+
+    @property
+    def cost(self) -> tuple[int, int]:
+        """A single trajectory waits for the chain, lanes side by side for the operations: both count alike."""
+        return 2 * self.depth + 3 * self.operations, self.operations
 
 
 class Arrangement:
@@ -75,9 +80,11 @@ class Arrangement:
     Parameters
     ----------
     states : sequence of (str, int)
-        Names, and when each is known, in operations: −1 for one that is known an operation before the others.
+        Names, and when each is known, in cycles.
     constants : sequence of str
         Names of what does not change in a run.
+    expand : bool
+        False leaves products of sums (`times`) as they are.
 
     Attributes
     ----------
@@ -85,7 +92,8 @@ class Arrangement:
         The numbers, to be calculated with.
     """
 
-    def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = ()) -> None:
+    def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = (), expand: bool = True) -> None:
+        self._expand = expand
         self._table, self._body = Recording(), Recording()
         self._constants = [self._table.input(name) for name in constants]
         self._known: dict[int, int] = {}
@@ -127,7 +135,7 @@ class Arrangement:
             *first, last = args
             return self._sum(first[0] if first else None, last, 1.0 if name == "add" else -1.0)
         if name in ("mul", "times"):
-            return self._product(*args, expand=name == "times")
+            return self._product(*args, expand=self._expand and name == "times")
         if name == "fma":
             return self._sum(self._product(args[0], args[1]), args[2], 1.0)
         if name == "pow" and constants[1] is not None and isinstance(constants[1], float):
@@ -185,7 +193,7 @@ class Arrangement:
         return value
 
     def depth(self, x: Any) -> int:
-        """When a number of the body is known, in operations after the states; constants always were."""
+        """When a number of the body is known, in cycles; constants always were."""
         return self._known.get(x.order, ALWAYS) if isinstance(x, Traced) else ALWAYS
 
     def coefficient(self, c: Any) -> Any:
@@ -216,27 +224,27 @@ class Arrangement:
         return self._moved(base, factor, x).write()
 
     def _moved(self, base: Any, factor: Any, x: Any, level: int = 4) -> Plan:
-        ready = max(self.depth(base), self.depth(factor), self.depth(x)) + 1
+        ready = max(self.depth(base), self.depth(factor), self.depth(x)) + FUSED
         plain = Plan(ready, 1, lambda: self.operation("fma", factor, x, base))
         if not level or not isinstance(x, Traced) or x.name not in ("fma", "add"):
             return plain
         if x.name == "add":
             first, last = sorted(x.args, key=self.depth)
             rest = self._moved(base, factor, first, level - 1)
-            depth = max(self.depth(last), rest.depth) + 1
+            depth = max(self.depth(last), rest.depth) + FUSED
             joined = Plan(depth, rest.operations + 1, lambda: self.operation("fma", factor, last, rest.write()))
         else:
             u, v = sorted(x.args[:2], key=self.depth)
             if self.depth(u) <= ALWAYS:
                 return plain
             rest = self._moved(base, factor, x.args[2], level - 1)
-            depth = max(self.depth(u) + 2, self.depth(v) + 1, rest.depth + 1)
+            depth = max(self.depth(u) + PRODUCT + FUSED, self.depth(v) + FUSED, rest.depth + FUSED)
 
             def write() -> Any:
                 return self.operation("fma", self.operation("mul", factor, u), v, rest.write())
 
             joined = Plan(depth, rest.operations + 2, write)
-        return min(plain, joined, key=lambda plan: (plan.depth, plan.operations))
+        return min(plain, joined, key=lambda plan: plan.cost)
 
     # nesting ------------------------------------------------------------------------------------------------------
 
@@ -254,8 +262,8 @@ class Arrangement:
             ((m, c),) = terms.items()
             return self._one(m, c)
         few = len(terms) <= MOST_TRIED
-        plans = (self._nested(terms, m) for m in self._factors(terms, few))
-        return min(plans, key=lambda plan: (plan.depth, plan.operations) if few else (plan.operations, plan.depth))
+        plans = (plan for m in self._factors(terms, few) for plan in self._nested(terms, m))
+        return min(plans, key=lambda plan: plan.cost if few else plan.cost[::-1])
 
     def _factors(self, terms: Terms, few: bool) -> list[Monomial]:
         """Products of letters to take out."""
@@ -271,25 +279,22 @@ class Arrangement:
             return list(counts)
         return sorted((m for m in counts if m[0][1] == 1), key=lambda m: -counts[m])[:1]
 
-    def _nested(self, terms: Terms, factor: Monomial) -> Plan:
-        """factor·A + B."""
+    def _nested(self, terms: Terms, factor: Monomial) -> Iterator[Plan]:
+        """factor·A + B, in one operation or in two, whose last one may wait less."""
         inside = {_without(m, factor): c for m, c in terms.items() if _divides(factor, m)}
-        A = self._plan(inside)
-        B = self._plan({m: c for m, c in terms.items() if not _divides(factor, m)})
-        x = self._one(factor, 1.0)
-        depth = max(A.depth, x.depth, B.depth) + 1
-
-        def write() -> Any:
-            value = x.write(), A.write()
-            rest = B.write()
-            return self.operation("mul", *value) if _is_zero(rest) else self.operation("fma", *value, rest)
-
-        if tuple(inside.values()) == (1.0,) and () in inside:  # a letter is added
-            return Plan(max(x.depth, B.depth) + 1, x.operations + B.operations + 1, lambda: self._added(x, B))
-        return Plan(depth, A.operations + x.operations + B.operations + 1, write)
-
-    def _added(self, x: Plan, B: Plan) -> Any:
-        return self.operation("add", x.write(), B.write())
+        outside = {m: c for m, c in terms.items() if not _divides(factor, m)}
+        x, A, B = self._one(factor, 1.0), self._plan(inside), self._plan(outside)
+        both, operations = max(x.depth, A.depth), x.operations + A.operations + B.operations
+        product = lambda: self.operation("mul", x.write(), A.write())
+        if not outside:
+            yield Plan(both + PRODUCT, operations + 1, product)
+        elif len(inside) == 1 and _is_one(inside.get(())):
+            yield Plan(max(x.depth, B.depth) + SUM, operations + 1, lambda: self.operation("add", x.write(), B.write()))
+        else:
+            fused = lambda: self.operation("fma", x.write(), A.write(), B.write())
+            yield Plan(max(both, B.depth) + FUSED, operations + 1, fused)
+            added = lambda: self.operation("add", product(), B.write())
+            yield Plan(max(both + PRODUCT, B.depth) + SUM, operations + 2, added)
 
     def _one(self, m: Monomial, c: Any) -> Plan:
         """A coefficient times letters: two numbers that are known first are multiplied first."""
@@ -305,20 +310,21 @@ class Arrangement:
             while len(items) > 1:
                 items.sort(key=lambda item: item[:2])
                 (d, i, a), (e, _, b) = items[:2]
-                items[:2] = [(max(d, e) + 1, i, self.operation("mul", a, b))]
+                items[:2] = [(max(d, e) + PRODUCT, i, self.operation("mul", a, b))]
             return items[0][2]
 
         return Plan(depth, operations, write)
 
 
-ALWAYS = -1000
+ALWAYS = -1000  # when constants are known
+SUM, PRODUCT, FUSED = (FUNCTIONS[name].cost for name in ("add", "mul", "fma"))
 
 
 def _folded(depths: list[int]) -> tuple[int, int]:
     """When the product of numbers is known that are known at these depths, and its operations."""
     depths, operations = sorted(depths), 0
     while len(depths) > 1:
-        depths = sorted([max(depths[:2]) + 1, *depths[2:]])
+        depths = sorted([max(depths[:2]) + PRODUCT, *depths[2:]])
         operations += 1
     return depths[0], operations
 

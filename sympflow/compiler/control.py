@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from sympflow.compiler.numbers import Number
 
-__all__ = ["BOOL", "DOUBLE", "INT", "POINTER", "Code", "Module", "Type", "Value"]
+__all__ = ["BOOL", "DOUBLE", "INT", "POINTER", "Code", "Module", "Type", "Value", "Variable"]
 
 
 class Type(NamedTuple):

@@ -12,7 +12,7 @@ import ctypes
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
+from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
 __all__ = ["Numbers", "Stage", "map_function", "run_function", "step_function"]
@@ -21,17 +21,20 @@ BLOCK = 1024  # steps between two looks for a state that is not finite, where no
 
 Numbers = Callable[[int], Any]
 """The number of an index, of one column."""
-Stage = Callable[[Code, list[Value], Numbers, Value], list[Value]]
-"""``stage(code, values, numbers, kind)``: the values after a stage; `kind` is an integer, which the column has."""
+Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
+"""``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
+`step` tells after how many whole steps the stage is executed."""
 
 
-def run_function(n_values: int, size: int, stage: Stage, width: int = 1, own: bool = False) -> Callable[..., None]:
+def run_function(
+    n_values: int, n_out: int, size: int, stage: Stage, width: int = 1, own: bool = False
+) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side.
 
     Parameters
     ----------
-    n_values : int
-        Numbers of a state.
+    n_values, n_out : int
+        Numbers of a state, and how many of them, the first ones, are the output.
     size : int
         Numbers of a column.
     stage
@@ -66,7 +69,7 @@ def run_function(n_values: int, size: int, stage: Stage, width: int = 1, own: bo
         column = _column(code, place, kinds, size, width if own else 1, width, stage)
         state = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
         n, saved, longest = code.variable(first), code.variable(zero), code.variable(code.constant(BLOCK, INT))
-        j = code.variable(code.select(zero < first, link, zero))
+        j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
         alive = code.variable(code.constant(1, Type("i1", width)))
         going = code.variable(first < n_steps)
         with code.during(lambda: going.value):
@@ -74,14 +77,15 @@ def run_function(n_values: int, size: int, stage: Stage, width: int = 1, own: bo
             left = saved.value < n_saved
             following = code.load(save, code.select(left, saved.value, zero), INT) - n.value
             k = code.select(left, code.apply("min", (k, following)), k)
-            before, j_before = [x.value for x in state], j.value
+            before, j_before, step_before = [x.value for x in state], j.value, step.value
             with code.over(k * link):
                 at = j.value
+                _set(state, column(at, [x.value for x in state], step.value))
                 j.value = code.select(code.apply("eq", (at, link)), one, at + 1)
-                _set(state, column(at, [x.value for x in state]))
+                step.value = code.select(code.apply("eq", (j.value, link)), step.value + 1, step.value)
             end = [code.variable(x.value) for x in state]
             with code.over(closes):
-                _set(end, column(link + 1, [x.value for x in end]))
+                _set(end, column(link + 1, [x.value for x in end], step.value))
             alive.value = alive.value & _finite(code, [x.value for x in end])
             good = code.any(alive.value)
             going.value = good & code.apply("eq", (code.load(stop, 0, INT, shared=True), zero))
@@ -90,12 +94,12 @@ def run_function(n_values: int, size: int, stage: Stage, width: int = 1, own: bo
                 going.value = going.value & (n.value < n_steps)
                 due = lambda: _due(code, save, n_saved, saved.value, n.value)
                 with code.during(due):
-                    lanes.store([x.value for x in end], out, begin, n_rows, n_saved, saved.value)
+                    lanes.store([x.value for x in end[:n_out]], out, begin, n_rows, n_saved, saved.value)
                     saved.value = saved.value + 1
             if width == 1:  # again, step by step
                 with code.given(~good & (one < k)):
                     _set(state, before)
-                    j.value, longest.value = j_before, one
+                    j.value, step.value, longest.value = j_before, step_before, one
                     alive.value, going.value = code.constant(1, Type("i1")), code.constant(1, Type("i1"))
         if width == 1:
             code.store(n.value, finite, begin)
@@ -106,35 +110,37 @@ def run_function(n_values: int, size: int, stage: Stage, width: int = 1, own: bo
     return _finished(code, types)
 
 
-def map_function(n_values: int, size: int, stage: Stage, width: int = 1) -> Callable[..., None]:
+def map_function(n_values: int, n_out: int, size: int, stage: Stage, width: int = 1) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table.
 
     Returns
     -------
     callable
-        Of (table, kinds, n_columns, rows, n_rows, out); `out` may be `rows`.
+        Of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out): row i is mapped after ``steps[i % n_steps]``
+        whole steps, in lanes the same for all of them; `out` may be `rows`.
     """
-    types = [POINTER, POINTER, INT, POINTER, INT, POINTER]
+    types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER]
     code = Module(host().fused).function("map", types)
-    table, kinds, n_columns, rows, n_rows, out = code.arguments
-    lanes = Lanes(code, n_values, width)
+    table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments
+    lanes = Lanes(code, n_out, width)
     column = _column(code, table, kinds, size, 1, width, stage)
     with code.over(lanes.groups(n_rows)) as group:
         begin = group * width
-        state = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
+        state = _opened(code, lanes.loaded(rows, begin, n_rows), n_values)
+        step = code.load(steps, code.op("srem", INT, begin, n_steps), INT)
         with code.over(n_columns) as j:
-            _set(state, column(j, [x.value for x in state]))
-        lanes.store([x.value for x in state], out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
+            _set(state, column(j, [x.value for x in state], step))
+        lanes.store([x.value for x in state[:n_out]], out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
     return _finished(code, types)
 
 
 def step_function(
     n_values: int,
+    n_out: int,
     powers: Sequence[int],
     own: int,
     numbers: Callable[..., Sequence[Any]],
     stage: Stage,
-    kind: int,
     width: int = 1,
 ) -> Callable[..., None]:
     """Compile single steps from rows, each of its own length.
@@ -147,24 +153,22 @@ def step_function(
         Numbers that follow each state in its row and replace the last ones given.
     numbers : callable
         From the given numbers to those that a stage reads.
-    kind : int
-        Of all stages.
 
     Returns
     -------
     callable
-        Of (coefficients, n_columns, n_powers, x, h, rows, n_rows, out): the given numbers of a column of row i are
+        Of (coefficients, n_columns, n_powers, x, h, t, rows, n_rows, out): the given numbers of a column of row i are
         polynomials Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
     """
-    types = [POINTER, INT, INT, POINTER, POINTER, POINTER, INT, POINTER]
+    types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER]
     code = Module(host().fused).function("steps", types)
-    table, n_columns, n_powers, x, h, rows, n_rows, out = code.arguments
-    lanes, alone = Lanes(code, n_values, width, n_values + own), Lanes(code, 1, width)
+    table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments
+    lanes, alone = Lanes(code, n_out + own, width), Lanes(code, 1, width)
     with code.over(lanes.groups(n_rows)) as group:
         begin = group * width
         (at,), (length,) = alone.loaded(x, begin, n_rows), alone.loaded(h, begin, n_rows)
-        *values, = lanes.loaded(rows, begin, n_rows)
-        state = [code.variable(value) for value in values[:n_values]]
+        values = lanes.loaded(rows, begin, n_rows)
+        state = _opened(code, values[:n_out], n_values)
         with code.over(n_columns) as j:
             given = []
             for r, power in enumerate(powers):
@@ -174,17 +178,17 @@ def step_function(
                     total.value = total.value * at + code.splat(code.load(start, n_powers - 1 - k), width)
                 given.append(total.value)
             grown = [value * length**power if power else value for value, power in zip(given, powers, strict=True)]
-            entries = numbers(*grown[: len(grown) - own], *values[n_values:])
-            _set(state, stage(code, [s.value for s in state], entries.__getitem__, code.constant(kind, INT)))
-        lanes.store([s.value for s in state], out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
+            entries = numbers(*grown[: len(grown) - own], *values[n_out:])
+            _set(state, stage([s.value for s in state], entries.__getitem__, j, j))
+        lanes.store([s.value for s in state[:n_out]], out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
     return _finished(code, types)
 
 
 class Lanes:
     """Rows of memory as values of registers: `width` rows side by side, the last one again where there are fewer."""
 
-    def __init__(self, code: Code, n_values: int, width: int, stride: int | None = None) -> None:
-        self.code, self.n_values, self.width = code, n_values if stride is None else stride, width
+    def __init__(self, code: Code, n_values: int, width: int) -> None:
+        self.code, self.n_values, self.width = code, n_values, width
         self.type = Type("double", width)
         self._buffer = None if width == 1 else code.memory(self.n_values, self.type)
 
@@ -233,10 +237,10 @@ class Lanes:
 
 def _column(
     code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Stage
-) -> Callable[[Value, list[Value]], list[Value]]:
+) -> Callable[[Value, list[Value], Value], list[Value]]:
     """The stage of a column, the numbers of which are those of all lanes, or one for each."""
 
-    def at(j: Value, values: list[Value]) -> list[Value]:
+    def at(j: Value, values: list[Value], step: Value) -> list[Value]:
         start = code.at(table, j * (size * lanes))
 
         def number(i: int) -> Value:
@@ -244,12 +248,18 @@ def _column(
                 return code.load(start, i * lanes, Type("double", lanes))
             return code.splat(code.load(start, i), width)
 
-        return stage(code, values, number, code.load(kinds, j, INT))
+        return stage(values, number, code.load(kinds, j, INT), step)
 
     return at
 
 
-def _set(variables: Sequence[Any], values: Sequence[Value]) -> None:
+def _opened(code: Code, x: Sequence[Value], n_values: int) -> list[Variable]:
+    """Variables of a state, whose values after those given are 0."""
+    zero = code.constant(0.0, x[0].type)
+    return [code.variable(value) for value in [*x, *[zero] * (n_values - len(x))]]
+
+
+def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:
     for variable, value in zip(variables, values, strict=True):
         variable.value = value
 
