@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.loop_functions import damped_drift, shared_by_lanes
+from sympflow.kernels.loop_functions import damped_drift, shared_by_lanes, takes_values
 from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.kernels.splitting_loops import damped_table, splitting_loops
 from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source, two_stages_source
@@ -70,7 +70,7 @@ class TangentKernel:
         self._scheme, self._friction = scheme, system.friction
         drift = damped_drift(system, False)
         damped = None if drift is None else replace(drift, copies=1 + vectors)
-        if loops.takes_values(scheme.level):
+        if loops.values and loops.friction is None and takes_values(scheme.level):
             symbols, self._values = symbols.parametric, loops.values
         self._make = partial(_rollout, symbols, scheme.level, scheme.monomials, vectors, damped)
 
