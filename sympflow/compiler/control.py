@@ -55,6 +55,34 @@ class Value(Number):
     def apply(self, name: str, args: Sequence[Any]) -> Any:
         return self.code.apply(name, args)
 
+    @property
+    def bits(self) -> Value:
+        """The bits of a double as a whole number."""
+        return self.code.convert("bitcast", self, "i64")
+
+    @property
+    def real(self) -> Value:
+        """The double of these bits."""
+        return self.code.convert("bitcast", self, "double")
+
+    def __and__(self, other: Any) -> Value:
+        return self._bitwise("and", other)
+
+    def __or__(self, other: Any) -> Value:
+        return self._bitwise("or", other)
+
+    def __xor__(self, other: Any) -> Value:
+        return self._bitwise("xor", other)
+
+    def __lshift__(self, other: Any) -> Value:
+        return self._bitwise("shl", other)
+
+    def __rshift__(self, other: Any) -> Value:
+        return self._bitwise("lshr", other)
+
+    def _bitwise(self, operation: str, other: Any) -> Value:
+        return self.code.op(operation, self.type, self, self.code.operand(other, self.type))
+
     def __repr__(self) -> str:
         return f"{self.type} {self.name}"
 
@@ -90,10 +118,23 @@ class Module:
         self.fused = fused
         self._declared: dict[str, str] = {}
         self._functions: dict[str, str] = {}
+        self._uses: dict[str, int] = {}
 
-    def function(self, name: str, arguments: Sequence[Type], result: Type | None = None, within: bool = False) -> Code:
-        """Begin a function; `within` for one that is called by the others only, rarely, and is not copied into them."""
-        return Code(self, name, arguments, result, within)
+    def function(
+        self,
+        name: str,
+        arguments: Sequence[Type],
+        result: Type | None = None,
+        within: bool = False,
+        rare: bool = True,
+    ) -> Code:
+        """Begin a function; `within` for one that is called by the others only, `rare`ly, and not copied into them."""
+        return Code(self, name, arguments, result, within, rare)
+
+    def used(self, name: str) -> int:
+        """Count one more use of a name, and return how many there are."""
+        self._uses[name] = self._uses.get(name, 0) + 1
+        return self._uses[name]
 
     def declare(self, name: str, text: str) -> None:
         """Put a declaration or a constant before the functions, once."""
@@ -135,8 +176,17 @@ class Code:
     arguments : list of Value
     """
 
-    def __init__(self, module: Module, name: str, arguments: Sequence[Type], result: Type | None, within: bool) -> None:
-        self.module, self.name, self.result, self._within = module, name, result, within
+    def __init__(
+        self,
+        module: Module,
+        name: str,
+        arguments: Sequence[Type],
+        result: Type | None,
+        within: bool = False,
+        rare: bool = True,
+    ) -> None:
+        self.module, self.name, self.result = module, name, result
+        self._kind, self._traits = ("internal ", f" noinline{' cold' if rare else ''}") if within else ("", "")
         self._types = list(arguments)
         self.arguments = [Value(self, type, f"%a{i}") for i, type in enumerate(arguments)]
         self._lines: list[str] = []
@@ -166,7 +216,7 @@ class Code:
 
     def external(self, name: str, args: Sequence[Value], result: Type | None, more: str = "") -> Value:
         """Write a call of a function that is declared only: an intrinsic, or one of the C library."""
-        types = ", ".join(str(a.type) for a in args) + (f", {more.split()[0]}" if more else "")
+        types = ", ".join(str(a.type) for a in args) + (f", {more.split(maxsplit=1)[0]}" if more else "")
         self.module.declare(name, f"declare {result or 'void'} @{name}({types})")
         given = ", ".join([*(f"{a.type} {a.name}" for a in args), *([more] if more else [])])
         return self._new(result, f"call {result or 'void'} @{name}({given})")
@@ -175,6 +225,29 @@ class Code:
         """Write a call of a function of the module."""
         given = ", ".join(f"{a.type} {a.name}" for a in args)
         return self._new(result, f"call {result or 'void'} @{name}({given})")
+
+    def outlined(
+        self,
+        name: str,
+        args: Sequence[Value],
+        body: Callable[..., Value | None],
+        result: Type | None = None,
+        rare: bool = False,
+    ) -> Value:
+        """Write a call of a function of its own, made of `body(*arguments)` when it is called first."""
+        if not self.module.has(name):
+            function = self.module.function(name, [a.type for a in args], result, within=True, rare=rare)
+            function.give(body(*function.arguments))
+        return self.call(name, args, result)
+
+    def lanes(self, function: Callable[..., Value], args: Sequence[Value], result: Type) -> Value:
+        """Call a function of scalars with one lane after the other."""
+        total = Value(self, result, "poison")
+        for k in range(result.width):
+            lane = [self._new(Type(a.type.scalar), f"extractelement {a.type} {a.name}, i64 {k}") for a in args]
+            y = function(*lane)
+            total = self._new(result, f"insertelement {result} {total.name}, {y.type} {y.name}, i64 {k}")
+        return total
 
     def apply(self, name: str, args: Sequence[Any]) -> Value:
         """Write a function of the table; operands that are floats become constants."""
@@ -383,8 +456,7 @@ class Code:
         """End the function, with its result."""
         self._lines.append("  ret void" if x is None else f"  ret {x.type} {x.name}")
         given = ", ".join(f"{t}{' noalias' if t == POINTER else ''} %a{i}" for i, t in enumerate(self._types))
-        kind, traits = ("internal ", " noinline cold") if self._within else ("", "")
-        head = f"define {kind}{self.result or 'void'} @{self.name}({given}){traits} nounwind {{\nentry:"
+        head = f"define {self._kind}{self.result or 'void'} @{self.name}({given}){self._traits} nounwind {{\nentry:"
         self.module.add(self.name, "\n".join([head, *self._entry, *self._lines, "}"]))
 
     def _name(self, type: Type) -> Value:

@@ -23,8 +23,8 @@ class Function:
     ----------
     numpy : callable
         Of arrays.
-    tensor : str
-        Its name in torch, or that of the function in `tensor_functions`.
+    tensor : str or callable
+        Its name in torch, or the function of tensors.
     partials : callable, optional
         Of the value y and the arguments x…: the derivative by each argument, 0.0 where it is none.
     cost : int
@@ -34,7 +34,7 @@ class Function:
     """
 
     numpy: Callable[..., Any]
-    tensor: str
+    tensor: str | Callable[..., Any]
     partials: Callable[..., tuple[Any, ...]] | None = None
     cost: int = 1
     infix: str = ""
@@ -43,21 +43,42 @@ class Function:
         """Return the value of tensors and floats."""
         import torch
 
-        return getattr(torch, self.tensor)(*_alike(args))
+        function = getattr(torch, self.tensor) if isinstance(self.tensor, str) else self.tensor
+        return function(*_alike(args))
 
 
 def _alike(args: tuple[Any, ...]) -> list[Any]:
-    """The arguments as tensors of the dtype and device of those that are."""
+    """The arguments as tensors of the device and dtype of those that are, float64 if these are conditions."""
     import torch
 
-    like = next(x for x in args if isinstance(x, torch.Tensor) and x.dtype != torch.bool)
-    return [x if isinstance(x, torch.Tensor) else like.new_tensor(x) for x in args]
+    tensors = [x for x in args if isinstance(x, torch.Tensor)]
+    dtype = next((x.dtype for x in tensors if x.dtype != torch.bool), torch.float64)
+    return [x if isinstance(x, torch.Tensor) else tensors[0].new_tensor(x, dtype=dtype) for x in args]
+
+
+def _special(name: str) -> Callable[..., Any]:
+    """A function of scipy.special, which is loaded by its first call."""
+
+    def function(*args: Any) -> Any:
+        from scipy import special
+
+        return getattr(special, name)(*args)
+
+    return function
 
 
 def _call(name: str, *args: Any) -> Any:
     from sympflow.compiler.numbers import apply
 
     return apply(name, *args)
+
+
+def _multiply_add(a: Any, b: Any, c: Any) -> Any:
+    return a * b + c
+
+
+def _choice(y: Any, c: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
+    return 0.0, _call("where", c, 1.0, 0.0), _call("where", c, 0.0, 1.0)
 
 
 def _power_rule(y: Any, x: Any, n: Any) -> tuple[Any, Any]:
@@ -75,6 +96,8 @@ def _chosen(sign: float) -> Callable[..., tuple[Any, Any]]:
     return partials
 
 
+_TWO_OVER_ROOT_PI = 2.0 / np.sqrt(np.pi)
+
 # fmt: off
 FUNCTIONS: dict[str, Function] = {
     "add": Function(np.add, "add", lambda y, a, b: (1.0, 1.0), 3, "+"),
@@ -83,7 +106,7 @@ FUNCTIONS: dict[str, Function] = {
     "times": Function(np.multiply, "mul", lambda y, a, b: (b, a), 3, "*"),
     "div": Function(np.divide, "div", lambda y, a, b: (1.0 / b, -(y / b)), 13, "/"),
     "neg": Function(np.negative, "neg", lambda y, a: (-1.0,), 1),
-    "fma": Function(lambda a, b, c: a * b + c, "addcmul_last", lambda y, a, b, c: (b, a, 1.0), 4),
+    "fma": Function(_multiply_add, _multiply_add, lambda y, a, b, c: (b, a, 1.0), 4),
     "pow": Function(np.power, "pow", _power_rule, 120, "**"),
     "sqrt": Function(np.sqrt, "sqrt", lambda y, x: (0.5 / y,), 20),
     "abs": Function(np.abs, "abs", lambda y, x: (_call("sign", x),), 1),
@@ -98,7 +121,7 @@ FUNCTIONS: dict[str, Function] = {
     "and": Function(np.logical_and, "logical_and", None, 1, "&"),
     "or": Function(np.logical_or, "logical_or", None, 1, "|"),
     "not": Function(np.logical_not, "logical_not", None, 1),
-    "where": Function(np.where, "where", lambda y, c, a, b: (0.0, _call("where", c, 1.0, 0.0), _call("where", c, 0.0, 1.0)), 2),
+    "where": Function(np.where, "where", _choice, 2),
     "exp": Function(np.exp, "exp", lambda y, x: (y,), 45),
     "expm1": Function(np.expm1, "expm1", lambda y, x: (y + 1.0,), 48),
     "log": Function(np.log, "log", lambda y, x: (1.0 / x,), 55),
@@ -116,5 +139,8 @@ FUNCTIONS: dict[str, Function] = {
     "asinh": Function(np.arcsinh, "asinh", lambda y, x: (1.0 / _call("sqrt", 1.0 + x * x),), 160),
     "acosh": Function(np.arccosh, "acosh", lambda y, x: (1.0 / _call("sqrt", (x - 1.0) * (x + 1.0)),), 160),
     "atanh": Function(np.arctanh, "atanh", lambda y, x: (1.0 / ((1.0 - x) * (1.0 + x)),), 160),
+    "erf": Function(_special("erf"), "erf", lambda y, x: (_TWO_OVER_ROOT_PI * _call("exp", -(x * x)),), 160),
+    "erfc": Function(_special("erfc"), "erfc", lambda y, x: (-_TWO_OVER_ROOT_PI * _call("exp", -(x * x)),), 160),
+    "lgamma": Function(_special("gammaln"), "lgamma", lambda y, x: (_call("digamma", x),), 160),
 }
 # fmt: on
