@@ -15,7 +15,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sympflow.compiler.control import DOUBLE, INT, POINTER, Value
+from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
 from sympflow.compiler.numbers import fma, where
 
 __all__ = ["LOWERED"]
@@ -34,7 +34,10 @@ ONE, WHOLE, NEAREST, ROOT_HALF = map(_pattern, (1.0, 2.0**52, ROUND, math.sqrt(0
 LOWERED: dict[str, Callable[..., Value]] = {}
 
 
-def _lowered(name: str, inline: int = 3) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
+INLINE, ALWAYS = 3, 1_000_000  # how often a function's operations are copied into a module before it is called
+
+
+def _lowered(name: str, inline: int = INLINE) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
     """Register machine code for a function of the table, copied in so many times; further uses call it."""
 
     def register(build: Callable[..., Value]) -> Callable[..., Value]:
@@ -44,7 +47,7 @@ def _lowered(name: str, inline: int = 3) -> Callable[[Callable[..., Value]], Cal
                 wide = [x.code.convert("fpext", a, "double") if isinstance(a, Value) else a for a in args]
                 return x.code.convert("fptrunc", lowered(*wide), "float")
             full = f"{name}.{x.type.suffix}"
-            if name == "power" or x.code.module.used(full) <= inline:
+            if x.code.module.used(full) <= inline:
                 return build(*args)
             return x.code.outlined(full, args, build, x.type)
 
@@ -319,7 +322,7 @@ def _floor(x: Value) -> Value:
     return x.code.intrinsic("llvm.floor", x)
 
 
-@_lowered("power")
+@_lowered("power", inline=ALWAYS)
 def _power(x: Value, n: float) -> Value:
     """xⁿ for a constant n: products for whole and half numbers up to 16, in double length where three would add up."""
     m = abs(n)
@@ -484,25 +487,41 @@ def _odd(n: Value) -> Value:
     return (n << 63) < 0
 
 
-def _either(odd: Value, r: Value) -> Value:
-    """cos r or sin r."""
+def _circle(x: Value) -> list[Value]:
+    """sin x and cos x: of r, exchanged and negated as the quarter asks."""
+    n, r = _quarters(abs(x))
     z = r * r
-    return where(odd, fma(z, _estrin(COS, z), 1.0), fma(r * z, _estrin(SIN, z), r))
+    s, c = fma(r * z, _estrin(SIN, z), r), fma(z, _estrin(COS, z), 1.0)
+    odd = _odd(n)
+    sine, cosine = where(odd, c, s), where(odd, s, c)
+    return [
+        (sine.bits ^ (((n << 62) ^ x.bits) & SIGN)).real,
+        (cosine.bits ^ (((n + 1) << 62) & SIGN)).real,
+    ]
 
 
-@_lowered("sin")
+def _circle_once(x: Value) -> list[Value]:
+    """Both from one calculation, since a force and its slope want both."""
+    code, name = x.code, f"circle.{x.type.suffix}"
+
+    def make() -> list[Value]:
+        if code.module.used(name) <= INLINE:
+            return _circle(x)
+        types = [x.type, x.type]
+        both = Type(f"{{ {x.type}, {x.type} }}")
+        return code.unpack(code.outlined(name, [x], lambda x: x.code.pack(_circle(x)), both), types)
+
+    return code.once(("circle", x.name), make)
+
+
+@_lowered("sin", inline=ALWAYS)
 def _sin(x: Value) -> Value:
-    n, r = _quarters(abs(x))
-    y = _either(_odd(n), r)
-    return (y.bits ^ (((n << 62) ^ x.bits) & SIGN)).real
+    return _circle_once(x)[0]
 
 
-@_lowered("cos")
+@_lowered("cos", inline=ALWAYS)
 def _cos(x: Value) -> Value:
-    n, r = _quarters(abs(x))
-    n = n + 1
-    y = _either(_odd(n), r)
-    return (y.bits ^ ((n << 62) & SIGN)).real
+    return _circle_once(x)[1]
 
 
 @_lowered("tan")
@@ -558,17 +577,17 @@ def _atan(x: Value) -> Value:
 # sign, min, max, mod --------------------------------------------------------------------------------------------------
 
 
-@_lowered("sign", inline=1_000_000)
+@_lowered("sign", inline=ALWAYS)
 def _sign(x: Value) -> Value:
     return where(x > 0.0, 1.0, where(x < 0.0, -1.0, x))
 
 
-@_lowered("min", inline=1_000_000)
+@_lowered("min", inline=ALWAYS)
 def _min(x: Value, y: Value) -> Value:
     return where(_compare("uno", x, x), x, where(x < y, x, y))
 
 
-@_lowered("max", inline=1_000_000)
+@_lowered("max", inline=ALWAYS)
 def _max(x: Value, y: Value) -> Value:
     return where(_compare("uno", x, x), x, where(x > y, x, y))
 
