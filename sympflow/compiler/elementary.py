@@ -607,18 +607,18 @@ def _mod_of(r: Value, y: Value) -> Value:
 
 
 def _mod_far(x: Value, y: Value) -> Value:
-    """Subtracts multiples of |y|, of |y| 2⁸⁰⁰ before, whose number fits into a double, until less than |y| is left."""
+    """Subtract multiples of |y| 2¹⁴⁰⁰, |y| 2⁷⁰⁰ and |y|, exactly, until less than |y| is left."""
     code, b = x.code, abs(y)
-    large = where(abs(x) * 2.0**-900 > b, b * 2.0**800, b)
+    more = b * 2.0**700
+    most = more * 2.0**700
 
     def less(values: Sequence[Value]) -> tuple[Value, list[Value]]:
-        r, c = values
-        q = r / c
-        r = _rest(code.intrinsic("llvm.trunc", q), c, r)
-        more = abs(r) >= b
-        return code.any(more), [r, where(abs(r) < c, b, c)]
+        a = abs(values[0])
+        unit = where(a >= most, most, where(a >= more, more, b))
+        r = _rest(code.intrinsic("llvm.trunc", values[0] / unit), unit, values[0])
+        return code.any(abs(r) >= b), [r]
 
-    r, _ = code.repeat([x, large], less)
+    (r,) = code.repeat([x], less)
     r = where(_compare("oeq", b, INFINITY) & (abs(x) < INFINITY), x, r)
     return _mod_of(r, y)
 
@@ -636,3 +636,40 @@ def _library(name: str, c_name: str) -> None:
 
 for _name in ("asin", "acos", "atan2", "sinh", "cosh", "asinh", "acosh", "atanh", "erf", "erfc", "lgamma"):
     _library(_name, _name)
+
+
+# the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.12 from 16 on, below by
+# recurrence, below 1/2 by reflection --------------------------------------------------------------------------------
+
+DIGAMMA = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12)
+TRIGAMMA = (1 / 6, -1 / 30, 1 / 42, -1 / 30, 5 / 66, -691 / 2730, 7 / 6)
+
+
+def _raised(x: Value, term: Callable[[Value], Value]) -> tuple[Value, Value, Value, Value]:
+    """Whether x < 1/2; 1/z of a number z ≥ 16 above x or 1 − x, the sum of the terms between, πx less whole turns."""
+
+    def step(k: Value, values: Sequence[Value]) -> list[Value]:
+        z, total = values
+        small = z < 16.0
+        return [where(small, z + 1.0, z), total + where(small, term(1.0 / z), 0.0)]
+
+    below = x < 0.5
+    z, total = x.code.loop(16, [where(below, 1.0 - x, x), _constant(x, 0.0)], step)
+    return below, 1.0 / z, total, (x - _floor(x + 0.5)) * math.pi
+
+
+@_lowered("digamma", inline=0)
+def _digamma(x: Value) -> Value:
+    below, w, total, angle = _raised(x, lambda w: w)
+    z = w * w
+    y = ((-LOWERED["log"](w) - 0.5 * w) - z * _estrin(DIGAMMA, z)) - total
+    return where(below, y - math.pi / LOWERED["tan"](angle), y)
+
+
+@_lowered("trigamma", inline=0)
+def _trigamma(x: Value) -> Value:
+    below, w, total, angle = _raised(x, lambda w: w * w)
+    z = w * w
+    y = total + (w + (0.5 * z + w * z * _estrin(TRIGAMMA, z)))
+    sine = math.pi / LOWERED["sin"](angle)
+    return where(below, sine * sine - y, y)
