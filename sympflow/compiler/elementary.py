@@ -99,8 +99,7 @@ def _product(x: Value, y: Value) -> tuple[Value, Value]:
         return p, fma(x, y, -p)
     halves = []
     for a in (x, y):
-        c = a * (2.0**27 + 1)
-        high = c - (c - a)
+        high = ((a.bits + 2**26) & -(2**27)).real
         halves.append((high, a - high))
     (a, b), (c, d) = halves
     return p, ((a * c - p) + a * d + b * c) + b * d
