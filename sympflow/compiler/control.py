@@ -193,6 +193,8 @@ class Code:
         self._entry: list[str] = []
         self._count = 0
         self._block = "entry"
+        self._before: dict[str, str] = {}
+        self._known: dict[tuple[str, Any], list[Value]] = {}
 
     # arithmetic ---------------------------------------------------------------------------------------------------
 
@@ -240,8 +242,32 @@ class Code:
             function.give(body(*function.arguments))
         return self.call(name, args, result)
 
+    def once(self, key: Any, make: Callable[[], Sequence[Value]]) -> list[Value]:
+        """The values of `make()`, or those that it gave for this key before, if they hold here."""
+        block: str | None = self._block
+        while block is not None:
+            if (block, key) in self._known:
+                return self._known[block, key]
+            block = self._before.get(block)
+        values = list(make())
+        self._known[self._block, key] = values
+        return values
+
+    def pack(self, values: Sequence[Value]) -> Value:
+        """Several values as one, to be given by a function."""
+        type = Type(f"{{ {', '.join(str(v.type) for v in values)} }}")
+        total = Value(self, type, "poison")
+        for i, v in enumerate(values):
+            total = self._new(type, f"insertvalue {type} {total.name}, {v.type} {v.name}, {i}")
+        return total
+
+    def unpack(self, packed: Value, types: Sequence[Type]) -> list[Value]:
+        return [self._new(t, f"extractvalue {packed.type} {packed.name}, {i}") for i, t in enumerate(types)]
+
     def lanes(self, function: Callable[..., Value], args: Sequence[Value], result: Type) -> Value:
         """Call a function of scalars with one lane after the other."""
+        if result.width == 1:
+            return function(*args)
         total = Value(self, result, "poison")
         for k in range(result.width):
             lane = [self._new(Type(a.type.scalar), f"extractelement {a.type} {a.name}, i64 {k}") for a in args]
@@ -388,13 +414,13 @@ class Code:
         head, inside, after = self._label(), self._label(), self._label()
         before = self._block
         self._branch(head)
-        self._begin(head)
+        self._begin(head, before)
         place = len(self._lines)
         k = self._name(INT)
         values = [self._name(v.type) for v in carried]
         condition = k < count
         self._lines.append(f"  br i1 {condition.name}, label %{inside}, label %{after}")
-        self._begin(inside)
+        self._begin(inside, head)
         new = list(body(k, values))
         following = k + 1
         end = self._block
@@ -406,14 +432,14 @@ class Code:
             )
         ]
         self._lines[place:place] = phis
-        self._begin(after)
+        self._begin(after, head)
         return values
 
     def repeat(self, carried: Sequence[Value], body: Callable[..., tuple[Value, Sequence[Value]]]) -> list[Value]:
         """Execute `body(values)`, which returns whether to go on and the new values, at least once."""
         head, after, before = self._label(), self._label(), self._block
         self._branch(head)
-        self._begin(head)
+        self._begin(head, before)
         place = len(self._lines)
         values = [self._name(v.type) for v in carried]
         again, new = body(values)
@@ -423,7 +449,7 @@ class Code:
             f"  {v.name} = phi {v.type} [ {first.name}, %{before} ], [ {last.name}, %{end} ]"
             for v, first, last in zip(values, carried, new, strict=True)
         ]
-        self._begin(after)
+        self._begin(after, end)
         return list(new)
 
     def when(
@@ -434,7 +460,7 @@ class Code:
         rare: bool = False,
     ) -> list[Value]:
         """Execute one of two bodies, and return its values; `rare` if the first one hardly ever."""
-        yes, no, after = self._label(), self._label(), self._label()
+        yes, no, after, before = self._label(), self._label(), self._label(), self._block
         weights = ""
         if rare:
             self.module.declare("!rare", '!0 = !{!"branch_weights", i32 1, i32 100000}')
@@ -442,11 +468,11 @@ class Code:
         self._lines.append(f"  br i1 {condition.name}, label %{yes}, label %{no}{weights}")
         ends, results = [], []
         for label, body in ((yes, then), (no, otherwise)):
-            self._begin(label)
+            self._begin(label, before)
             results.append(list(body()))
             ends.append(self._block)
             self._branch(after)
-        self._begin(after)
+        self._begin(after, before)
         return [
             self._new(x.type, f"phi {x.type} [ {x.name}, %{ends[0]} ], [ {y.name}, %{ends[1]} ]")
             for x, y in zip(*results, strict=True)
@@ -475,9 +501,10 @@ class Code:
         self._count += 1
         return f"b{self._count}"
 
-    def _begin(self, label: str) -> None:
+    def _begin(self, label: str, before: str) -> None:
+        """Begin a block, which is reached through the one before only."""
         self._lines.append(f"{label}:")
-        self._block = label
+        self._block, self._before[label] = label, before
 
     def _branch(self, label: str) -> None:
         self._lines.append(f"  br label %{label}")

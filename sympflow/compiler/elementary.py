@@ -15,7 +15,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sympflow.compiler.control import DOUBLE, INT, POINTER, Value
+from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
 from sympflow.compiler.numbers import fma, where
 
 __all__ = ["LOWERED"]
@@ -34,7 +34,10 @@ ONE, WHOLE, NEAREST, ROOT_HALF = map(_pattern, (1.0, 2.0**52, ROUND, math.sqrt(0
 LOWERED: dict[str, Callable[..., Value]] = {}
 
 
-def _lowered(name: str, inline: int = 3) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
+INLINE, ALWAYS = 3, 1_000_000  # how often a function's operations are copied into a module before it is called
+
+
+def _lowered(name: str, inline: int = INLINE) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
     """Register machine code for a function of the table, copied in so many times; further uses call it."""
 
     def register(build: Callable[..., Value]) -> Callable[..., Value]:
@@ -44,7 +47,7 @@ def _lowered(name: str, inline: int = 3) -> Callable[[Callable[..., Value]], Cal
                 wide = [x.code.convert("fpext", a, "double") if isinstance(a, Value) else a for a in args]
                 return x.code.convert("fptrunc", lowered(*wide), "float")
             full = f"{name}.{x.type.suffix}"
-            if name == "power" or x.code.module.used(full) <= inline:
+            if x.code.module.used(full) <= inline:
                 return build(*args)
             return x.code.outlined(full, args, build, x.type)
 
@@ -96,8 +99,7 @@ def _product(x: Value, y: Value) -> tuple[Value, Value]:
         return p, fma(x, y, -p)
     halves = []
     for a in (x, y):
-        c = a * (2.0**27 + 1)
-        high = c - (c - a)
+        high = ((a.bits + 2**26) & -(2**27)).real
         halves.append((high, a - high))
     (a, b), (c, d) = halves
     return p, ((a * c - p) + a * d + b * c) + b * d
@@ -319,7 +321,7 @@ def _floor(x: Value) -> Value:
     return x.code.intrinsic("llvm.floor", x)
 
 
-@_lowered("power")
+@_lowered("power", inline=ALWAYS)
 def _power(x: Value, n: float) -> Value:
     """xⁿ for a constant n: products for whole and half numbers up to 16, in double length where three would add up."""
     m = abs(n)
@@ -484,25 +486,41 @@ def _odd(n: Value) -> Value:
     return (n << 63) < 0
 
 
-def _either(odd: Value, r: Value) -> Value:
-    """cos r or sin r."""
+def _circle(x: Value) -> list[Value]:
+    """sin x and cos x: of r, exchanged and negated as the quarter asks."""
+    n, r = _quarters(abs(x))
     z = r * r
-    return where(odd, fma(z, _estrin(COS, z), 1.0), fma(r * z, _estrin(SIN, z), r))
+    s, c = fma(r * z, _estrin(SIN, z), r), fma(z, _estrin(COS, z), 1.0)
+    odd = _odd(n)
+    sine, cosine = where(odd, c, s), where(odd, s, c)
+    return [
+        (sine.bits ^ (((n << 62) ^ x.bits) & SIGN)).real,
+        (cosine.bits ^ (((n + 1) << 62) & SIGN)).real,
+    ]
 
 
-@_lowered("sin")
+def _circle_once(x: Value) -> list[Value]:
+    """Both from one calculation, since a force and its slope want both."""
+    code, name = x.code, f"circle.{x.type.suffix}"
+
+    def make() -> list[Value]:
+        if code.module.used(name) <= INLINE:
+            return _circle(x)
+        types = [x.type, x.type]
+        both = Type(f"{{ {x.type}, {x.type} }}")
+        return code.unpack(code.outlined(name, [x], lambda x: x.code.pack(_circle(x)), both), types)
+
+    return code.once(("circle", x.name), make)
+
+
+@_lowered("sin", inline=ALWAYS)
 def _sin(x: Value) -> Value:
-    n, r = _quarters(abs(x))
-    y = _either(_odd(n), r)
-    return (y.bits ^ (((n << 62) ^ x.bits) & SIGN)).real
+    return _circle_once(x)[0]
 
 
-@_lowered("cos")
+@_lowered("cos", inline=ALWAYS)
 def _cos(x: Value) -> Value:
-    n, r = _quarters(abs(x))
-    n = n + 1
-    y = _either(_odd(n), r)
-    return (y.bits ^ ((n << 62) & SIGN)).real
+    return _circle_once(x)[1]
 
 
 @_lowered("tan")
@@ -558,17 +576,17 @@ def _atan(x: Value) -> Value:
 # sign, min, max, mod --------------------------------------------------------------------------------------------------
 
 
-@_lowered("sign", inline=1_000_000)
+@_lowered("sign", inline=ALWAYS)
 def _sign(x: Value) -> Value:
     return where(x > 0.0, 1.0, where(x < 0.0, -1.0, x))
 
 
-@_lowered("min", inline=1_000_000)
+@_lowered("min", inline=ALWAYS)
 def _min(x: Value, y: Value) -> Value:
     return where(_compare("uno", x, x), x, where(x < y, x, y))
 
 
-@_lowered("max", inline=1_000_000)
+@_lowered("max", inline=ALWAYS)
 def _max(x: Value, y: Value) -> Value:
     return where(_compare("uno", x, x), x, where(x > y, x, y))
 
@@ -588,18 +606,18 @@ def _mod_of(r: Value, y: Value) -> Value:
 
 
 def _mod_far(x: Value, y: Value) -> Value:
-    """Subtracts multiples of |y|, of |y| 2⁸⁰⁰ before, whose number fits into a double, until less than |y| is left."""
+    """Subtract multiples of |y| 2¹⁴⁰⁰, |y| 2⁷⁰⁰ and |y|, exactly, until less than |y| is left."""
     code, b = x.code, abs(y)
-    large = where(abs(x) * 2.0**-900 > b, b * 2.0**800, b)
+    more = b * 2.0**700
+    most = more * 2.0**700
 
     def less(values: Sequence[Value]) -> tuple[Value, list[Value]]:
-        r, c = values
-        q = r / c
-        r = _rest(code.intrinsic("llvm.trunc", q), c, r)
-        more = abs(r) >= b
-        return code.any(more), [r, where(abs(r) < c, b, c)]
+        a = abs(values[0])
+        unit = where(a >= most, most, where(a >= more, more, b))
+        r = _rest(code.intrinsic("llvm.trunc", values[0] / unit), unit, values[0])
+        return code.any(abs(r) >= b), [r]
 
-    r, _ = code.repeat([x, large], less)
+    (r,) = code.repeat([x], less)
     r = where(_compare("oeq", b, INFINITY) & (abs(x) < INFINITY), x, r)
     return _mod_of(r, y)
 
@@ -617,3 +635,40 @@ def _library(name: str, c_name: str) -> None:
 
 for _name in ("asin", "acos", "atan2", "sinh", "cosh", "asinh", "acosh", "atanh", "erf", "erfc", "lgamma"):
     _library(_name, _name)
+
+
+# the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.12 from 16 on, below by
+# recurrence, below 1/2 by reflection --------------------------------------------------------------------------------
+
+DIGAMMA = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12)
+TRIGAMMA = (1 / 6, -1 / 30, 1 / 42, -1 / 30, 5 / 66, -691 / 2730, 7 / 6)
+
+
+def _raised(x: Value, term: Callable[[Value], Value]) -> tuple[Value, Value, Value, Value]:
+    """Whether x < 1/2; 1/z of a number z ≥ 16 above x or 1 − x, the sum of the terms between, πx less whole turns."""
+
+    def step(k: Value, values: Sequence[Value]) -> list[Value]:
+        z, total = values
+        small = z < 16.0
+        return [where(small, z + 1.0, z), total + where(small, term(1.0 / z), 0.0)]
+
+    below = x < 0.5
+    z, total = x.code.loop(16, [where(below, 1.0 - x, x), _constant(x, 0.0)], step)
+    return below, 1.0 / z, total, (x - _floor(x + 0.5)) * math.pi
+
+
+@_lowered("digamma", inline=0)
+def _digamma(x: Value) -> Value:
+    below, w, total, angle = _raised(x, lambda w: w)
+    z = w * w
+    y = ((-LOWERED["log"](w) - 0.5 * w) - z * _estrin(DIGAMMA, z)) - total
+    return where(below, y - math.pi / LOWERED["tan"](angle), y)
+
+
+@_lowered("trigamma", inline=0)
+def _trigamma(x: Value) -> Value:
+    below, w, total, angle = _raised(x, lambda w: w * w)
+    z = w * w
+    y = total + (w + (0.5 * z + w * z * _estrin(TRIGAMMA, z)))
+    sine = math.pi / LOWERED["sin"](angle)
+    return where(below, sine * sine - y, y)

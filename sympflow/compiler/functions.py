@@ -77,6 +77,25 @@ def _multiply_add(a: Any, b: Any, c: Any) -> Any:
     return a * b + c
 
 
+def _sign(x: Any) -> Any:
+    """The sign of tensors, NaN of NaN."""
+    return x.sign().where(x == x, x)
+
+
+def _trigamma(x: Any) -> Any:
+    return _special("polygamma")(1, x)
+
+
+def _trigamma_of_tensors(x: Any) -> Any:
+    import torch
+
+    return torch.polygamma(1, x)
+
+
+def _no_further(y: Any, x: Any) -> tuple[Any]:
+    raise NotImplementedError("the third derivative of lgamma is not in the table: use a method without it.")
+
+
 def _choice(y: Any, c: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
     return 0.0, _call("where", c, 1.0, 0.0), _call("where", c, 0.0, 1.0)
 
@@ -110,7 +129,7 @@ FUNCTIONS: dict[str, Function] = {
     "pow": Function(np.power, "pow", _power_rule, 120, "**"),
     "sqrt": Function(np.sqrt, "sqrt", lambda y, x: (0.5 / y,), 20),
     "abs": Function(np.abs, "abs", lambda y, x: (_call("sign", x),), 1),
-    "sign": Function(np.sign, "sign", lambda y, x: (0.0,), 4),
+    "sign": Function(np.sign, _sign, lambda y, x: (0.0,), 4),
     "min": Function(np.minimum, "minimum", _chosen(-1.0), 3),
     "max": Function(np.maximum, "maximum", _chosen(1.0), 3),
     "floor": Function(np.floor, "floor", lambda y, x: (0.0,), 8),
@@ -142,5 +161,7 @@ FUNCTIONS: dict[str, Function] = {
     "erf": Function(_special("erf"), "erf", lambda y, x: (_TWO_OVER_ROOT_PI * _call("exp", -(x * x)),), 160),
     "erfc": Function(_special("erfc"), "erfc", lambda y, x: (-_TWO_OVER_ROOT_PI * _call("exp", -(x * x)),), 160),
     "lgamma": Function(_special("gammaln"), "lgamma", lambda y, x: (_call("digamma", x),), 160),
+    "digamma": Function(_special("psi"), "digamma", lambda y, x: (_call("trigamma", x),), 160),
+    "trigamma": Function(_trigamma, _trigamma_of_tensors, _no_further, 160),
 }
 # fmt: on

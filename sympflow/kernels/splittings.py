@@ -394,7 +394,8 @@ class SplittingCode:
         self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width)
         for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
             one = slice(i, i + 1)
-            running[i] = before[i]
+            if len(before):
+                running[i] = before[i]
             self._run(table, y0[one], n_steps, save, out[one], n_finite[one], *rest, running[one], closed, 1)
 
     def _run(
@@ -447,7 +448,8 @@ class SplittingCode:
         if width == 1:
             for i in np.flatnonzero(n_finite < n_steps):
                 out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
-                running[i] = np.nan
+                if keeps:
+                    running[i] = np.nan
 
     def rollout_processed(
         self, before: np.ndarray, run: np.ndarray, after: np.ndarray, y0: np.ndarray, *rest: Any
