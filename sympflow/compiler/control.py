@@ -386,24 +386,24 @@ class Code:
     @contextmanager
     def during(self, condition: Callable[[], Value]) -> Iterator[None]:
         """Execute what is written inside again and again while a condition holds."""
-        head, inside, after = self._label(), self._label(), self._label()
+        head, inside, after, before = self._label(), self._label(), self._label(), self._block
         self._branch(head)
-        self._begin(head)
+        self._begin(head, before)
         self._lines.append(f"  br i1 {condition().name}, label %{inside}, label %{after}")
-        self._begin(inside)
+        self._begin(inside, head)
         yield
         self._branch(head)
-        self._begin(after)
+        self._begin(after, head)
 
     @contextmanager
     def given(self, condition: Value) -> Iterator[None]:
         """Execute what is written inside if a condition holds."""
-        inside, after = self._label(), self._label()
+        inside, after, before = self._label(), self._label(), self._block
         self._lines.append(f"  br i1 {condition.name}, label %{inside}, label %{after}")
-        self._begin(inside)
+        self._begin(inside, before)
         yield
         self._branch(after)
-        self._begin(after)
+        self._begin(after, before)
 
     def loop(self, count: Any, carried: Sequence[Value], body: Callable[..., Sequence[Value]]) -> list[Value]:
         """Execute `body(k, values)` for k = 0 … count − 1, none if the count is not positive.
