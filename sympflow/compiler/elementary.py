@@ -2,7 +2,9 @@
 
 Each function reduces its argument by an identity, which a comment states, and evaluates a polynomial by Estrin's rule.
 What few arguments need stands in a function of its own behind a branch that others never take. float32 is computed in
-double precision. Errors in units in the last place: below 1 for exp, log and cos, 2 for the others, 3 for tanh.
+double precision. Errors in units in the last place: below 1 for exp and log, 3 for tanh, 2 for the others; on machines
+without fused operations 3 for sin, cos and tan. Of what C gives, constant powers differ in this: a half power of −∞ is
+NaN, x^(−3/2) is 0 where it would be subnormal.
 
 Polynomials of sin, cos and log are those of fdlibm (Sun Microsystems, 1993, free to use with this notice); the others
 interpolate at Chebyshev's points. Tables of 2/π after Payne and Hanek (1983), products after Dekker (1971).
