@@ -1,7 +1,6 @@
 """Machine code of elementary functions: as accurate as promised, and the same in a scalar as in every lane."""
 
 import ctypes
-import math
 
 import mpmath
 import numpy as np
@@ -156,7 +155,7 @@ def test_what_was_calculated_in_a_branch_is_not_used_after_it():
     np.testing.assert_allclose(run(function, x), np.where(x > 100, np.sin(x), x) + np.cos(x), rtol=1e-13, atol=1e-15)
 
 
-# powers ----------------------------------------------------------------------------------------------------------------
+# powers ---------------------------------------------------------------------------------------------------------------
 
 BASES = np.concatenate([wide(-20, 20), wide(-700, 700), around(1, 0.3), wide(-744, -708, 20)])
 EXPONENTS = around(0, 1, len(BASES))[::-1] * np.minimum(745 / np.abs(np.log(BASES)), 1e300)
@@ -189,7 +188,7 @@ def test_power_of_a_constant_exponent(n, sign):
     x = -x if n % 1 == 0 else x
     for fused in (True, False):
         assert units(run(lambda a: a**n, x, width=8, fused=fused), lambda a: a**n, x) < 2.0
-    special = SPECIAL[SPECIAL > -np.inf] if n % 1 == 0.5 else SPECIAL  # 1/√x and its kin of −∞ are NaN
+    special = SPECIAL[~np.isneginf(SPECIAL)] if n % 1 == 0.5 else SPECIAL  # 1/√x and its kin of −∞ are NaN
     with np.errstate(all="ignore"):
         expected = special**n
         zero = (special == 0) & (n % 1 != 0)
@@ -240,16 +239,3 @@ def test_single_precision_is_rounded_from_double(name):
     np.testing.assert_array_equal(run(of(name), x, width=8), FUNCTIONS[name].numpy(x.astype(float)).astype(np.float32))
     power = run(lambda a: a ** (1 / 3), x, width=8)
     np.testing.assert_array_equal(power, (x.astype(float) ** (1 / 3)).astype(np.float32))
-
-
-def test_every_function_of_the_table_has_machine_code():
-    values = {"lt", "le", "eq", "and", "or", "not"}
-    x = np.array([0.7, 0.3])
-    for name, function in FUNCTIONS.items():
-        arguments = function.numpy.nin if isinstance(function.numpy, np.ufunc) else None
-        if name in values or arguments is None:
-            continue
-        y = run(of(name), *[x] * arguments, width=2)
-        with np.errstate(all="ignore"):
-            np.testing.assert_allclose(y, function.numpy(*[x] * arguments), rtol=4 * np.finfo(float).eps, equal_nan=True)
-    assert math.isnan(run(of("acosh"), x)[0])
