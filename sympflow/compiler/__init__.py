@@ -2,5 +2,5 @@
 
 Read in this order: `numbers` (what arithmetic is done with), `functions` (one table of what may be done), `program`
 (operations recorded, differentiated, evaluated with arrays), `arrange` (the order of operations), `control` (loops,
-conditions and memory), `elementary` (exp, log, sin and their kin by arithmetic alone) and `machine` (from text to code).
+conditions, memory), `elementary` (exp, log, sin and their kin by arithmetic alone) and `machine` (from text to code).
 """

@@ -2,8 +2,8 @@
 
 A compiler keeps the order of additions and products, so that it is ours to choose. Numbers are collected as polynomials
 in *letters*: the inputs, and the values of functions that are no polynomials. What depends on no state is computed once
-for a run and stands in a table. Each polynomial is then nested, m·A + B, by letters and products of two of them, so that
-its longest chain of operations is short: the chains of one trajectory take its time. One shape serves a single
+for a run and stands in a table. Each polynomial is then nested, m·A + B, by letters and products of two of them, so
+that its longest chain of operations is short: the chains of one trajectory take its time. One shape serves a single
 trajectory and the lanes of registers, so that their bits agree.
 """
 
@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from sympflow.compiler.functions import FUNCTIONS
-from sympflow.compiler.numbers import Number, apply
+from sympflow.compiler.functions import FUNCTIONS, apply
+from sympflow.compiler.numbers import Number
 from sympflow.compiler.program import Program, Recording, Traced
 
 __all__ = ["Arranged", "Arrangement"]
@@ -135,7 +135,7 @@ class Arrangement:
             *first, last = args
             return self._sum(first[0] if first else None, last, 1.0 if name == "add" else -1.0)
         if name in ("mul", "times"):
-            return self._product(*args, expand=self._expand and name == "times")
+            return self._product(args[0], args[1], self._expand and name == "times")
         if name == "fma":
             return self._sum(self._product(args[0], args[1]), args[2], 1.0)
         if name == "pow" and constants[1] is not None and isinstance(constants[1], float):
@@ -285,16 +285,25 @@ class Arrangement:
         outside = {m: c for m, c in terms.items() if not _divides(factor, m)}
         x, A, B = self._one(factor, 1.0), self._plan(inside), self._plan(outside)
         both, operations = max(x.depth, A.depth), x.operations + A.operations + B.operations
-        product = lambda: self.operation("mul", x.write(), A.write())
+
+        def product() -> Any:
+            return self.operation("mul", x.write(), A.write())
+
         if not outside:
             yield Plan(both + PRODUCT, operations + 1, product)
         elif len(inside) == 1 and _is_one(inside.get(())):
             yield Plan(max(x.depth, B.depth) + SUM, operations + 1, lambda: self.operation("add", x.write(), B.write()))
         else:
-            fused = lambda: self.operation("fma", x.write(), A.write(), B.write())
-            yield Plan(max(both, B.depth) + FUSED, operations + 1, fused)
-            added = lambda: self.operation("add", product(), B.write())
-            yield Plan(max(both + PRODUCT, B.depth) + SUM, operations + 2, added)
+            yield Plan(
+                max(both, B.depth) + FUSED,
+                operations + 1,
+                lambda: self.operation("fma", x.write(), A.write(), B.write()),
+            )
+            yield Plan(
+                max(both + PRODUCT, B.depth) + SUM,
+                operations + 2,
+                lambda: self.operation("add", product(), B.write()),
+            )
 
     def _one(self, m: Monomial, c: Any) -> Plan:
         """A coefficient times letters: two numbers that are known first are multiplied first."""

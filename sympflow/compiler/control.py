@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from sympflow.compiler.numbers import Number
 
-__all__ = ["BOOL", "DOUBLE", "INT", "POINTER", "Code", "Module", "Type", "Value", "Variable"]
+__all__ = ["BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Type", "Value", "Variable"]
 
 
 class Type(NamedTuple):
@@ -85,6 +85,10 @@ class Value(Number):
 
     def __repr__(self) -> str:
         return f"{self.type} {self.name}"
+
+
+LOWERED: dict[str, Callable[..., Value]] = {}
+"""Code of functions of several instructions: see `elementary`."""
 
 
 class Variable:
@@ -306,8 +310,6 @@ class Code:
             return self.fma(*values)
         if name in _INTRINSIC:
             return self.intrinsic(_INTRINSIC[name], *values)
-        from sympflow.compiler.elementary import LOWERED
-
         if name == "pow" and not isinstance(args[1], Value):
             return LOWERED["power"](values[0], float(args[1]))
         return LOWERED[name](*values)
@@ -427,9 +429,7 @@ class Code:
         self._branch(head)
         phis = [
             f"  {v.name} = phi {v.type} [ {first.name}, %{before} ], [ {last.name}, %{end} ]"
-            for v, first, last in zip(
-                [k, *values], [self.constant(0, INT), *carried], [following, *new], strict=True
-            )
+            for v, first, last in zip([k, *values], [self.constant(0, INT), *carried], [following, *new], strict=True)
         ]
         self._lines[place:place] = phis
         self._begin(after, head)

@@ -17,8 +17,8 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
-from sympflow.compiler.numbers import fma, where
+from sympflow.compiler.control import DOUBLE, INT, LOWERED, POINTER, Type, Value
+from sympflow.compiler.functions import fma, where
 
 __all__ = ["LOWERED"]
 
@@ -33,7 +33,6 @@ def _pattern(x: float) -> int:
 
 
 ONE, WHOLE, NEAREST, ROOT_HALF = map(_pattern, (1.0, 2.0**52, ROUND, math.sqrt(0.5)))
-LOWERED: dict[str, Callable[..., Value]] = {}
 
 
 INLINE, ALWAYS = 3, 1_000_000  # how often a function's operations are copied into a module before it is called

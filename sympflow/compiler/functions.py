@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["FUNCTIONS", "Function"]
+from sympflow.compiler.numbers import Number
+
+__all__ = ["FUNCTIONS", "Function", "apply", "fma", "times", "where"]
 
 
 @dataclass(frozen=True)
@@ -67,12 +69,6 @@ def _special(name: str) -> Callable[..., Any]:
     return function
 
 
-def _call(name: str, *args: Any) -> Any:
-    from sympflow.compiler.numbers import apply
-
-    return apply(name, *args)
-
-
 def _multiply_add(a: Any, b: Any, c: Any) -> Any:
     return a * b + c
 
@@ -97,20 +93,24 @@ def _no_further(y: Any, x: Any) -> tuple[Any]:
 
 
 def _choice(y: Any, c: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
-    return 0.0, _call("where", c, 1.0, 0.0), _call("where", c, 0.0, 1.0)
+    return 0.0, apply("where", c, 1.0, 0.0), apply("where", c, 0.0, 1.0)
 
 
 def _power_rule(y: Any, x: Any, n: Any) -> tuple[Any, Any]:
-    by_n = 0.0 if isinstance(n, float | int) else _call("mul", y, _call("log", x))
-    return _call("mul", n, _call("pow", x, n - 1.0)), by_n
+    by_n = 0.0 if isinstance(n, float | int) else apply("mul", y, apply("log", x))
+    return apply("mul", n, apply("pow", x, n - 1.0)), by_n
+
+
+def _quotient_rule(y: Any, a: Any, b: Any) -> tuple[Any, Any]:
+    return (1.0 / b, -(y / b)) if not isinstance(a, float | int) else (0.0, -(y * y) * (1.0 / a))
 
 
 def _chosen(sign: float) -> Callable[..., tuple[Any, Any]]:
     """Derivatives of the larger (1) or smaller (−1) of two; at a tie those of the first."""
 
     def partials(y: Any, a: Any, b: Any) -> tuple[Any, Any]:
-        first = _call("le", b, a) if sign > 0 else _call("le", a, b)
-        return _call("where", first, 1.0, 0.0), _call("where", first, 0.0, 1.0)
+        first = apply("le", b, a) if sign > 0 else apply("le", a, b)
+        return apply("where", first, 1.0, 0.0), apply("where", first, 0.0, 1.0)
 
     return partials
 
@@ -123,17 +123,17 @@ FUNCTIONS: dict[str, Function] = {
     "sub": Function(np.subtract, "sub", lambda y, a, b: (1.0, -1.0), 3, "-"),
     "mul": Function(np.multiply, "mul", lambda y, a, b: (b, a), 3, "*"),
     "times": Function(np.multiply, "mul", lambda y, a, b: (b, a), 3, "*"),
-    "div": Function(np.divide, "div", lambda y, a, b: (1.0 / b, -(y / b)), 13, "/"),
+    "div": Function(np.divide, "div", _quotient_rule, 13, "/"),
     "neg": Function(np.negative, "neg", lambda y, a: (-1.0,), 1),
     "fma": Function(_multiply_add, _multiply_add, lambda y, a, b, c: (b, a, 1.0), 4),
     "pow": Function(np.power, "pow", _power_rule, 120, "**"),
     "sqrt": Function(np.sqrt, "sqrt", lambda y, x: (0.5 / y,), 20),
-    "abs": Function(np.abs, "abs", lambda y, x: (_call("sign", x),), 1),
+    "abs": Function(np.abs, "abs", lambda y, x: (apply("sign", x),), 1),
     "sign": Function(np.sign, _sign, lambda y, x: (0.0,), 4),
     "min": Function(np.minimum, "minimum", _chosen(-1.0), 3),
     "max": Function(np.maximum, "maximum", _chosen(1.0), 3),
     "floor": Function(np.floor, "floor", lambda y, x: (0.0,), 8),
-    "mod": Function(np.mod, "remainder", lambda y, a, b: (1.0, -_call("floor", a / b)), 30),
+    "mod": Function(np.mod, "remainder", lambda y, a, b: (1.0, -apply("floor", a / b)), 30),
     "lt": Function(np.less, "lt", None, 4, "<"),
     "le": Function(np.less_equal, "le", None, 4, "<="),
     "eq": Function(np.equal, "eq", None, 4, "=="),
@@ -145,23 +145,49 @@ FUNCTIONS: dict[str, Function] = {
     "expm1": Function(np.expm1, "expm1", lambda y, x: (y + 1.0,), 48),
     "log": Function(np.log, "log", lambda y, x: (1.0 / x,), 55),
     "log1p": Function(np.log1p, "log1p", lambda y, x: (1.0 / (1.0 + x),), 60),
-    "sin": Function(np.sin, "sin", lambda y, x: (_call("cos", x),), 50),
-    "cos": Function(np.cos, "cos", lambda y, x: (-_call("sin", x),), 50),
+    "sin": Function(np.sin, "sin", lambda y, x: (apply("cos", x),), 50),
+    "cos": Function(np.cos, "cos", lambda y, x: (-apply("sin", x),), 50),
     "tan": Function(np.tan, "tan", lambda y, x: (1.0 + y * y,), 65),
     "atan": Function(np.arctan, "atan", lambda y, x: (1.0 / (1.0 + x * x),), 65),
     "tanh": Function(np.tanh, "tanh", lambda y, x: (1.0 - y * y,), 60),
-    "asin": Function(np.arcsin, "asin", lambda y, x: (1.0 / _call("sqrt", (1.0 - x) * (1.0 + x)),), 160),
-    "acos": Function(np.arccos, "acos", lambda y, x: (-1.0 / _call("sqrt", (1.0 - x) * (1.0 + x)),), 160),
+    "asin": Function(np.arcsin, "asin", lambda y, x: (1.0 / apply("sqrt", (1.0 - x) * (1.0 + x)),), 160),
+    "acos": Function(np.arccos, "acos", lambda y, x: (-1.0 / apply("sqrt", (1.0 - x) * (1.0 + x)),), 160),
     "atan2": Function(np.arctan2, "atan2", lambda y, a, b: (b / (a * a + b * b), -(a / (a * a + b * b))), 160),
-    "sinh": Function(np.sinh, "sinh", lambda y, x: (_call("cosh", x),), 160),
-    "cosh": Function(np.cosh, "cosh", lambda y, x: (_call("sinh", x),), 160),
-    "asinh": Function(np.arcsinh, "asinh", lambda y, x: (1.0 / _call("sqrt", 1.0 + x * x),), 160),
-    "acosh": Function(np.arccosh, "acosh", lambda y, x: (1.0 / _call("sqrt", (x - 1.0) * (x + 1.0)),), 160),
+    "sinh": Function(np.sinh, "sinh", lambda y, x: (apply("cosh", x),), 160),
+    "cosh": Function(np.cosh, "cosh", lambda y, x: (apply("sinh", x),), 160),
+    "asinh": Function(np.arcsinh, "asinh", lambda y, x: (1.0 / apply("sqrt", 1.0 + x * x),), 160),
+    "acosh": Function(np.arccosh, "acosh", lambda y, x: (1.0 / apply("sqrt", (x - 1.0) * (x + 1.0)),), 160),
     "atanh": Function(np.arctanh, "atanh", lambda y, x: (1.0 / ((1.0 - x) * (1.0 + x)),), 160),
-    "erf": Function(_special("erf"), "erf", lambda y, x: (_TWO_OVER_ROOT_PI * _call("exp", -(x * x)),), 160),
-    "erfc": Function(_special("erfc"), "erfc", lambda y, x: (-_TWO_OVER_ROOT_PI * _call("exp", -(x * x)),), 160),
-    "lgamma": Function(_special("gammaln"), "lgamma", lambda y, x: (_call("digamma", x),), 160),
-    "digamma": Function(_special("psi"), "digamma", lambda y, x: (_call("trigamma", x),), 160),
+    "erf": Function(_special("erf"), "erf", lambda y, x: (_TWO_OVER_ROOT_PI * apply("exp", -(x * x)),), 160),
+    "erfc": Function(_special("erfc"), "erfc", lambda y, x: (-_TWO_OVER_ROOT_PI * apply("exp", -(x * x)),), 160),
+    "lgamma": Function(_special("gammaln"), "lgamma", lambda y, x: (apply("digamma", x),), 160),
+    "digamma": Function(_special("psi"), "digamma", lambda y, x: (apply("trigamma", x),), 160),
     "trigamma": Function(_trigamma, _trigamma_of_tensors, _no_further, 160),
 }
 # fmt: on
+
+
+def apply(name: str, *args: Any) -> Any:
+    """Return the value of a function of the table, of numbers of any one kind, arrays, tensors or floats."""
+    for x in args:
+        if isinstance(x, Number):
+            return x.apply(name, args)
+    function = FUNCTIONS[name]
+    if all(isinstance(x, float | int | np.ndarray | np.generic) for x in args):
+        return function.numpy(*args)
+    return function.torch(*args)
+
+
+def fma(x: Any, y: Any, z: Any) -> Any:
+    """Return x·y + z, in compiled code rounded once."""
+    return apply("fma", x, y, z)
+
+
+def times(x: Any, y: Any) -> Any:
+    """Return x·y, a product of sums that may be multiplied out."""
+    return apply("times", x, y)
+
+
+def where(condition: Any, x: Any, y: Any) -> Any:
+    """Return x where the condition holds, else y."""
+    return apply("where", condition, x, y)

@@ -1,4 +1,4 @@
-"""From text of LLVM IR to machine code: optimised, kept in memory and on disk, called without the interpreter's lock."""
+"""From text of LLVM IR to machine code: kept in memory and on disk, called without the interpreter's lock."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
+
+from sympflow.compiler import elementary  # noqa: F401  (code of functions, which texts are made of)
 
 __all__ = ["Host", "compiled", "host"]
 

@@ -1,6 +1,6 @@
 """Numbers: what a stage calculates with. One kind of number, one interpretation of its operations.
 
-A stage is a Python function that uses operators and the functions of this module. Called with NumPy arrays or tensors
+A stage is a Python function that uses operators and the functions of `functions`. Called with NumPy arrays or tensors
 it computes; called with numbers of a kind of its own it records a program, writes machine code, expands polynomials.
 """
 
@@ -9,11 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
-from sympflow.compiler.functions import FUNCTIONS
-
-__all__ = ["Number", "apply", "dot", "fma", "times", "where"]
+__all__ = ["Number"]
 
 
 class Number:
@@ -92,38 +88,4 @@ class Number:
     def __bool__(self) -> bool:
         raise TypeError("a number that is traced has no value yet: write where(condition, a, b) in place of a branch.")
 
-    __float__ = __int__ = __index__ = __bool__  # type: ignore[assignment]
-
-
-def apply(name: str, *args: Any) -> Any:
-    """Return the value of a function of the table, of numbers of any one kind, arrays, tensors or floats."""
-    for x in args:
-        if isinstance(x, Number):
-            return x.apply(name, args)
-    function = FUNCTIONS[name]
-    if all(isinstance(x, float | int | np.ndarray | np.generic) for x in args):
-        return function.numpy(*args)
-    return function.torch(*args)
-
-
-def fma(x: Any, y: Any, z: Any) -> Any:
-    """Return x·y + z, in compiled code rounded once."""
-    return apply("fma", x, y, z)
-
-
-def times(x: Any, y: Any) -> Any:
-    """Return x·y, a product of sums that may be multiplied out."""
-    return apply("times", x, y)
-
-
-def where(condition: Any, x: Any, y: Any) -> Any:
-    """Return x where the condition holds, else y."""
-    return apply("where", condition, x, y)
-
-
-def dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
-    """Return Σ xᵢ yᵢ, added from the first to the last."""
-    total: Any = 0.0
-    for a, b in zip(x, y, strict=True):
-        total = total + a * b
-    return total
+    __float__ = __int__ = __index__ = __bool__

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler.functions import FUNCTIONS
-from sympflow.compiler.numbers import Number, apply
+from sympflow.compiler.functions import FUNCTIONS, apply
+from sympflow.compiler.numbers import Number
 
 __all__ = ["Program", "Traced", "derivatives", "gradient", "tangent", "traced"]
 
@@ -75,6 +75,7 @@ def _place(x: Any) -> tuple[int, float]:
     return (1, x.order) if isinstance(x, Traced) else (0, x)
 
 
+MOST_ROOTS = 8.5  # powers that are written as powers of a root
 _COMMUTE = {"add", "mul", "times", "min", "max", "eq", "and", "or"}
 
 
@@ -119,7 +120,10 @@ def _power(x: Any, n: Any) -> Any:
         return 1.0 / x
     if n == 0.5:
         return apply("sqrt", x)
-    return None
+    if n % 1 == 0.5 and abs(n) <= MOST_ROOTS:  # of the root or its reciprocal, which other powers share
+        root = apply("sqrt", x)
+        return (root if n > 0 else 1.0 / root) ** abs(2 * n)
+    return (1.0 / x) ** -n if n < 0 and n % 1 == 0 else None
 
 
 def _fused(a: Any, b: Any, c: Any) -> Any:
@@ -188,15 +192,13 @@ class Program:
 
     def __str__(self) -> str:
         lines = [f"{x!r} = {_written(x)}" for x in self.operations]
-        return "\n".join([f"({', '.join(map(repr, self.inputs))}) →", *lines, f"→ ({', '.join(map(_name, self.outputs))})"])
-
-
-def _name(x: Any) -> str:
-    return repr(x)
+        return "\n".join(
+            [f"({', '.join(map(repr, self.inputs))}) →", *lines, f"→ ({', '.join(map(repr, self.outputs))})"]
+        )
 
 
 def _written(x: Traced) -> str:
-    args = [_name(a) for a in x.args]
+    args = [repr(a) for a in x.args]
     infix = FUNCTIONS[x.name].infix
     return f"{args[0]} {infix} {args[1]}" if infix else f"{x.name}({', '.join(args)})"
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import sympy as sp
 
-from sympflow.compiler.numbers import apply, where
+from sympflow.compiler.functions import apply, where
 
 __all__ = ["NotRecorded", "evaluator"]
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
@@ -92,8 +93,7 @@ def run_function(
             with code.given(good):
                 n.value = n.value + k
                 going.value = going.value & (n.value < n_steps)
-                due = lambda: _due(code, save, n_saved, saved.value, n.value)
-                with code.during(due):
+                with code.during(partial(_due, code, save, n_saved, saved, n)):
                     lanes.store([x.value for x in end[:n_out]], out, begin, n_rows, n_saved, saved.value)
                     saved.value = saved.value + 1
             if width == 1:  # again, step by step
@@ -171,7 +171,7 @@ def step_function(
         state = _opened(code, values[:n_out], n_values)
         with code.over(n_columns) as j:
             given = []
-            for r, power in enumerate(powers):
+            for r in range(len(powers)):
                 total = code.variable(code.constant(0.0, at.type))
                 start = code.at(table, (n_columns * r + j) * n_powers)
                 with code.over(n_powers) as k:
@@ -272,11 +272,11 @@ def _finite(code: Code, x: Sequence[Value]) -> Value:
     return code.apply("eq", (total, 0.0))
 
 
-def _due(code: Code, save: Value, n_saved: Value, saved: Value, n: Value) -> Value:
+def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) -> Value:
     """True if the next output is that after n steps."""
-    left = saved < n_saved
-    following = code.load(save, code.select(left, saved, code.constant(0, INT)), INT)
-    return left & code.apply("eq", (following, n))
+    left = saved.value < n_saved
+    following = code.load(save, code.select(left, saved.value, code.constant(0, INT)), INT)
+    return left & code.apply("eq", (following, n.value))
 
 
 _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}

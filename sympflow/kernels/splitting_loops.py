@@ -85,7 +85,8 @@ class SplittingLoops:
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = self.traced = False
-        self._symbols, self._codes = system.symbols, {}
+        self._symbols = system.symbols
+        self._codes: dict[tuple[int, bool, Monomials], LoopFunctions] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not system.separable:
@@ -205,8 +206,11 @@ class SplittingLoops:
 
         key = level, compensated, monomials
         if key not in self._codes:
+            assert self._symbols is not None
             ndim = None if self.friction is None else self.friction.damping.ndim
-            self._codes[key] = SplittingCode(Splitting(self._symbols.parametric, level, monomials, compensated, ndim))
+            code = SplittingCode(Splitting(self._symbols.parametric, level, monomials, compensated, ndim))
+            processed = code.rollout_processed, code.rollout_processed_batch
+            self._codes[key] = LoopFunctions(code.rollout, code.rollout_batch, *processed, code.step_rows)
         return self._codes[key]
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:

@@ -10,16 +10,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
-from sympflow.compiler.numbers import times
+from sympflow.compiler.functions import times
 from sympflow.compiler.program import Program, derivatives, gradient, traced
-from sympflow.hamiltonian.driving import DURATION
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.runs import Numbers, map_function, run_function, step_function
@@ -92,9 +91,13 @@ class _Shape:
         symbols = splitting.symbols
         self.splitting, self.symbols, self.terms, self.d = splitting, symbols, terms, symbols.ndof
         errors = [f"error_{s}" for s in (*symbols.q, *symbols.p)] if splitting.compensated else []
-        states = [*((s.name, 0) for s in symbols.q), *((s.name, EARLY) for s in symbols.p), *((e, EARLY) for e in errors)]
+        states = [
+            *((s.name, 0) for s in symbols.q),
+            *((s.name, EARLY) for s in symbols.p),
+            *((e, EARLY) for e in errors),
+        ]
         self.made = made = Arrangement(states, splitting.numbers, expand)
-        self.q, self.p, self.errors = (made.states[k * self.d : (k + 1) * self.d] for k in range(3))
+        self.q, self.p = made.states[: self.d], made.states[self.d : 2 * self.d]
         self.errors = made.states[2 * self.d :]
         self.number = dict(zip(splitting.numbers, made.constants, strict=True))
         self.values = [self.number[s.name] for s in symbols.parameters]
@@ -140,6 +143,7 @@ class _Shape:
     def _by_mass(self, v: Sequence[Any]) -> list[Any]:
         """M⁻¹v."""
         M, entry = self.symbols.inverse_mass, self._of_parameters
+        assert M is not None
         return [_dot([entry(M[i, j]) for j in range(self.d)], v) for i in range(self.d)]
 
     def _of_parameters(self, f: Any) -> Any:
@@ -152,6 +156,7 @@ class _Shape:
             return [self.made.number(a * x) for x in self._by_mass(p)]
         numbers = zip((*self.symbols.p, *self.symbols.parameters), (*p, *self.values), strict=True)
         kinetic = evaluator(dict(numbers))
+        assert self.symbols.T is not None
         return [self.made.number(a * kinetic(self.symbols.T.diff(s))) for s in self.symbols.p]
 
     def _drifted(self, momenta: list[Any]) -> tuple[list[Any], list[Any]]:
@@ -178,9 +183,13 @@ class _Shape:
         numbers = [x for key, x in self.number.items() if key.startswith(f"{name}_")]
         if len(numbers) == d * d and self.splitting.friction == 2:
             return [_dot(numbers[i * d : (i + 1) * d], p) for i in range(d)]
-        return [self.made.number(x * (numbers[0] if self.splitting.friction == 0 else numbers[i])) for i, x in enumerate(p)]
+        return [
+            self.made.number(x * (numbers[0] if self.splitting.friction == 0 else numbers[i])) for i, x in enumerate(p)
+        ]
 
-    def _compensated(self, x: Sequence[Any], changes: Sequence[Any], errors: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    def _compensated(
+        self, x: Sequence[Any], changes: Sequence[Any], errors: Sequence[Any]
+    ) -> tuple[list[Any], list[Any]]:
         """x + change by Kahan's compensated sum, and the new errors."""
         op, sums, left = self.made.operation, [], []
         for value, change, error in zip(map(self.made.node, x), changes, map(self.made.node, errors), strict=True):

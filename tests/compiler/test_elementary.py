@@ -8,9 +8,8 @@ import pytest
 
 from sympflow.compiler.control import INT, POINTER, Module, Type
 from sympflow.compiler.elementary import INLINE
-from sympflow.compiler.functions import FUNCTIONS
+from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.machine import compiled
-from sympflow.compiler.numbers import apply
 
 SPECIAL = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 5e-324, -1e-310, 2.3e-308, 1.0, -1.0, 0.5, -5.0, 1e9, -3e300])
 HALVES = np.array([float(k * mpmath.pi / 2) for k in range(1, 120)])

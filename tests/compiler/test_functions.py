@@ -6,8 +6,7 @@ import pytest
 import torch
 from test_elementary import run
 
-from sympflow.compiler.functions import FUNCTIONS
-from sympflow.compiler.numbers import apply
+from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.program import derivatives, traced
 
 CONDITIONS = {"lt", "le", "eq", "and", "or", "not"}
