@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sympflow.storage.runs import RunStore
 
 SMALLEST_SCALE = 1e-12
-"""|H(y0)| below which an energy error is absolute, unless the system declares its `energy_scale`."""
+"""|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
 
 
 @dataclass
@@ -177,11 +177,7 @@ class Solution:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
         if self.varied and not self.system.autonomous:
             return gathered(self, lambda part: part.energy_scale())
-        declared = self.system.energy_scale
-        H0 = np.abs(_energy(self, self.y0, self.t_span[0]))
-        if declared is not None:
-            return np.full_like(H0, declared)
-        return np.where(H0 < SMALLEST_SCALE, np.nan, H0)
+        return known_scale(self.system, to_numpy(self.y0), self.t_span[0], _energy(self, self.y0, self.t_span[0]))
 
     def to_scipy(self) -> OptimizeResult:
         """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; of a single trajectory.
@@ -377,6 +373,16 @@ def check_solution(sol: object, name: str = "sol") -> None:
         raise TypeError(f"`{name}` must be a Solution; got {type(sol).__name__}. Pass what solve() returns.")
 
 
+def known_scale(system: HamiltonianSystem, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:
+    """The system's `energy_scale`, else |H0| of the states y0 (..., 2d); NaN where H0 is 0 but for rounding: (...)."""
+    if system.energy_scale is not None:
+        return np.full_like(H0, system.energy_scale)
+    with np.errstate(all="ignore"):
+        y = y0.astype(float)
+        terms = np.abs(y * np.asarray(system.gradient(y, None if system.autonomous else t0))).sum(-1)
+        return np.where(np.isfinite(H0) & (np.abs(H0) <= SMALLEST_SCALE * terms), np.nan, np.abs(H0))
+
+
 def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> np.ndarray:
     """H(y(t)) − H(y0) in float64, (..., n): the metric `sympflow.energy_error`, where it is documented.
 
@@ -397,7 +403,7 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
         scale = sol.energy_scale()
         if (absolute := np.isnan(scale)).any():
             warnings.warn(
-                f"The energy error is absolute where |H(y0)| < {SMALLEST_SCALE:g}: give the system an `energy_scale`.",
+                "The energy error is absolute where H(y0) is 0 but for rounding: give the system an `energy_scale`.",
                 RuntimeWarning,
                 stacklevel=stacklevel,
             )

@@ -28,7 +28,13 @@ from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap, warn_of_loss
+from sympflow.integrators.domain_exit import (
+    check_domain,
+    check_system_along,
+    warn_of_leap,
+    warn_of_loss,
+    warn_of_tolerance,
+)
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
@@ -262,6 +268,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         note_singularities(outcome, integrator, problem)
     if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
+    if integrator.absolute_tolerance and not failed and problem.store is None and readable(outcome.y):
+        warn_of_tolerance(outcome, system, integrator.absolute_tolerance, stacklevel=4)
     if system.functions_given and readable(outcome.y):
         system.check_functions_along(outcome.y)
     if integrator.trained:

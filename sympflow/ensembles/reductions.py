@@ -17,7 +17,7 @@ import numpy as np
 
 from sympflow.ensembles.chunks import Chunk
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.solution import SMALLEST_SCALE
+from sympflow.solution import known_scale
 
 Fields = dict[str, tuple[tuple[int, ...], np.dtype]]
 """Names of what is kept of each orbit, with the shape of one orbit and the dtype."""
@@ -104,7 +104,7 @@ class Final(Reduction):
 class EnergyError(Reduction):
     """The largest relative energy error |H(y(t)) − H(y0)| / |H(y0)| along each orbit: `energy_error`.
 
-    It is absolute where |H(y0)| is below 1e-12, and relative to the system's `energy_scale` if it has one.
+    It is absolute where H(y0) is 0 but for rounding, and relative to the system's `energy_scale` if it has one.
     """
 
     def check(self, system: HamiltonianSystem) -> None:
@@ -118,8 +118,7 @@ class EnergyError(Reduction):
         system = chunk.system
         with np.errstate(all="ignore"):
             H0 = np.asarray(system.hamiltonian(chunk.y0))
-            scale = np.where(np.abs(H0) < SMALLEST_SCALE, 1.0, np.abs(H0))
-            scale = scale if system.energy_scale is None else np.full_like(H0, system.energy_scale)
+            scale = np.nan_to_num(known_scale(system, chunk.y0, chunk.t_span[0], H0), nan=1.0)
             worst = np.zeros(len(chunk))
             for _, y in chunk.windows():
                 H = np.asarray(system.hamiltonian(y.swapaxes(1, 2)))

@@ -722,7 +722,7 @@ class HamiltonianSystem(Hamiltonian):
         probes = probe_states(given, self.domain, 2 * self.ndof)
         n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
         self._definition.check(probes, like, n_given, *self._probed_times())
-        self._tested = self._tested | {kind: reach(probes[:, : self._arguments])}
+        self._tested = self._tested | {kind: reach(probes[:, : self._arguments], self._arguments // self.ndof)}
 
     def check_functions_along(self, y: Array) -> None:
         """Test the functions of a user where a run went far beyond the states at which they were tested: `solve` does.
@@ -747,7 +747,8 @@ class HamiltonianSystem(Hamiltonian):
         except (ValueError, TypeError) as error:
             warnings.warn(f"On this run, far from its start: {error}", RuntimeWarning, stacklevel=3)
             return
-        self._tested = self._tested | {kind: reach(np.concatenate([reached, far[:, : self._arguments]]))}
+        seen = np.concatenate([reached, far[:, : self._arguments]])
+        self._tested = self._tested | {kind: reach(seen, self._arguments // self.ndof)}
 
     def _probed_times(self) -> tuple[np.ndarray, ...]:
         """The times at which functions of a driven system are tested."""

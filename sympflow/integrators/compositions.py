@@ -88,8 +88,8 @@ class Composition(ABC):
         return x
 
     def distance(self, x: Array) -> Array:
-        """Distance of those states from ones that `lift` gives: (...)."""
-        return 0 * x[..., 0]
+        """Distance of those states from ones that `lift` gives, in q and in p: (..., 2)."""
+        return 0 * x[..., :2]
 
     @abstractmethod
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -605,7 +605,7 @@ class TwoCopies(SolvableParts):
         return mean(x, self.ndof)
 
     def distance(self, x: Array) -> Array:
-        """The largest difference of the copies: (..., 4d) to (...)."""
+        """The largest differences of the copies in q and in p: (..., 4d) to (..., 2)."""
         return distance(x, self.ndof)
 
 

@@ -85,7 +85,8 @@ class Gauss(OwnStepper):
         M, D = collocation.newton_matrix(system, y[..., None, :] + A @ K, h, times, A, scale)
         s, n = K.shape[-2:]
         slopes = (h[..., None, None] * scale[:, None, None] * D).reshape(*y.shape[:-1], s * n, n)
-        dK = collocation.solved(M, slopes).reshape(*y.shape[:-1], s, n, n)
+        sizes = collocation.variable_sizes(y, K, 0 * M[..., 0])
+        dK = collocation.solved(M, slopes, sizes).reshape(*y.shape[:-1], s, n, n)
         J = np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
         if system.friction is not None:
             E = collocation.decays(system, h[..., 0])

@@ -76,6 +76,10 @@ class RungeKutta(ExplicitStep):
         if self.rtol == 0 and self.atol == 0:
             raise ValueError("`rtol` and `atol` are both 0, which no step can meet: make one of them positive.")
 
+    @property
+    def absolute_tolerance(self) -> float:
+        return float(self.atol) if self.atol == type(self).atol else 0.0
+
 
 def weighted(weights: Any, K: list[Array]) -> Array:
     """Σ_i weights_i K_i, for as many weights as there are."""

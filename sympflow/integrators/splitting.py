@@ -135,9 +135,10 @@ class Splitting(OwnStepper):
         For the splitting "parts": expressions that add up to H, in their order, the last innermost. The default is
         found in the terms of H: as few as possible, potentials first and the linear part last.
     omega : float, optional
-        For the splitting "copies": ω. The default is the largest |λ| of J∇²H at the system's y0. Weaker, the copies may
-        drift apart, of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the
-        copies; a run keeps both, and is symplectic in their phase space [3]_.
+        For the splitting "copies": ω, a rate; the copies are bound by ω Σ (s²(q − x)² + (p − y)²/s²)/2, where s makes q
+        and p comparable. The default is the largest |λ| of J∇²H at the system's y0. Weaker, the copies may drift apart,
+        of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the copies; a run
+        keeps both, and is symplectic in their phase space [3]_.
     shift : float, optional
         For the logarithmic clock: c, above the energy; default E + |E|, which is 0 for a bound system.
 
