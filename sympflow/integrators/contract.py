@@ -224,7 +224,7 @@ class Integrator:
 
     @property
     def absolute_tolerance(self) -> float:
-        """The default `atol`, in the units of y, of a method that chooses its steps; 0 where it was given, or is none."""
+        """The default `atol`, in units of y, of a method that chooses its steps; 0 where it was given, or is none."""
         return 0.0
 
     @property

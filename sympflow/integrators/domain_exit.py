@@ -94,8 +94,8 @@ def warn_of_tolerance(outcome: Outcome, system: HamiltonianSystem, tolerance: fl
     if small.any():
         k = int(np.argmax(small))
         warnings.warn(
-            f"`atol`, by default {tolerance:g}, is larger than every {'qp'[k]} of the run, at most {sizes[k].max():.3g}, "
-            f"whose errors it hides. Pass an `atol`, such as {sizes[k].max() * 1e-9:.0e}.",
+            f"`atol`, by default {tolerance:g}, is larger than every {'qp'[k]} of the run, at most "
+            f"{sizes[k].max():.3g}, whose errors it hides. Pass an `atol`, such as {sizes[k].max() * 1e-9:.0e}.",
             RuntimeWarning,
             stacklevel=stacklevel + 1,
         )

@@ -199,8 +199,8 @@ def _orbit(system: HamiltonianSystem, y0: np.ndarray, t_span: tuple[float, float
     length = min(abs(t_span[1] - t_span[0]), MOST_OF_ORBIT * system.dt)
     times = np.linspace(0.0, length, ORBIT)
     with _quiet():
-        how = {"t_eval": times, "rtol": 1e-6, "atol": 1e-8 * smallest_size(system, y0)}
-        states = solve(system, "dop853", (0.0, length), y0, **how).states
+        atol = 1e-8 * smallest_size(system, y0)
+        states = solve(system, "dop853", (0.0, length), y0, t_eval=times, rtol=1e-6, atol=atol).states
     return states if len(states) else y0[None]
 
 

@@ -55,5 +55,5 @@ def test_a_reference_tells_its_own_times():
     of_solution, of_array = (compare(system, ["verlet"], ["error"], reference=r, **how) for r in (truth, truth.y))
     np.testing.assert_array_equal(of_solution.t, t)
     assert of_solution.rows[0].error == of_array.rows[0].error
-    with pytest.raises(ValueError, match="^`reference` must be at the 20 instants"):
+    with pytest.raises(ValueError, match=r"^`reference` must be at the 20 instants"):
         compare(system, ["verlet"], ["error"], reference=truth, **{**how, "n_outputs": 20})

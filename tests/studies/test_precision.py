@@ -197,7 +197,7 @@ def test_a_warm_up_is_a_run_of_a_few_steps_with_as_many_outputs():
 
 
 def test_an_error_that_would_be_small_by_chance_is_measured():
-    """At dt·ω = 2 Verlet turns an oscillator at rest by half a turn: all its steps have its energy, but for rounding."""
+    """At dt·ω = 2 Verlet turns an oscillator at rest by half a turn: all its steps have its energy but for rounding."""
     few = {"t_span": (0, 20 / 1.3), "y0": [1.0, 0.0], "n_outputs": 10, "repeats": 1}
     rows = work_precision(systems.harmonic_oscillator(1.3), ["verlet"], steps=[2 / 1.3, 0.4, 0.1], **few).rows
     assert [row.dt for row in rows] == [2 / 1.3, 0.4, 0.1]
