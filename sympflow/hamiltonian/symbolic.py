@@ -669,6 +669,11 @@ _MAX_POWER = 16  # integer powers up to this are made of products
 _INTEGER_POWER = sp.Function("integer_power", real=True)
 
 
+def _of_machine_numbers(f: sp.Expr) -> sp.Expr:
+    """f with integers that no 64 bits hold, as of a system in SI units, as floating-point numbers."""
+    return f.xreplace({n: sp.Float(int(n)) for n in f.atoms(sp.Integer) if abs(n) >= 2**63})
+
+
 def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], library: str) -> Callable[..., list[Any]]:
     """The values of the expressions, as a function of the variables' arrays of "numpy" or "torch".
 
@@ -677,7 +682,7 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     TypeError
         If the library has no function for something in the expressions.
     """
-    code = [_by_products(f) if library == "numpy" else f for f in expressions]
+    code = [_by_products(f) if library == "numpy" else f for f in map(_of_machine_numbers, expressions)]
     sums = [_in_pieces(f) for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
