@@ -11,6 +11,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.scales import weights
 
 if TYPE_CHECKING:
     import os
@@ -328,17 +329,17 @@ def dataset(sol: Solution, energy: bool = True, asked: str = "to_xarray()") -> x
 
 
 LARGEST_DIFFERENCE = 1e-6
-"""Difference of the two copies in q or p, over the largest of these, beyond which a physical solution warns."""
+"""Difference of the two copies, over the size of the states, beyond which a physical solution warns."""
 
 
 def physical_solution(sol: Solution) -> Solution:
     """The physical part of a solution of a doubled system: see `Solution.physical`."""
     doubled = sol.system.as_doubled()
     with np.errstate(all="ignore"):
-        both = (to_numpy(y) for y in (doubled.difference(sol.states), doubled.physical_limit(sol.states)))
-        of_q_and_p = [abs(y).reshape(-1, 2, y.shape[-1] // 2).max((0, 2), initial=0.0) for y in both]
-        apart = of_q_and_p[0].max()
-    if (of_q_and_p[0] > LARGEST_DIFFERENCE * of_q_and_p[1]).any():
+        both, scale = (doubled.difference(sol.states), doubled.physical_limit(sol.states)), weights(doubled.physical)
+        apart = abs(to_numpy(both[0])).max(initial=0.0)
+        scaled_apart, size = (abs(scale * to_numpy(y)).max(initial=0.0) for y in both)
+    if scaled_apart > LARGEST_DIFFERENCE * size:
         warnings.warn(
             f"The doubled variables q₋, p₋ have grown to {apart:.3g}: the run has left the physical limit. Reduce "
             "`dt`, or project every step, solve(system, 'projected', of=method).",

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, library
+from sympflow.arrays import Array, concatenate, library, like, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative
 from sympflow.hamiltonian.parts import ExactParts, PartFunctions
 from sympflow.hamiltonian.scales import fastest_rate, natural_scale
@@ -95,10 +95,13 @@ def mean(x: Array, d: int) -> Array:
     return concatenate([(x[..., :d] + x[..., d : 2 * d]) / 2, (x[..., 2 * d : 3 * d] + x[..., 3 * d :]) / 2])
 
 
-def distance(x: Array, d: int) -> Array:
-    """The largest difference of the two copies in a coordinate, and in a momentum: (..., 4d) to (..., 2)."""
-    apart = abs(concatenate([x[..., :d] - x[..., d : 2 * d], x[..., 2 * d : 3 * d] - x[..., 3 * d :]]))
-    return library(apart).amax(apart.reshape(*apart.shape[:-1], 2, d), -1)
+def distance(x: Array, s: np.ndarray) -> Array:
+    """The largest |s(q − x)| or |(p − y)/s|, and the largest of these variables: (..., 4d) to (..., 2)."""
+    d = len(s)
+    x = x * like(np.concatenate([s, s, 1 / s, 1 / s]), x)
+    apart = concatenate([x[..., :d] - x[..., d : 2 * d], x[..., 2 * d : 3 * d] - x[..., 3 * d :]])
+    xp = library(x)
+    return stack([xp.amax(abs(apart), -1), xp.amax(abs(x), -1)], axis=-1)
 
 
 def coupling_strength(system: HamiltonianSystem) -> float:

@@ -20,6 +20,7 @@ from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_st
 from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, linear_and_rest, map_evaluations
+from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import rollout
@@ -88,7 +89,7 @@ class Composition(ABC):
         return x
 
     def distance(self, x: Array) -> Array:
-        """Distance of those states from ones that `lift` gives, in q and in p: (..., 2)."""
+        """Distance of those states from ones that `lift` gives, and their size: (..., 2)."""
         return 0 * x[..., :2]
 
     @abstractmethod
@@ -588,7 +589,7 @@ class TwoCopies(SolvableParts):
         parts: tuple[str, ...] | None = None,
         omega: float | None = None,
     ) -> None:
-        self.omega, self.ndof = omega, system.ndof
+        self.omega, self.ndof, self.scale = omega, system.ndof, natural_scale(system)
         super().__init__(method, scheme, system, parts)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
@@ -605,8 +606,8 @@ class TwoCopies(SolvableParts):
         return mean(x, self.ndof)
 
     def distance(self, x: Array) -> Array:
-        """The largest differences of the copies in q and in p: (..., 4d) to (..., 2)."""
-        return distance(x, self.ndof)
+        """The largest difference of the copies, and the size of their states: (..., 4d) to (..., 2)."""
+        return distance(x, self.scale)
 
 
 SPLITTINGS: dict[str, type[Composition]] = {

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sympflow.storage.runs import RunStore
 
 APART = 0.1
-"""Distance of two copies, of q and p apart over the largest of the run, beyond which its states mean little."""
+"""Distance of two copies, over the size of the states of the run, beyond which these mean little."""
 
 
 class Extension(Protocol):
@@ -34,7 +34,7 @@ class Extension(Protocol):
         ...
 
     def distance(self, x: Array) -> Array:
-        """Distance of states of the extended space from those that `lift` gives, in q and in p: (..., 2)."""
+        """Distance of states of the extended space from those that `lift` gives, and their size: (..., 2)."""
         ...
 
 
@@ -79,9 +79,9 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Extension, proble
     outcome.y = extension.project(x)
     if outcome.sol is not None:
         outcome.sol = Projected(outcome.sol, extension)
-    if store is not None and "apart_q" in store.noted:
-        noted = np.array([[store.noted[f"{what}_{part}"] for part in "qp"] for what in ("apart", "size")])
-        outcome.stats["copy_distance"] = apart = float(_ratio(*noted))
+    if store is not None and "copy_distance" in store.noted:
+        noted = np.array([store.noted[name] for name in ("copy_distance", "size")])
+        outcome.stats["copy_distance"] = apart = float(_ratio(noted))
         if apart > APART and np.all(np.asarray(outcome.status) >= 0):
             _warn(extension, apart, "")
     elif len(x):
@@ -101,17 +101,16 @@ def _of_projections(search: EventSearch, extension: Extension) -> Any:
 def _noted(store: RunStore, extension: Extension, x: np.ndarray) -> np.ndarray:
     """The states of those of the extended space; a store keeps how far these are from ones that stand for a state."""
     with np.errstate(all="ignore"):
-        found = {"apart": np.asarray(extension.distance(x)), "size": _sizes(x)}
-    if not np.isnan(found["apart"]).all():
-        for what, values in found.items():
-            of_q, of_p = np.nanmax(values.reshape(-1, 2), axis=0).tolist()
-            store.note(**{f"{what}_q": of_q, f"{what}_p": of_p})
+        found = np.asarray(extension.distance(x)).reshape(-1, 2)
+    if not np.isnan(found).all():
+        apart, size = np.nanmax(found, axis=0).tolist()
+        store.note(copy_distance=apart, size=size)
     return np.asarray(extension.project(x))
 
 
 def _warn_of_distance(extension: Extension, x: np.ndarray, outcome: Outcome) -> None:
     with np.errstate(all="ignore"):
-        ratio = _ratio(np.asarray(extension.distance(x)).max(0), _sizes(x).max(0))
+        ratio = _ratio(np.asarray(extension.distance(x)).max(0))
     outcome.stats["copy_distance"] = float(np.nanmax(ratio)) if not np.isnan(ratio).all() else float("nan")
     lost = (ratio > APART) & (np.asarray(outcome.status) >= 0)  # what has failed says more
     if lost.any():
@@ -119,20 +118,16 @@ def _warn_of_distance(extension: Extension, x: np.ndarray, outcome: Outcome) -> 
         _warn(extension, float(np.nanmax(ratio)), which)
 
 
-def _sizes(x: np.ndarray) -> np.ndarray:
-    """The largest |q| and |p| of states of the extended space: (..., 2k) to (..., 2)."""
-    return np.abs(x).reshape(*x.shape[:-1], 2, -1).max(-1)
-
-
-def _ratio(apart: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The larger of the two distances (..., 2) in units of the sizes; 0 where nothing is apart."""
-    return np.where(apart == 0, 0.0, apart / np.where(size == 0, 1.0, size)).max(-1)
+def _ratio(found: np.ndarray) -> np.ndarray:
+    """Distances in units of sizes, (..., 2) to (...); 0 where nothing is apart."""
+    apart, size = found[..., 0], found[..., 1]
+    return np.where(apart == 0, 0.0, apart / np.where(size == 0, 1.0, size))
 
 
 def _warn(extension: Extension, apart: float, which: str) -> None:
     warnings.warn(
-        f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g} of the largest "
-        "q or p: its states say little about the system. Reduce `dt`, or change `omega`, the strength by which the "
+        f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g} of the size of "
+        "the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which the "
         "copies are bound.",
         RuntimeWarning,
         stacklevel=5,
