@@ -204,7 +204,8 @@ def variable_sizes(y: Array, K: Array, residual: Array) -> Array:
     own = xp.maximum(abs(y), both).reshape(*y.shape[:-1], 2, n // 2)
     kind = xp.amax(own, -1)[..., None] + 0 * own
     size = xp.where(own > 0, own, xp.where(kind > 0, kind, 1 + 0 * kind))
-    powers = xp.exp2(xp.round(xp.log2(size))).reshape(*y.shape[:-1], 1, n) + 0 * K
+    most = int(0.4 * math.log2(float(xp.finfo(y.dtype).max)))  # so that their ratios are numbers
+    powers = xp.exp2(xp.clip(xp.round(xp.log2(size)), -most, most)).reshape(*y.shape[:-1], 1, n) + 0 * K
     return powers.reshape(*y.shape[:-1], -1)
 
 

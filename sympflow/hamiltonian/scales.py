@@ -47,9 +47,17 @@ def weights(system: HamiltonianSystem) -> np.ndarray:
 
 
 def smallest_size(system: HamiltonianSystem, y0: np.ndarray) -> float:
-    """A size that no q and no p of an orbit from the states y0 (..., 2d) is less than, as a whole; never 0."""
+    """A size that neither all q nor all p of an orbit from the states y0 (..., 2d) are less than; never 0.
+
+    Of states at 0 it is that of their motion in a step `dt`, 1 where there is none.
+    """
     scale = weights(system)
-    return float(np.abs(scale * y0).max(initial=0.0) / scale.max()) or float(np.finfo(float).tiny) ** 0.5
+    size = np.abs(scale * y0).max(initial=0.0)
+    if size == 0:
+        slopes = [np.asarray(system.vector_field(y0, float(t))) for t in probe_times(*system.t_span)]
+        size = np.abs(scale * slopes).max(initial=0.0) * system.dt
+    found = float(size / scale.max())
+    return found if 0 < found < np.inf else 1.0
 
 
 def _of_hessians(system: HamiltonianSystem) -> np.ndarray:

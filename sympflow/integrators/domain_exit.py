@@ -89,8 +89,10 @@ def warn_of_tolerance(outcome: Outcome, system: HamiltonianSystem, tolerance: fl
         small = (sizes.max(-1) > 0) & (sizes.max(-1) <= tolerance)
     if not small.any():
         return
-    scaled = (sizes * weights(system).reshape(2, -1)).max(-1)
-    small &= scaled > NEXT_TO * scaled.max()
+    scale = weights(system)
+    scaled = (sizes * scale.reshape(2, -1)).max(-1)
+    at_rest = system.y0 is not None and scaled.max() <= np.finfo(float).eps * np.abs(scale * system.y0).max()
+    small &= (scaled > NEXT_TO * scaled.max()) & (not at_rest)
     if small.any():
         k = int(np.argmax(small))
         warnings.warn(

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 SIZE = 2 * NDOF
+SMALLEST = 1e-150  # of a size whose reciprocal is multiplied by other numbers
 DAMPED = len(RATES) > 0
 
 
@@ -43,7 +44,7 @@ def fill_sizes(y, K, change, sizes):
         for m in range(part * NDOF, (part + 1) * NDOF):
             size = sizes[m] if sizes[m] > 0.0 else top
             for i in range(STAGES):
-                sizes[i * SIZE + m] = 1.0 / size if size > 0.0 else 1.0
+                sizes[i * SIZE + m] = 1.0 / max(size, SMALLEST) if size > 0.0 else 1.0
 
 
 @njit(**OPTIONS)
