@@ -47,11 +47,8 @@ def warn_of_jumps(
             "first order. Choose a `dt` that divides all pieces between jumps from t0 on, or solve from jump to jump."
         )
     else:
-        met = (
-            []
-            if method is None
-            else [t for t in (t0, *times, t1) if t0 != t != t1 or _jumps_into(system, t, t0, t1, dt)]
-        )
+        known = [] if method is None else sorted({t0, *times.tolist(), t1})
+        met = [t for t in known if t0 != t != t1 or _jumps_into(system, t, t0, t1, dt)]
         if not met:
             return False
         text = (

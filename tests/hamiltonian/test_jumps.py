@@ -118,6 +118,7 @@ REFUSED = {
     "an energy": lambda: COMB.hamiltonian(np.zeros(2), 0.0),
     "multipliers": lambda: sympflow.floquet_multipliers(COMB, period=PI),
     "exponents": lambda: sympflow.lyapunov(COMB),
+    "indicators": lambda: sympflow.ensemble(COMB, "verlet", (0, 4), np.zeros((2, 2)), reduce="sali"),
     "a balance": lambda: sympflow.energy_balance_error(solve(COMB, "verlet", (0, 4), backend="array")),
     "symplecticity": lambda: sympflow.symplecticity_defect(solve(COMB, "verlet", (0, 4), backend="array")),
     "a store": lambda: solve(COMB, "verlet", (0, 4), store="never.zarr"),
