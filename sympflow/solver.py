@@ -36,6 +36,7 @@ from sympflow.integrators.domain_exit import (
     warn_of_tolerance,
 )
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
+from sympflow.integrators.impulses import run_between_impulses
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution, StoredSolution, joined
@@ -240,18 +241,29 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     """The solution of a validated problem."""
     system, y_start = problem.system, problem.y0
     n_times = 0 if problem.t_eval is None else len(problem.t_eval)
-    integrator = integrator.resolved(system, y_start, abs(problem.t1 - problem.t0), n_times)
-    check_applies(integrator, system, y_start)
+    between = system.between_impulses
+    integrator = integrator.resolved(between, y_start, abs(problem.t1 - problem.t0), n_times)
+    check_applies(integrator, between, y_start)
     integrator.check_library(y_start)
-    if not system.autonomous:
-        warn_of_jumps(system, problem.t0, problem.t1, integrator.step_length(system), stacklevel=4)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
+    if between is not system:
+        _check_impulses(problem, integrator)
+        run = partial(run_between_impulses, _run)
+    elif not system.autonomous:
+        warn_of_jumps(
+            system,
+            problem.t0,
+            problem.t1,
+            integrator.step_length(system),
+            integrator.label if integrator.forces_at_ends(system) else None,
+            stacklevel=4,
+        )
     if problem.t1 in (math.inf, -math.inf):
         run = _run_endless
     elif problem.store is not None:
         run = partial(_run_stored, action=action)
     else:
-        check_memory(integrator, problem)
+        check_memory(integrator, replace(problem, system=between))
 
     start, stopped = time.perf_counter(), None
     with naming_plugin(integrator):
@@ -273,10 +285,10 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     if system.functions_given and readable(outcome.y):
         system.check_functions_along(outcome.y)
     if integrator.trained:
-        check_system_along(outcome, integrator, system, y_start)
+        check_system_along(outcome, integrator, between, y_start)
     if action != "ignore" and readable(outcome.y):
-        check_domain(outcome, integrator, system, action)
-        if problem.store is None and not failed:
+        check_domain(outcome, integrator, between, action)
+        if problem.store is None and not failed and between is system:
             warn_of_loss(outcome, integrator, system, y_start, stacklevel=4)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     sol = (Solution if problem.store is None else StoredSolution)(
@@ -308,7 +320,8 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     """
     states = problem.y0.reshape(-1, problem.y0.shape[-1])
     groups = []
-    for group in rows.by_form() if action == "ignore" else rows.distinct():
+    alike = action == "ignore" and problem.system.between_impulses is problem.system
+    for group in rows.by_form() if alike else rows.distinct():
         together = replace(problem, system=group.system, y0=states[group.places], letters=group.letters)
         if group.letters is None or integrator.takes_letters(together):
             groups.append((group.places, together))
@@ -375,6 +388,18 @@ def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
     if search is None or integrator.finds_events:
         return integrator.run(problem), problem
     return run_and_search(integrator, problem, search), problem
+
+
+def _check_impulses(problem: Problem, integrator: Integrator) -> None:
+    """Refuse what is not done of a system with impulses."""
+    system, search = problem.system, problem.events
+    if problem.store is not None:
+        system.check_impulses("and a run into a `store` makes no kicks", "leave `store` out")
+    if not math.isfinite(problem.t1):
+        system.check_impulses("and `t_span` has no end up to which they are known", "give it a finite one")
+    if search is not None and search.events and integrator.keeps:
+        what = f"after each of which {integrator.keeps} begins anew in method {integrator.name!r}, and so do `events`"
+        system.check_impulses(what, "use another method")
 
 
 def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[Outcome, Problem]:

@@ -150,7 +150,7 @@ def ensemble(
         system = system.with_params(**fixed)
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
     integrator = integrator.resolved(system, first, abs(t1 - t0), 0 if times is None else len(times))
-    check_applies(integrator, system, first)
+    check_applies(integrator, system if kept.own_loops else system.between_impulses, first)
     for system_of in _telling(system, axes):
         kept.check(system_of)
     varied = kept.takes_params and _runs_together(system, integrator, (t0, t1), axes, first, backend)

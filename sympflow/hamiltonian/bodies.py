@@ -14,6 +14,7 @@ import sympy as sp
 
 from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
 
 MOST_AXES = 3
@@ -146,6 +147,7 @@ class PairsHamiltonian(LocalHamiltonian):
         self.columns = np.array([x for x, is_used in zip(columns.values(), used, strict=True) if is_used])
         self.columns = self.columns.reshape(-1, self.n_bodies)
         self.c, self.constants = c, tuple(self.params.values())
+        self._written = V
         V = V.subs(r, sp.sqrt(self.s))
         if self.cutoff is not None:
             end = sp.Symbol("end", positive=True)
@@ -153,6 +155,15 @@ class PairsHamiltonian(LocalHamiltonian):
             V = V - V.subs(self.s, end) - (self.s - end) * slope
             self.c, self.constants = (*self.c, end), (*self.constants, self.cutoff**2 + self.softening**2)
         self.V = V
+        self._check_continuous()
+
+    def _check_continuous(self) -> None:
+        """Refuse a V that jumps."""
+        columns = [*self.columns, *self.columns, *self.params.values()]
+        letters_of = (*self.first, *self.second, *self.c[: len(self.params)])
+        names = dict(zip(self.c, self.params, strict=False))
+        distance = [s for s in self._written.free_symbols if s.name == "r"]
+        check_continuous("potential", self._written, distance, dict(zip(letters_of, columns, strict=True)), names)
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
@@ -161,6 +172,7 @@ class PairsHamiltonian(LocalHamiltonian):
         other.constants = (*other.params.values(), *self.constants[len(self.params) :])
         for name in ("terms", "bond_length"):
             vars(other).pop(name, None)
+        other._check_continuous()
         return other
 
     @property

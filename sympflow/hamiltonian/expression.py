@@ -36,7 +36,7 @@ SPECIAL = (
 )
 # fmt: on
 FUNCTIONS: dict[str, Callable[..., Any]] = {
-    **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Max", "Min", "Rational")},
+    **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Max", "Min", "Rational", "DiracDelta")},
     "ln": sp.log,
     "abs": sp.Abs,
     "max": sp.Max,

@@ -12,6 +12,7 @@ import sympy as sp
 
 from sympflow.arrays import Array, assemble, is_tensor
 from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.jumps import refuse_deltas
 from sympflow.hamiltonian.symbolic import checked_params, generate, printable
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ class SymbolicForce:
             if not any(sp.Symbol(name, real=True) in f.free_symbols for f in read_ones):
                 raise ValueError(f"`params` has {name!r}, which the force does not use: remove it.")
         self.expressions = [self._valued(f, values) for f in read_ones]
+        for f in self.expressions:
+            refuse_deltas("force", f)
 
     def _valued(self, f: sp.Expr, values: Mapping[str, float]) -> sp.Expr:
         """The expression in the system's coordinates, its parameters replaced by their values."""

@@ -15,6 +15,7 @@ import sympy as sp
 
 from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, concatenate, is_tensor, library
+from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
 from sympflow.hamiltonian.poles import Poles
@@ -77,6 +78,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         self.params = checked_params(params, self.shape)
         self._set_letters()
         self._read(onsite, bond, kinetic)
+        self._check_continuous()
         self._check_sizes()
         self._set_mass()
 
@@ -86,6 +88,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         for name in ("_functions", "terms"):
             vars(other).pop(name, None)
         other.params = checked_params({**self.params, **values}, self.shape)
+        other._check_continuous()
         other._set_mass()
         return other
 
@@ -291,6 +294,14 @@ class LatticeHamiltonian(LocalHamiltonian):
         for name, s in values.items():
             if s not in used:
                 raise ValueError(f"`params` has {name!r}, which no expression uses: remove it.")
+
+    def _check_continuous(self) -> None:
+        """Refuse U, V and T that jump."""
+        values = dict(zip(self.c, self.params.values(), strict=True))
+        own = [(s, name) for kind, row in self.names.items() for s, name in zip(getattr(self, kind), row, strict=True)]
+        names = dict([*own, *zip(self.c, self.params, strict=True)])
+        for argument, f in (("onsite", self.U), ("kinetic", self.T), *(("bond", V) for V in self.bonds.values())):
+            check_continuous(argument, f, [s for s, _ in own], values, names)
 
     def _check_sizes(self, argument: str = "shape") -> None:
         reach = max(self.bonds, default=0)

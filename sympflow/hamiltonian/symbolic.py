@@ -8,6 +8,7 @@ import re
 import reprlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import islice
 from operator import add
@@ -23,23 +24,53 @@ from sympflow.arrays import Array, assemble, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
-    JUMP,
-    MOST_POINTS,
     Samples,
     check_span,
     drift,
     is_spline,
     sampled,
     sampled_parameter,
-    switches,
     with_letters,
-    zeros,
 )
 from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, read
+from sympflow.hamiltonian.jumps import (
+    MOST_IMPULSES,
+    MOST_POINTS,
+    Impulse,
+    Switch,
+    Zeros,
+    borders,
+    check_continuous,
+    has_period,
+    split_impulses,
+)
 
 LARGEST = sys.float_info.max
 FAR = 1000.0
-"""The time before and after 0 in which it is looked if H jumps."""
+"""The time before and after 0 in which it is looked if H jumps, where that is at no zeros of linear functions."""
+
+
+@dataclass(frozen=True)
+class Kick:
+    """The impulses of H at a time: with terms δ(g(t))·W(q, t) the flow p −= Σ ∇W(q, t)/|g'(t)|.
+
+    Attributes
+    ----------
+    t : float
+    potentials : tuple of (float, SymbolicHamiltonian)
+        1/|g'(t)| and W of each.
+    """
+
+    t: float
+    potentials: tuple[tuple[float, SymbolicHamiltonian], ...]
+
+    def __call__(self, y: Array, sign: float = 1.0) -> Array:
+        """Return the states (..., 2d) after the kick, for those before; with a sign of −1 the reverse."""
+        d = y.shape[-1] // 2
+        q, p = y[..., :d], y[..., d:]
+        for strength, W in self.potentials:
+            p = p - (sign * strength) * W.gradient(y, self.t)[..., :d]
+        return concatenate([q, p])
 
 
 class SymbolicHamiltonian(Definition):
@@ -88,6 +119,10 @@ class SymbolicHamiltonian(Definition):
     named_time: sp.Symbol | None = None
     """The time as it was given; `time` is None where H, by the values of its parameters, does not depend on it."""
     samples: Mapping[str, Samples] = MappingProxyType({})
+    impulses: tuple[tuple[Zeros, SymbolicHamiltonian], ...] = ()
+    """The zeros of g, and W, of the terms δ(g(t))·W(q, t) of H."""
+    _rest: SymbolicHamiltonian | None = None
+    """H without its impulses, where it has some."""
 
     def __init__(
         self,
@@ -122,7 +157,15 @@ class SymbolicHamiltonian(Definition):
         if values:
             _check_values(H, values)
             self._written = written.xreplace(numbered), values
-        self._set(H.xreplace(numbered))
+        H = H.xreplace(numbered)
+        if H.has(sp.DiracDelta):
+            rest, potentials = split_impulses("expression", H, self.time, self.q, self.p)
+            self._rest = self.like(rest)
+            self.impulses = tuple((Zeros(g, self.time), self.like(W)) for g, W in potentials.items())
+            if self.time not in rest.free_symbols:
+                self._rest.time = None
+            H = H.replace(sp.DiracDelta, lambda g, *_: Impulse(g))
+        self._set(H)
 
     def _set(self, H: sp.Expr) -> None:
         self.H: sp.Expr = _with_numeric_constants(H)
@@ -200,29 +243,58 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def jumps(self) -> bool:
-        """True if H jumps at some times, at those of samples or of a function of the time that jumps."""
-        if self.shortest_piece < math.inf or self.time is None:
-            return self.shortest_piece < math.inf
-        return self.Ht.has(sp.DiracDelta) or len(self.jump_times(-FAR, FAR, FAR / MOST_POINTS)) > 0
+        """True if H jumps at some times, at those of samples or of a function of the time that jumps, or has impulses.
+
+        In a time of `FAR` about 0 and about every zero of a linear function.
+        """
+        if self.impulses or self.shortest_piece < math.inf:
+            return True
+        return any(each.at_root or len(each.times(-FAR, FAR, FAR / MOST_POINTS)) for each in self._switches)
 
     @cached_property
-    def _switches(self) -> tuple[sp.Expr, ...]:
-        return () if self.time is None else switches(self.H, self.time)
+    def _switches(self) -> list[Switch]:
+        """Where H may jump in t alone."""
+        if self.time is None:
+            return []
+        own = [border for border in borders(self.H, [self.time]) if border.g.free_symbols == {self.time}]
+        return [Switch(border, self.time, self.samples) for border in own]
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
         found = [samples.jump_times(low, high) for samples in self.samples.values()]
-        for g in self._switches:
-            times = zeros(g, self.time, low, high, step)
-            found.append(times[self._differs_across(times)])
-        return np.unique(np.concatenate(found)) if found else np.zeros(0)
+        found += [each.times(low, high, step) for each in self._switches]
+        times = np.unique(np.concatenate(found)) if found else np.zeros(0)
+        return times[np.diff(times, prepend=-np.inf) > 8 * sys.float_info.epsilon * np.abs(times)]
 
-    def _differs_across(self, times: np.ndarray) -> np.ndarray:
-        """True for the times (n,) at which H jumps, by its values on both sides at a few states."""
-        y = np.random.default_rng(0).uniform(-1.0, 1.0, (len(times), 4, 2 * self.ndof))
-        aside = 1e-12 * np.maximum(1.0, np.abs(times))[:, None]
-        with np.errstate(all="ignore"):
-            before, after = (self.hamiltonian(y, times[:, None] + s * aside) for s in (-1, 1))
-            return (np.abs(after - before) > JUMP * (np.abs(after) + np.abs(before))).any(-1)
+    def check_continuous(self) -> None:
+        """Raise a ValueError where H jumps in q or p, at the borders of its pieces."""
+        check_continuous("expression", self.between_impulses.H, (*self.q, *self.p))
+
+    @property
+    def between_impulses(self) -> SymbolicHamiltonian:
+        """H without its impulses."""
+        return self if self._rest is None else self._rest
+
+    def kicks(self, low: float, high: float, step: float) -> list[Kick]:
+        found: dict[float, list[tuple[float, SymbolicHamiltonian]]] = {}
+        for zeros, W in self.impulses:
+            times = zeros.within(low, high, step, MOST_IMPULSES)
+            rates = zeros.slopes(times, step)
+            met = W.jump_times(low, high, step)
+            refused = {
+                f"more than {MOST_IMPULSES:,} of them: take a shorter one": len(times) > MOST_IMPULSES,
+                "one of infinite weight, a double zero: write it as DiracDelta(t - a)": not rates.all(),
+                "a factor that jumps at one: leave that out": np.isclose(times[:, None], met, rtol=1e-12, atol=0).any(),
+            }
+            for what in (what for what, is_so in refused.items() if is_so):
+                raise ValueError(f"`t_span` ({low:g}, {high:g}) has impulses DiracDelta({zeros.g}), and {what}.")
+            for t, rate in zip(times.tolist(), rates.tolist(), strict=True):
+                found.setdefault(t, []).append((1 / abs(rate), W))
+        return [Kick(t, tuple(found[t])) for t in sorted(found)]
+
+    def has_period(self, period: float) -> bool:
+        """Return True if H, up to a function of t alone, has a period in t."""
+        assert self.time is not None
+        return has_period(self.H, self.time, (*self.q, *self.p), self.samples, period)
 
     @cached_property
     def Ht(self) -> sp.Expr:
@@ -396,7 +468,7 @@ class SymbolicHamiltonian(Definition):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the generated functions, which cannot be pickled and are generated again."""
-        return {name: value for name, value in vars(self).items() if name != "_functions"}
+        return {name: value for name, value in vars(self).items() if name not in ("_functions", "_switches")}
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:

@@ -7,7 +7,7 @@ walks the grid, finds what is not finite, places the outputs and looks for event
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt, check_not_followed
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, stack
+from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, join, lanes, stack
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import (
@@ -651,7 +651,7 @@ class GridRun:
             outputs, kept = outputs[:n_outputs], [*kept[:n_kept], y[None]]
             search.forget_after(grid.time(k), grid.h)
 
-        t, y_out = times[:delivered], _join(outputs)
+        t, y_out = times[:delivered], join(outputs)
         finite_outputs = finite_states(y_out)  # a shorter step may overflow too
         failed = failed or not finite_outputs.all()
         t_end = search.end[0] if search.end else grid.time(k) if failed or stopped else grid.t1
@@ -659,7 +659,7 @@ class GridRun:
         n_keep = len(t) if keep.all() else int(np.argmin(keep))
         t, y_out = t[:n_keep], y_out[:n_keep]
         if search.end and problem.t_eval is None and not (len(t) and t[-1] == t_end):
-            t, y_out = np.append(t, t_end), _join([y_out, search.end[1][None]])
+            t, y_out = np.append(t, t_end), join([y_out, search.end[1][None]])
 
         n_extra = search.n_dense + int(np.count_nonzero(remainder[:delivered]))
         stats = self.stats(k + shorter, k, k, n_extra)
@@ -669,7 +669,7 @@ class GridRun:
             outcome.stats["failed_at"] = t_end
             outcome.message = self._failure(t_end, k)
         if problem.dense_output:
-            outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), _join(kept))
+            outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), join(kept))
         if stopped:
             raise interrupted(outcome, t_end)
         return outcome
@@ -829,14 +829,6 @@ def _all_finite(y: Array, compiled: bool) -> bool:
     from sympflow.kernels.output_loops import all_finite
 
     return all_finite(y)
-
-
-def _join(parts: Sequence[Array]) -> Array:
-    if is_tensor(parts[0]):
-        import torch
-
-        return torch.cat(list(parts))
-    return np.concatenate(parts)
 
 
 # runs whose steps the method chooses -----------------------------------------------------------------

@@ -80,6 +80,10 @@ class Composition(ABC):
         """Raise a ValueError where the parts of a driven system have no exact flows."""
         raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
 
+    @abstractmethod
+    def force_times(self) -> list[float]:
+        """The times, in steps, at which a step takes the parts of H that depend on t."""
+
     def lift(self, y: Array) -> Array:
         """The states on which steps are made, of states y (..., 2d); y itself where the phase space is not extended."""
         return y
@@ -190,6 +194,10 @@ class KineticPotential(Composition):
     def check_driving(self) -> None:
         if self.system.kinetic_timed:
             self.system.drift(np.zeros(self.system.ndof), 0.0, 0.0)
+
+    def force_times(self) -> list[float]:
+        scheme = self.scheme
+        return [c for s, c in zip(scheme.substeps, scheme.substep_times, strict=True) if s.kind == "kick"]
 
     def _times(self, t: Any, h: Any) -> list[Any]:
         """The time at which each substep begins; that of a system that does not depend on it is left out."""
@@ -358,6 +366,9 @@ class ExactMaps(Composition):
 
     def _key(self) -> tuple[Any, ...]:
         return type(self), self.scheme, self.parts
+
+    def force_times(self) -> list[float]:
+        return [m.at for m in known_maps(self, 1.0) if self.parts.timed(m.part)]
 
     @abstractmethod
     def maps(self, h: Any) -> list[Map]:

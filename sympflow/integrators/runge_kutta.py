@@ -23,6 +23,9 @@ class ExplicitStep(ByVectorField):
     A: ClassVar[Any]
     B: ClassVar[Any]
 
+    def forces_at_ends(self, system: HamiltonianSystem) -> bool:
+        return True
+
     def step(self, system: HamiltonianSystem, t: Any, y: Array, h: float | Array) -> Array:
         """One step without error control."""
         times, h = self._stage_times(system, t, h), per_state(h, y)

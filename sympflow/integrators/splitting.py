@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from sympflow.kernels.tangent_loops import TangentKernel
 
 
+END = 1e-9
+"""Distance from its ends, in steps, within which a force counts as taken there."""
+
+
 @dataclass(frozen=True)
 class Clock:
     """A time in which steps are equal, with the traits of the contract that depend on it.
@@ -303,6 +307,10 @@ class Splitting(OwnStepper):
                 raise ValueError(
                     "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
                 )
+
+    def forces_at_ends(self, system: HamiltonianSystem) -> bool:
+        times = [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
+        return any(not END < c < 1 - END for c in times)
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         clock = self.on_clock(system)

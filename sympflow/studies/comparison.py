@@ -165,6 +165,8 @@ def compare(
 
 def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
     """The metrics of what the flow of a system keeps."""
+    if system.between_impulses is not system:
+        return ("error",)
     if system.conservative:
         energy = ("energy", "drift") if system.autonomous else () if jumps_in_time(system) else ("balance",)
         return ("error", *energy, "volume", "symplecticity")
