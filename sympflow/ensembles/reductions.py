@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -59,10 +59,6 @@ class Reduction(ABC):
     @abstractmethod
     def fields(self, problem: Chunk) -> Fields:
         """Return the fields of one orbit, for a problem that is given as a chunk of some first orbits."""
-
-    def settings(self) -> dict[str, Any]:
-        """Return what the reduction was made with: by that a store knows it again. Dataclasses tell their fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare} if is_dataclass(self) else vars(self)
 
     @abstractmethod
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:

@@ -16,12 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow._version import __version__
-from sympflow.ensembles.callables import fingerprint
 from sympflow.ensembles.orbits import Drawn, Given
 from sympflow.ensembles.results import Block, Done, Index, Layout
-from sympflow.integrators.provenance import digest, flow_checksum, option_text
-from sympflow.integrators.registry import name_of
+from sympflow.integrators.provenance import known_by
+from sympflow.storage.identity import Known
 from sympflow.storage.layout import halves, imported
 from sympflow.storage.store import Store
 
@@ -50,28 +48,15 @@ def identity(
     axes: Mapping[str, np.ndarray],
     reduction: Reduction,
     backend: str,
-) -> dict[str, str]:
-    """The identity of an ensemble, each part as a text; two are the same if all parts are."""
-    states = orbits.y0 if isinstance(orbits, Given) else orbits.states(0, min(len(orbits), 64))
-    return {
-        "version": __version__,
-        "system": f"{system.name} {digest([system.expression, dict(system.params), list(system.fingerprint)])}",
-        "method": f"{name_of(integrator)}, {option_text(integrator)}, flow={flow_checksum(integrator, system)}",
-        "dt": repr(integrator.step_length(system)),
-        "t_span": f"{t_span[0]!r} to {t_span[1]!r}",
-        "t_eval": "every step" if t_eval is None else f"{len(t_eval)} times {digest(t_eval)}",
-        "y0": f"{len(orbits)} states{'' if isinstance(orbits, Given) else f' by seed {orbits.seed}'} {digest(states)}",
-        "params": ", ".join(f"{len(v)} values of {name} {digest(v)}" for name, v in axes.items()) or "none",
-        "reduce": _described(reduction),
-        "backend": backend,
-    }
-
-
-def _described(reduction: Reduction) -> str:
-    """A reduction with its options; a user's function by its fingerprint."""
-    settings = reduction.settings().items()
-    told = (f"{name}={fingerprint(value) if callable(value) else repr(value)}" for name, value in settings)
-    return f"{type(reduction).__name__}({', '.join(told)})"
+) -> Known:
+    """What an ensemble is known by."""
+    known = known_by(system, integrator, backend)
+    known.texts |= {"dt": repr(integrator.step_length(system)), "t_span": f"{t_span[0]!r} to {t_span[1]!r}"}
+    known.add("t_eval", "every step" if t_eval is None else f"{len(t_eval)} times", t_eval)
+    known.add("y0", f"{len(orbits)} states{orbits.drawn}", *orbits.parts())
+    known.add("params", ", ".join(f"{len(v)} values of {name}" for name, v in axes.items()) or "none", axes)
+    known.add("reduce", type(reduction).__name__, reduction)
+    return known
 
 
 # the store -----------------------------------------------------------------------------------------------------------
@@ -94,7 +79,9 @@ class EnsembleStore:
     sizes: Index
 
     @classmethod
-    def at(cls, path: Any, layout: Layout, sizes: Index, attributes: dict[str, Any], resume: bool) -> EnsembleStore:
+    def at(
+        cls, path: Any, layout: Layout, sizes: Index, attributes: dict[str, Any], known: Known, resume: bool, same: bool
+    ) -> EnsembleStore:
         """Make the store of an ensemble, or, with `resume`, find the one that is there, with chunks of its own.
 
         Raises
@@ -107,16 +94,17 @@ class EnsembleStore:
         if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
             raise TypeError(f"`store` must be the path of a folder; got {type(path).__name__}.")
         place = Path(os.path.abspath(os.fspath(path)))
-        made = layout.stored(sizes)
+        made, told = layout.stored(sizes), {KNOWN: json.dumps(known.texts), "chunk_shape": list(sizes)}
         try:
-            Store.create(place, made, attributes | {"chunk_shape": list(sizes)}, layout.coordinates())
+            Store.create(place, made, attributes | told, layout.coordinates())
         except FileExistsError:
             if not resume:
                 raise ValueError(
                     f"`store` {str(path)!r} exists: pass resume=True to go on with it, or name another folder."
                 ) from None
             store = Store.open(place)
-            sizes = _same(store, str(path), attributes)
+            store.check_same(KNOWN, known, str(path), "ensemble", "Name another folder.", same)
+            sizes = tuple(store.attributes["chunk_shape"])
             for name, values in layout.coordinates().items():
                 if not store.has(name, (0,)):  # as in one of an earlier version that was killed as it made it
                     store.write(name, (0,), values)
@@ -208,9 +196,3 @@ class _Read(Mapping[str, np.ndarray]):
 
     def __len__(self) -> int:
         return len(self.layout.fields)
-
-
-def _same(store: Store, path: str, attributes: Mapping[str, Any]) -> Index:
-    """Return the shape of the chunks of a store, if it is of the same ensemble."""
-    store.check_same(KNOWN, json.loads(attributes[KNOWN]), path, "ensemble", "Name another folder.")
-    return tuple(store.attributes["chunk_shape"])

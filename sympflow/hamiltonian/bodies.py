@@ -154,6 +154,10 @@ class PairsHamiltonian(LocalHamiltonian):
             self.c, self.constants = (*self.c, end), (*self.constants, self.cutoff**2 + self.softening**2)
         self.V = V
 
+    def identity_parts(self) -> Any:
+        made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
+        return [made_with, self.V, self.columns, list(self.params.items())]
+
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
         other = copy.copy(self)

@@ -336,6 +336,11 @@ class SymbolicHamiltonian(Definition):
         """Raise a ValueError where an interval leaves the times of samples."""
         check_span({name.rpartition("_")[0]: samples for name, samples in self.samples.items()}, t0, t1)
 
+    def identity_parts(self) -> Any:
+        """H, and the samples in it; the time has one name."""
+        H = self.H if self.time is None else self.H.xreplace({self.time: sp.Symbol("t", real=True)})
+        return [self.ndof, H, {name: samples.digest for name, samples in self.samples.items()}]
+
     # generation -----------------------------------------------------------------------------------
 
     def _variables(self, name: str) -> tuple[sp.Symbol, ...]:

@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import check_flag
+from sympflow.storage.identity import Known
 from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, dofs, halves
 from sympflow.storage.store import Appender, Field, Store
 
@@ -77,6 +79,8 @@ class RunStore:
         Whether to go on with the run that is there.
     checkpoint_every : float, optional
         Seconds between two commits, at most; the default is 10.
+    same : bool
+        Whether functions and objects of Python are taken for those of the run that is there.
 
     Attributes
     ----------
@@ -90,20 +94,20 @@ class RunStore:
         The largest numbers that the method noted, and `domain_exit` and `warning` of an output outside the domain.
     """
 
-    def __init__(self, path: Any, resume: Any = False, checkpoint_every: Any = None) -> None:
+    def __init__(self, path: Any, resume: Any = False, checkpoint_every: Any = None, same: Any = False) -> None:
         if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
             raise TypeError(f"`store` must be the path of a folder; got {type(path).__name__}.")
-        if not isinstance(resume, bool | np.bool_):
-            raise TypeError(f"`resume` must be True or False; got {resume!r}.")
+        check_flag("resume", resume)
+        check_flag("same", same)
         every = SECONDS if checkpoint_every is None else checkpoint_every
         if isinstance(every, bool) or not isinstance(every, int | float | np.number) or not every > 0:
             raise ValueError(f"`checkpoint_every` must be a positive number of seconds; got {every!r}.")
         self.asked, self.path = str(path), Path(os.path.abspath(os.fspath(path)))
-        self.resume, self.every = bool(resume), float(every)
+        self.resume, self.same, self.every = bool(resume), bool(same), float(every)
         self.consistent, self.committed = True, time.perf_counter()
         self.noted: dict[str, Any] = {}
         self.attributes: dict[str, Any] = {}
-        self._made_of: tuple[dict[str, str], np.ndarray, int]
+        self._made_of: tuple[Known, np.ndarray, int]
         self.store: Store
         self.appender: Appender
         self.project: Callable[[Any], Any] = _itself
@@ -111,13 +115,13 @@ class RunStore:
 
     # opening --------------------------------------------------------------------------------------
 
-    def prepare(self, known: Mapping[str, str], attributes: Mapping[str, Any], y0: np.ndarray, n_outputs: int) -> None:
+    def prepare(self, known: Known, attributes: Mapping[str, Any], y0: np.ndarray, n_outputs: int) -> None:
         """Take what the store is to be made of.
 
         Parameters
         ----------
-        known : mapping of str to str
-            What the run is known by, in words.
+        known : Known
+            What the run is known by.
         attributes : mapping
             Those of the store, as JSON has them.
         y0 : ndarray of shape (..., 2d)
@@ -125,7 +129,7 @@ class RunStore:
             That are expected.
         """
         self.attributes = dict(attributes)
-        self._made_of = dict(known), y0, n_outputs
+        self._made_of = known, y0, n_outputs
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -148,7 +152,7 @@ class RunStore:
                 ) from None
             self.store = Store.open(self.path)
             remedy = "Nothing of it was changed: name another folder, or make the same call."
-            self.store.check_same(KNOWN, known, self.asked, "run", remedy)
+            self.store.check_same(KNOWN, known, self.asked, "run", remedy, self.same)
         try:
             with self.store.locked():
                 self.store = Store.open(self.path)  # as it is now that nobody else writes it
@@ -159,7 +163,7 @@ class RunStore:
             self.look, self.project = _nothing, _itself
             vars(self).pop("appender", None)
 
-    def _create(self, known: Mapping[str, str], y0: np.ndarray, n_outputs: int) -> Store:
+    def _create(self, known: Known, y0: np.ndarray, n_outputs: int) -> Store:
         """Make the store; a FileExistsError says that there is something in its place."""
         batch, d = y0.shape[:-1], y0.shape[-1] // 2
         size = max(1, min(CHUNK // y0.size, n_outputs))
@@ -171,7 +175,7 @@ class RunStore:
         made["status"] = Field(dims, batch, np.int8, attributes=NAMED["status"])
         told = {
             **self.attributes,
-            KNOWN: json.dumps(dict(known)),
+            KNOWN: json.dumps(known.texts),
             "status": -1,
             "ended": 0,
             "message": "The run has begun.",

@@ -32,6 +32,8 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.storage.identity import Known
+
 __all__ = ["Appender", "Field", "Store", "StoreError"]
 
 METADATA, ATTRIBUTES, ARRAY = ".zmetadata", ".zattrs", ".zarray"
@@ -207,33 +209,46 @@ class Store:
         except (ValueError, KeyError, TypeError, AttributeError, NotADirectoryError):
             raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
 
-    def check_same(self, key: str, mine: Mapping[str, str], asked: str, kind: str, remedy: str) -> None:
+    def check_same(self, key: str, mine: Known, asked: str, kind: str, remedy: str, same: bool) -> None:
         """Check that a store is of the call that asks for it.
 
         Parameters
         ----------
         key : str
             The attribute that says of which call a store is, as JSON.
-        mine : mapping of str to str
-            What the call is known by, in words.
+        mine : Known
+            What the call is known by.
         asked : str
             The path as it was given.
         kind : str
             "run" or "ensemble".
         remedy : str
+        same : bool
+            Whether functions and objects of Python are taken for those of the store.
 
         Raises
         ------
         ValueError
-            If it is of another call, or of none of this kind.
+            If it is of another call, or of none of this kind, or if that cannot be told.
         """
-        theirs = json.loads(self.attributes.get(key, "{}"))
-        if not theirs:
+        try:
+            theirs = json.loads(self.attributes[key])
+        except (KeyError, TypeError, ValueError):
+            theirs = None
+        if not isinstance(theirs, dict):
             article = "an" if kind[0] in "aeiou" else "a"
             raise ValueError(f"`store` {asked!r} is no store of {article} {kind}: name another folder.")
-        other = difference(theirs, mine)
-        if other:
-            raise ValueError(f"`store` {asked!r} is of another {kind}: {other}. {remedy}")
+        known = {name: text for name, text in mine.texts.items() if not (same and name in mine.python)}
+        if other := difference(theirs, known):
+            name = other.split("`")[1]
+            vouched = f" If the code of `{name}` means the same, pass same=True." * (name in mine.python)
+            raise ValueError(f"`store` {asked!r} is of another {kind}: {other}. {remedy}{vouched}")
+        if mine.untold and not same:
+            name, part = next(iter(mine.untold.items()))
+            raise ValueError(
+                f"`store` {asked!r} may be of another {kind}: `{name}` holds {part}, which cannot be told from others. "
+                "Pass same=True if all is the same, or name another folder."
+            )
 
     # chunks ---------------------------------------------------------------------------------------
 
