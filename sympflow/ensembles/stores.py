@@ -104,7 +104,8 @@ class EnsembleStore:
                 ) from None
             store = Store.open(place)
             store.check_same(KNOWN, known, str(path), "ensemble", "Name another folder.", same)
-            sizes = tuple(store.attributes["chunk_shape"])
+            sizes = _chunk_shape(store, layout)
+            store.check_made_of(layout.stored(sizes))
             for name, values in layout.coordinates().items():
                 if not store.has(name, (0,)):  # as in one of an earlier version that was killed as it made it
                     store.write(name, (0,), values)
@@ -147,8 +148,14 @@ class EnsembleStore:
     def is_done(self, block: Block) -> bool:
         """True if the orbits of a block have been run, and all that was kept of them is there."""
         store, number = self._store, self._number(block)
-        kept = ((v.name, (*number, *(0,) * len(v.shape))) for v in self.layout.variables())
-        return store.has("status", number) and all(store.has(*chunk) for chunk in kept)
+        return store.has("status", number) and not self._missing(number)
+
+    def _missing(self, number: Index) -> str:
+        """The name of an array of which a chunk that has been run is not there; "" if all are."""
+        kept = {v.name: (*number, *(0,) * len(v.shape)) for v in self.layout.variables()}
+        if not any(number[:-1]):
+            kept |= {f"{letter}0": (number[-1], 0) for letter, _ in halves(self.layout.ndof)}
+        return next((name for name, index in kept.items() if not self._store.has(name, index)), "")
 
     def finish(self) -> None:
         """Note that all orbits have been run."""
@@ -160,15 +167,33 @@ class EnsembleStore:
 
     @property
     def fields(self) -> Mapping[str, np.ndarray]:
-        return _Read(self._store, self.layout)
+        return _Read(self)
+
+    def read(self, field: str) -> np.ndarray:
+        """Return a field, NaN where orbits have not been run.
+
+        Raises
+        ------
+        StoreError
+            If what has been run is damaged, or not there.
+        """
+        store = self._store
+        for number in np.ndindex(*store.fields["status"].grid):
+            if store.has("status", number) and (name := self._missing(number)):
+                raise store.damaged(f"a chunk of {name!r} is missing, and is run again by the same call, resume=True")
+        arrays = [store.read(v.name) for v in self.layout.variables() if v.field == field]
+        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=len(self.layout.shape))
 
     @property
     def messages(self) -> Mapping[Index, str]:
         found = {}
         for file in (Path(self.path) / MESSAGES).glob("*.json"):
-            for row, text in json.loads(file.read_text(encoding="utf-8")).items():
-                index = np.unravel_index(int(file.stem) + int(row), self.layout.shape)
-                found[tuple(map(int, index))] = text
+            try:
+                for row, text in json.loads(file.read_text(encoding="utf-8")).items():
+                    index = np.unravel_index(int(file.stem) + int(row), self.layout.shape)
+                    found[tuple(map(int, index))] = str(text)
+            except (ValueError, AttributeError, RecursionError, OSError) as error:
+                raise self._store.damaged(f"its messages {file.name} cannot be read ({error})") from None
         return dict(sorted(found.items()))
 
     def dataset(self) -> xarray.Dataset:
@@ -179,14 +204,13 @@ class EnsembleStore:
 class _Read(Mapping[str, np.ndarray]):
     """The fields of a store, read when they are asked for."""
 
-    def __init__(self, store: Store, layout: Layout) -> None:
-        self.store, self.layout = store, layout
+    def __init__(self, store: EnsembleStore) -> None:
+        self.store, self.layout = store, store.layout
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.layout.fields:
             raise KeyError(name)
-        arrays = [self.store.read(v.name) for v in self.layout.variables() if v.field == name]
-        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=len(self.layout.shape))
+        return self.store.read(name)
 
     def __contains__(self, name: object) -> bool:
         return name in self.layout.fields
@@ -196,3 +220,13 @@ class _Read(Mapping[str, np.ndarray]):
 
     def __len__(self) -> int:
         return len(self.layout.fields)
+
+
+def _chunk_shape(store: Store, layout: Layout) -> Index:
+    """The shape of the chunks of orbits of a store, which is none larger than all orbits."""
+    sizes = store.attributes.get("chunk_shape")
+    if not isinstance(sizes, list) or len(sizes) != len(layout.shape):
+        raise store.damaged("its chunk_shape is missing")
+    if not all(isinstance(k, int) and 1 <= k <= n for k, n in zip(sizes, layout.shape, strict=True)):
+        raise store.damaged(f"its chunk_shape {sizes} is none of {layout.shape} orbits")
+    return tuple(sizes)
