@@ -395,12 +395,17 @@ def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
 
 def _reduced(task: Task, chunk: Chunk, start: int) -> Done:
     fields = task.reduction.reduce(chunk)
+    for name, (_, dtype) in task.fields.items():
+        found = np.asarray(fields[name]).dtype
+        if not np.can_cast(found, dtype, "same_kind"):
+            raise TypeError(f"`reduce` returns {name} as {found}, which its `fields` told as {dtype}: let them agree.")
     return Done(fields, chunk.status, {start + k: text for k, text in chunk.messages.items()})
 
 
 def _without_a_system(task: Task, n: int, start: int, values: Mapping[str, float], error: Exception) -> Done:
     """The orbits of values of the parameters for which there is no system, or no such reduction: all failed."""
-    fields = {name: np.full((n, *shape), np.nan, dtype) for name, (shape, dtype) in task.fields.items()}
+    unknown = {name: np.nan if dtype.kind in "fc" else 0 for name, (_, dtype) in task.fields.items()}
+    fields = {name: np.full((n, *shape), unknown[name], dtype) for name, (shape, dtype) in task.fields.items()}
     shown = ", ".join(f"{name} = {value:.9g}" for name, value in values.items())
     text = f"`params` has {shown}: {error}"[:LONGEST_MESSAGE]
     return Done(fields, np.full(n, FAILED, dtype=np.int8), dict.fromkeys(range(start, start + n), text))

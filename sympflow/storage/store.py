@@ -31,7 +31,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import prod
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -287,10 +287,10 @@ class Store:
             If one is missing, or is another, or one too many.
         """
         for name in {**fields, **self.fields}:
+            if name in self.fields and not (name in fields and fields[name].is_like(self.fields[name])):
+                raise self.damaged(f"its array {name!r} is none that the call makes")
             if name not in self.fields or not (self.path / name).is_dir():
                 raise self.damaged(f"its array {name!r} is missing")
-            if name not in fields or not fields[name].is_like(self.fields[name]):
-                raise self.damaged(f"its array {name!r} is none that the call makes")
 
     def damaged(self, why: str) -> StoreError:
         """Return the error that says what is wrong with the store."""
@@ -547,10 +547,10 @@ class Appender:
 
 
 def is_name(name: Any) -> bool:
-    """Return True for a name of an array: on no system a path, and not hidden."""
+    """Return True for a name of an array: no path, and not hidden."""
     if not isinstance(name, str) or name.startswith(".") or not name.isprintable():
         return False
-    return PurePosixPath(name).name == PureWindowsPath(name).name == name != ""
+    return PurePath(name).name == name != "" and "\\" not in name
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
