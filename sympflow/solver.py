@@ -70,6 +70,7 @@ def solve(
     progress: Asked = False,
     store: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    same: bool = False,
     checkpoint_every: float | None = None,
     **options: Any,
 ) -> Solution:
@@ -131,7 +132,12 @@ def solve(
         ``xarray.open_zarr(store)`` reads it at any time.
     resume : bool
         Go on with the run that is in the store, if there is one: after a kill at any moment, or to a later end of
-        `t_span`, with later times in `t_eval`, the bits are those of a run that was never interrupted.
+        `t_span`, with later times in `t_eval`, the bits are those of a run that was never interrupted. A store of
+        another run is refused: it is known by all that it is made of, functions and classes by their code and the
+        values that they use.
+    same : bool
+        With `resume`, take functions and objects of Python for those of the store: where one cannot be told from
+        another, such as what a compiled library made, or where code was rewritten and means the same.
     checkpoint_every : float, optional
         Seconds of work, at most, that a kill loses; the default is 10. Outputs are chosen by `t_eval` and `save_every`.
     **options
@@ -197,11 +203,14 @@ def solve(
     if store is not None:
         from sympflow.storage.runs import RunStore
 
-        kept = RunStore(store, resume, checkpoint_every)
+        kept = RunStore(store, resume, checkpoint_every, same)
         check_stored(problem, action, rows)
         problem = replace(problem, store=kept)
-    elif resume or checkpoint_every is not None:
-        raise ValueError("`resume` and `checkpoint_every` are for runs with a `store`: give one, or leave them out.")
+    elif resume or same or checkpoint_every is not None:
+        raise ValueError(
+            "`resume` and `checkpoint_every` are for runs with a `store`, and `same` with them: give one, or leave "
+            "them out."
+        )
     if progress is False:
         return _answered(integrator, problem, action, rows)
     sign = math.copysign(1.0, t1 - t0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -34,6 +34,8 @@ REDUCTIONS: dict[str, str] = {
 }
 """The names that `reduce` takes: "module:Class" below sympflow, called without arguments."""
 
+EXACT = 2**53
+"""The largest of the integers that floats hold exactly."""
 MOST_TRIED = 64
 """First orbits of which a user's function is tried on the first that does not fail."""
 
@@ -59,10 +61,6 @@ class Reduction(ABC):
     @abstractmethod
     def fields(self, problem: Chunk) -> Fields:
         """Return the fields of one orbit, for a problem that is given as a chunk of some first orbits."""
-
-    def settings(self) -> dict[str, Any]:
-        """Return what the reduction was made with: by that a store knows it again. Dataclasses tell their fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare} if is_dataclass(self) else vars(self)
 
     @abstractmethod
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
@@ -130,8 +128,8 @@ class EnergyError(Reduction):
 class OfFunction(Reduction):
     """A user's function of (t (m,), y (2d, m)) of one orbit, which returns a number, an array, or a dict of such.
 
-    The shapes are those of the first orbit. An orbit for which the function raises, or returns another shape, has
-    failed, with that message.
+    The shapes are those of the first orbit, and numbers are complex if its are. An orbit for which the function raises,
+    or returns another shape, or imaginary parts where the first has none, has failed, with that message.
     """
 
     function: Callable[[np.ndarray, np.ndarray], Any]
@@ -158,7 +156,10 @@ class OfFunction(Reduction):
                     f"`reduce` raises {type(error).__name__}: {error}, for orbit {i}: it is called with the times "
                     f"{t.shape} and the states {y.shape} of one orbit."
                 ) from error
-            self.found.update({name: (v.shape, v.dtype) for name, v in _arrays(value).items()})
+            try:
+                self.found.update({name: (v.shape, v.dtype) for name, v in _arrays(value).items()})
+            except ValueError as error:
+                raise ValueError(f"`reduce` cannot be kept: {error}") from None
             return dict(self.found)
         raise ValueError(
             f"`reduce` cannot be tried: the first {len(problem)} orbits all fail. Reduce `dt`, or mend `y0`."
@@ -171,9 +172,16 @@ class OfFunction(Reduction):
                 continue
             try:
                 values = _arrays(self.function(t, y))
-                shapes = {name: (v.shape, np.result_type(v, float)) for name, v in values.items()}
-                if {name: s for name, (s, _) in shapes.items()} != {name: s for name, (s, _) in self.found.items()}:
+                if {name: v.shape for name, v in values.items()} != {name: s for name, (s, _) in self.found.items()}:
                     raise ValueError(f"`reduce` returns {_described(values)}, but {_described(out, 1)} for the first")
+                for name, v in values.items():
+                    if v.dtype.kind == "c" and out[name].dtype.kind != "c":
+                        if v.imag.any():
+                            raise ValueError(
+                                f"`reduce` returns complex {name}, and real ones for the first orbit: return complex "
+                                "numbers for all"
+                            )
+                        values[name] = v.real
             except Exception as error:
                 chunk.fail(i, f"`reduce` failed: {type(error).__name__}: {error}.")
                 continue
@@ -195,6 +203,11 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
             array = np.asarray(v)
         except ValueError:  # rows of different lengths
             array = np.empty(0, dtype=object)
+        whole = array.dtype.kind in "iu" or (array.dtype == object and all(isinstance(x, int) for x in array.flat))
+        if whole and array.size and max(-int(array.min()), int(array.max())) > EXACT:
+            raise ValueError(
+                f"{name} has an integer beyond 2**53, which floats would change: return its parts, or a float"
+            )
         if array.dtype.kind not in "biufc" or not isinstance(name, str):
             raise TypeError(
                 f"`reduce` must return numbers, an array of them, or a dict of such by name; got {type(v).__name__}."

@@ -165,6 +165,10 @@ class PairsHamiltonian(LocalHamiltonian):
         distance = [s for s in self._written.free_symbols if s.name == "r"]
         check_continuous("potential", self._written, distance, dict(zip(letters_of, columns, strict=True)), names)
 
+    def identity_parts(self) -> Any:
+        made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
+        return [made_with, self.V, self.columns, list(self.params.items())]
+
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
         other = copy.copy(self)

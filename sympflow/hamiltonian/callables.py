@@ -55,6 +55,9 @@ class CallableHamiltonian(Definition):
         self._potential, self._gradient = arrays.potential, arrays.gradient
         self._hessian_vector = None if hessian_vector is None else arrays.hessian_vector
 
+    def identity_parts(self) -> Any:
+        return [self.ndof, self._potential, self._hamiltonian, self._gradient, self._hessian_vector]
+
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None:
             return False
@@ -317,6 +320,9 @@ class DrivenCallables(Definition):
         now = self._at(0.0)
         self.given, self.separable = now.given, now.separable
         self.has_hessian_vector, self.differentiates_itself = now.has_hessian_vector, now.differentiates_itself
+
+    def identity_parts(self) -> Any:
+        return [self.ndof, self._functions]
 
     def _at(self, t: Any) -> CallableHamiltonian:
         """The functions at one time."""

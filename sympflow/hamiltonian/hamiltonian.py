@@ -84,6 +84,7 @@ class Hamiltonian:
     friction: Friction | None = None
     autonomous: bool = True
     period: float | None = None
+    energy_scale: float | None = None
     external_force: ExternalForce | None = None
     """F of the physical limit of a doubled system, p' = −∂H/∂q + F; it is part of `vector_field`."""
 
@@ -217,6 +218,17 @@ class Hamiltonian:
             f"`y0` must have shape (..., {2 * self.ndof}) for {self.name!r}, [q, p] with {self.ndof} each; got "
             f"{tuple(y.shape)}."
         )
+
+    def identity_parts(self) -> Any:
+        """Return all that H and the equations of motion are made of, by which a store knows the system again."""
+        return [
+            self._definition,
+            self.inverse_mass,
+            self.stiffness_matrix,
+            self.damping,
+            self.external_force,
+            self.energy_scale,
+        ]
 
     @property
     def damping(self) -> np.ndarray | None:

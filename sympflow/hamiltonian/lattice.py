@@ -82,6 +82,9 @@ class LatticeHamiltonian(LocalHamiltonian):
         self._check_sizes()
         self._set_mass()
 
+    def identity_parts(self) -> Any:
+        return [self.shape, self.boundary, self.fields, self.U, self.T, self.bonds, list(self.params.items())]
+
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
         other = copy.copy(self)

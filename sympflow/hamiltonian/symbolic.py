@@ -46,6 +46,8 @@ from sympflow.hamiltonian.jumps import (
 )
 
 LARGEST = sys.float_info.max
+MOST_LEFT_OUT = 100
+"""Degrees of freedom up to the last one that a formula may do without."""
 FAR = 1000.0
 """The time before and after 0 in which it is looked if H jumps, where that is at no zeros of linear functions."""
 
@@ -144,9 +146,15 @@ class SymbolicHamiltonian(Definition):
                 for symbol, found in values.items()
                 if isinstance(found, sampled)
             }
-        ndof = max((_index(s) for s in H.free_symbols if _index(s)), default=0)
+        used = {_index(s) for s in H.free_symbols} - {0}
+        ndof = max(used, default=0)
         if ndof == 0:
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
+        if ndof - len(used) > MOST_LEFT_OUT:
+            raise ValueError(
+                f"`expression` has coordinates of the number {str(ndof)[:20]}, and depends on {len(used)} degrees of "
+                "freedom: number them from 1, q1 … qd and p1 … pd."
+            )
         plain = {sp.Symbol("q", real=True), sp.Symbol("p", real=True)} & H.free_symbols
         if plain and ndof > 1:
             raise ValueError("`expression` mixes q, p with numbered coordinates: write q1, p1.")
@@ -407,6 +415,11 @@ class SymbolicHamiltonian(Definition):
     def check_times(self, t0: float, t1: float) -> None:
         """Raise a ValueError where an interval leaves the times of samples."""
         check_span({name.rpartition("_")[0]: samples for name, samples in self.samples.items()}, t0, t1)
+
+    def identity_parts(self) -> Any:
+        """H, and the samples in it; the time has one name."""
+        H = self.H if self.time is None else self.H.xreplace({self.time: sp.Symbol("t", real=True)})
+        return [self.ndof, H, {name: samples.digest for name, samples in self.samples.items()}]
 
     # generation -----------------------------------------------------------------------------------
 
@@ -702,8 +715,8 @@ def _is_coordinate(name: str) -> bool:
 
 
 def _index(symbol: sp.Symbol) -> int:
-    """1 for q1, p1, q and p; 2 for q2, p2; …"""
-    return int(symbol.name[1:] or 1) if _is_coordinate(symbol.name) else 0
+    """1 for q1, p1, q and p; 2 for q2, p2; …, of very long ones the beginning."""
+    return int(symbol.name[1:20] or 1) if _is_coordinate(symbol.name) else 0
 
 
 def _with_numeric_constants(H: sp.Expr) -> sp.Expr:

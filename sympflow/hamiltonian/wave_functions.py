@@ -91,6 +91,9 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         if not np.isfinite(self.rates).all():
             raise ValueError("`dispersion` must be finite at all wave numbers k of the grid, 0 among them; it is not.")
 
+    def identity_parts(self) -> Any:
+        return [self.grid, self.length, self.f, self.w, list(self.params.items())]
+
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
         other = copy.copy(self)
