@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import Array
+from sympflow.hamiltonian.poles import Poles
 
 
 class Definition:
@@ -45,7 +46,9 @@ class Definition:
     instead : str
         The methods that are advised where H is not separable, in words.
     leaps : bool
-        True if V is infinite in places that a step may leap over, such as of bodies that meet: then there is `leapt`.
+        True if bodies may meet, over which a step may leap: then there is `leapt`.
+    poles : Poles or None
+        The places that a step may leap over at which H as it is written is infinite or no number.
     """
 
     ndof: int
@@ -61,6 +64,7 @@ class Definition:
     has_third_derivative: bool = False
     loops: str = ""
     leaps: bool = False
+    poles: Poles | None = None
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:

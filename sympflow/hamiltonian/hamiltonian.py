@@ -464,8 +464,13 @@ class Hamiltonian:
         return self._definition.instead
 
     @property
+    def poles(self) -> Poles | None:
+        """The places that a step may leap over at which H as it is written is infinite or no number, if it has some."""
+        return self._definition.poles
+
+    @property
     def leaps(self) -> bool:
-        """True if V is infinite in places that a step may leap over, such as of bodies that meet."""
+        """True if bodies may meet, over which a step may leap."""
         return self._definition.leaps
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int) -> np.ndarray:

@@ -36,6 +36,7 @@ from sympflow.hamiltonian.driving import (
     zeros,
 )
 from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, read
+from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 
 LARGEST = sys.float_info.max
 FAR = 1000.0
@@ -271,6 +272,10 @@ class SymbolicHamiltonian(Definition):
         v = self.inverse_mass * slope
         return (v.T * sp.hessian(self.V, self.q) * v)[0] / 2
 
+    @cached_property
+    def poles(self) -> Poles | None:  # type: ignore[override]
+        return SymbolicPoles(self) or None
+
     # array functions, state y = [q, p] on the last axis -------------------------------------------
 
     def hamiltonian(self, y: Array, *t: Array) -> Array:
@@ -288,6 +293,10 @@ class SymbolicHamiltonian(Definition):
     def time_derivative(self, y: Array, t: Array) -> Array:
         """∂H/∂t: (..., 2d) to (...)."""
         return self._scalar("Ht")(y, t)
+
+    def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
+        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, under a name of its own."""
+        return self._function(name, lambda: expressions, assemble)
 
     def potential(self, q: Array, *t: Array) -> Array:
         return self._scalar("V")(q, *t)
@@ -396,7 +405,7 @@ class SymbolicHamiltonian(Definition):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the generated functions, which cannot be pickled and are generated again."""
-        return {name: value for name, value in vars(self).items() if name != "_functions"}
+        return {name: value for name, value in vars(self).items() if name not in ("_functions", "poles")}
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:

@@ -1,11 +1,15 @@
-"""The time at which the solution of a run that could not go on becomes infinite, if it does."""
+"""After a run: over which poles of H it leapt, and when the solution of one that failed becomes infinite."""
 
 from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import DOP853
 
-from sympflow.arrays import Array, to_numpy
+from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.poles import Poles
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome, Problem
 
@@ -17,6 +21,190 @@ LOST = 0.01  # of y·∇H: a state whose energy differs by more is no longer on 
 SHORT = 1e-11  # of the way: steps below it go on no more
 NEAR, NEARER, GROWTH = 1e-3, 1e-8, 10.0
 """The state is infinite at the end if it grows by so much from this to that part of the way before it."""
+
+LOOKED_AT, LOOKED_AT_TOGETHER = 32, 4096  # outputs of one trajectory, states of all, at which H and signs are compared
+OFF, FAR_OFF = 0.01, 1.0  # of the kinetic energy: a change of H after which steps are looked at; where H may change
+MOST_WALKED, MOST_TESTED, MOST_NAMED = 4 * 10**6, 32, 64  # numbers of a run executed again; crossings; trajectories
+ACROSS, AROUND, PARTS = 0.05, 8, 9
+"""A step leaps if, at one of so many points on it, what vanishes is so small a part of what it is at another; around it
+H changes by more than a tenth of the kinetic energy within so many steps."""
+LOST_AROUND = 0.1
+
+
+class Passage(NamedTuple):
+    """The times between which a trajectory passed a pole, its column, and True if no solution does."""
+
+    begin: float
+    end: float
+    column: int
+    certain: bool
+
+
+def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stacklevel: int) -> None:
+    """End a run where it passed a place at which H is infinite or no number, and warn where it seems to have done so.
+
+    No solution passes such a place, but a step of fixed length sees nothing of what lies between its ends. Compared are
+    first the signs of what vanishes there, and H, at the start and at some outputs, at the cost of as many evaluations.
+    Where one of them is off, the steps are looked at: those that are outputs, or the run is executed again.
+
+    Between two states with H infinite on the way the status becomes −1. Where the place is a point in more than one
+    dimension, no sign changes; there is a warning if a step was long beside its distance and H changed for good.
+    """
+    poles, d = problem.system.poles, problem.system.ndof
+    if poles is None or not len(outcome.t):
+        return
+    starts = to_numpy(problem.y0).reshape(-1, 2 * d)
+    outputs = to_numpy(outcome.y).reshape(len(outcome.t), -1, 2 * d)
+    held = (np.atleast_1d(np.asarray(outcome.status)) >= 0).reshape(-1)
+    n = int(np.clip(LOOKED_AT_TOGETHER // starts.size, 1, min(LOOKED_AT, len(outputs))))
+    chosen = np.linspace(len(outputs) - 1, 0, n).astype(int)[::-1] if n > 1 else np.array([len(outputs) - 1])
+    t, y = np.append(problem.t0, outcome.t[chosen]), np.concatenate([starts[None], outputs[chosen]])
+    with np.errstate(all="ignore"):
+        try:
+            odd, scale = _look(problem.system, poles, t, y)
+        except TypeError:  # a function that takes no arrays
+            return
+        rows = np.flatnonzero(odd.any(0) & held)
+        if not len(rows):
+            return
+        found: dict[int, Passage] = {}
+        for row in rows[np.argsort(~odd[0, rows], kind="stable")][:MOST_NAMED].tolist():
+            if odd[0, row]:
+                found[row] = Passage(problem.t0, problem.t0, -1, True)
+                continue
+            ends = t[-1], t[int(np.argmax(odd[:, row]))]
+            passage = _passage(problem, poles, *_steps_of(outcome, integrator, problem, row, ends), scale[row])
+            if passage is not None:
+                found[row] = passage
+    certain = [row for row, passage in found.items() if passage.certain]
+    if certain:
+        _end(outcome, problem, {row: found[row] for row in certain})
+    likely = [row for row in found if row not in certain]
+    if likely:
+        passage, which = found[likely[0]], _which(problem, likely)
+        warnings.warn(
+            f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt over "
+            f"a place at which it is infinite, {poles.name(passage.column)}: the run means nothing after that. {REMEDY}.",
+            RuntimeWarning,
+            stacklevel=stacklevel + 1,
+        )
+
+
+REMEDY = "Reduce `dt`, soften H there, or take a method with a clock of its own, such as 'log_leapfrog'"
+
+
+def _look(system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """True for states y (n, N, 2d) with signs or H unlike the first ones, and for a start without H: (n, N).
+
+    Also the kinetic energy (N,), or what there is like it, beside which H is judged.
+    """
+    cells = poles.cells(y, t[:, None])
+    odd = (cells != cells[0]).any(-1)
+    if poles.sizes(y[:1], t[:1, None]) is None:
+        return odd, np.full(y.shape[1], np.inf)
+    H, kinetic = _energies(system, t, y)
+    change, scale = np.abs(H - H[0]), np.nanmax(kinetic, axis=0, initial=0.0)
+    limit = OFF if system.conservative and system.autonomous else FAR_OFF
+    odd |= ~(change <= limit * scale)
+    odd[0] = ~np.isfinite(H[0])
+    return odd, scale
+
+
+def _energies(system: HamiltonianSystem, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """H and the kinetic energy, or p·∂H/∂p where it is not a part of H, at y (n, N, 2d): (n, N), each."""
+    d, times = system.ndof, () if system.autonomous else (np.broadcast_to(t[:, None], y.shape[:-1]),)
+    q, p = y[..., :d], y[..., d:]
+    if system.separable:
+        T, V = system.kinetic(p, *times), system.potential(q, *times)
+        return T + V, np.maximum(np.abs(T), np.abs(V - V[0]))
+    slope = system.gradient(y, *times)
+    return system.hamiltonian(y, *times), np.abs(p * slope[..., d:]).sum(-1) + np.abs(q * slope[..., :d]).sum(-1)
+
+
+def _steps_of(
+    outcome: Outcome, integrator: Integrator, problem: Problem, row: int, ends: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and states (n, 2d) of a trajectory at its steps up to an end, the first that is near; or its outputs."""
+    width, length = 2 * problem.system.ndof, integrator.step_length(problem.system)
+    y0 = to_numpy(problem.y0).reshape(-1, width)[row]
+    known = problem.t_eval is None and problem.save_every == 1 and (length is not None or problem.y0.ndim == 1)
+    for end in () if known or is_tensor(problem.y0) else ends:
+        n_steps = abs(end - problem.t0) / length if length else outcome.stats.get("n_steps", 0)
+        if n_steps * width <= MOST_WALKED:
+            try:
+                again = integrator.run(Problem(problem.system, problem.t0, end, y0, backend=problem.backend))
+            except Exception:  # of a plug-in, whose outputs are all that is known
+                break
+            return again.t.astype(float), again.y.astype(float)
+    first = int(outcome.t[0] == problem.t0)
+    y = to_numpy(outcome.y).reshape(len(outcome.t), -1, width)[first:, row]
+    return np.append(problem.t0, outcome.t[first:]), np.concatenate([y0[None], y]).astype(float)
+
+
+def _passage(problem: Problem, poles: Poles, t: np.ndarray, y: np.ndarray, scale: float) -> Passage | None:
+    """The first place that was passed between states y (n, 2d) at t (n,): surely, or else likely."""
+    cells = poles.cells(y, t)
+    for k, column in np.argwhere(cells[1:] != cells[:-1])[:MOST_TESTED].tolist():
+        if poles.passed(column, t[k : k + 2], y[k : k + 2]):
+            return Passage(float(t[k]), float(t[k + 1]), column, True)
+    if len(y) < 2 or poles.sizes(y[:1], t[:1]) is None:
+        return None
+    H, _ = _energies(problem.system, t, y[:, None])
+    k = np.arange(len(y) - 1)
+    lost = np.abs(H[np.minimum(k + 1 + AROUND, len(k)), 0] - H[np.maximum(k - AROUND, 0), 0])
+    k = np.flatnonzero(~(lost <= LOST_AROUND * scale))
+    if not len(k):
+        return None
+    s = np.linspace(0, 1, PARTS)[:, None]
+    along = y[k][:, None] * (1 - s) + y[k + 1][:, None] * s
+    size = np.abs(poles.sizes(along, t[k][:, None] * (1 - s[:, 0]) + t[k + 1][:, None] * s[:, 0]))
+    leapt = size.min(1) < ACROSS * size.max(1)
+    if not leapt.any():
+        return None
+    first, column = np.argwhere(leapt)[0].tolist()
+    return Passage(float(t[k[first]]), float(t[k[first] + 1]), column, False)
+
+
+def _which(problem: Problem, rows: list[int]) -> str:
+    """The trajectories of a batch, in words."""
+    if problem.y0.ndim == 1:
+        return ""
+    first = ", ".join(map(str, np.unravel_index(rows[0], problem.y0.shape[:-1])))
+    return f" of trajectory {first}" + (f", the first of {len(rows)}," if len(rows) > 1 else "")
+
+
+def _end(outcome: Outcome, problem: Problem, found: dict[int, Passage]) -> None:
+    """Set status −1 and the message of trajectories that passed a pole; end them before."""
+    poles, sign = problem.system.poles, 1.0 if problem.t1 >= problem.t0 else -1.0
+    assert poles is not None
+    rows = sorted(found, key=lambda row: (found[row].end - problem.t0) * sign)
+    first, which = found[rows[0]], _which(problem, rows)
+    outcome.message = (
+        f"H{which} is infinite, or no number, at `y0`: start elsewhere."
+        if first.column < 0
+        else f"Between t = {first.begin:.10g} and {first.end:.10g} the run{which} passed {poles.name(first.column)}, where "
+        f"H is infinite or no number: no solution does. {REMEDY}, or end `t_span` earlier."
+    )
+    if problem.y0.ndim == 1:
+        keep = (outcome.t - first.begin) * sign <= 0
+        outcome.t, outcome.y, outcome.status = outcome.t[keep], outcome.y[keep], -1
+        outcome.stats["failed_at"] = first.begin
+        return
+    failed_at = np.full(int(np.prod(problem.y0.shape[:-1])), np.nan)
+    failed_at[list(found)] = [passage.begin for passage in found.values()]
+    before = np.asarray(outcome.stats.get("failed_at", np.nan)).reshape(-1)
+    failed_at = np.where(np.isnan(failed_at), before, failed_at).reshape(problem.y0.shape[:-1])
+    after = ~((outcome.t.reshape(-1, *[1] * failed_at.ndim) - failed_at) * sign <= 0) & np.isin(
+        np.arange(failed_at.size), list(found)
+    ).reshape(failed_at.shape)
+    outcome.stats["failed_at"], outcome.finite = failed_at, False
+    outcome.status = np.where(after.any(0) | ~np.isnan(failed_at), -1, outcome.status)
+    if is_tensor(outcome.y):
+        import torch
+
+        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], np.nan)
+    else:
+        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)
 
 
 def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
