@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.arrays import Array
-from sympflow.hamiltonian.poles import Poles
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.poles import Poles
 
 
 class Definition:

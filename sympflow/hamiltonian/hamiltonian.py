@@ -15,6 +15,7 @@ from sympflow.hamiltonian.times import checked_time
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.local import LocalHamiltonian
+    from sympflow.hamiltonian.poles import Poles
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 

@@ -197,10 +197,8 @@ class LatticeHamiltonian(LocalHamiltonian):
     def remark(self, q: np.ndarray) -> str:
         if self.poles is None:
             return ""
-        return (
-            f"{LatticePoles(self).nearest(q)} is nearest to a place where V is infinite: take shorter steps, or another "
-            "`y0`."
-        )
+        nearest = LatticePoles(self).nearest(q)
+        return f"{nearest} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
 
     def written_out(self) -> sp.Expr:
         """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import mpmath
@@ -29,11 +30,15 @@ class Place(NamedTuple):
 class Poles(Protocol):
     """The places at which H of a system may be infinite, in columns."""
 
-    def cells(self, y: np.ndarray, t: Any) -> np.ndarray:
-        """Numbers (..., m) that differ on the two sides of a place: states (..., 2d), times (...)."""
+    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Numbers (..., m) that differ on the two sides of a place, H and T: states (..., 2d), times (...).
 
-    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray | None:
-        """What vanishes at the places: (..., m); None where H is not known to be cheap beside a run."""
+        Where these cost more than such a number, H is 0, or NaN where it is no number, and T None. Where H has no
+        part T there is one of its size.
+        """
+
+    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
+        """What vanishes at the places: (..., m)."""
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         """Return True if H is infinite, or no number, on the way between states y (2, 2d) in two cells."""
@@ -55,14 +60,19 @@ class SymbolicPoles:
         letters = (*symbols.q, *symbols.p, *((symbols.time,) if symbols.timed else ()))
         parts = [symbols.V, symbols.T] if symbols.separable else [symbols.H]
         self._letters, self._places = letters, [(place, f) for f in parts for place in places(f, letters)]
-        rows = [place.cell for place, _ in self._places], [place.g for place, _ in self._places]
-        self._cells, self._sizes = (symbols.evaluated(key, row) for key, row in zip(("c", "g"), rows, strict=True))
+        self._m = len(self._places)
+        if not self._places:
+            return
+        T = symbols.T if symbols.separable else sp.Add(*[sp.Abs(s * sp.diff(symbols.H, s)) for s in letters])
+        self._look = symbols.evaluated("cells", [*(place.cell for place, _ in self._places), symbols.H, T])
+        self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
 
     def __bool__(self) -> bool:
         return bool(self._places)
 
-    def cells(self, y: np.ndarray, t: Any) -> np.ndarray:
-        return self._cells(y, *self._time(y, t))
+    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        values = self._look(y, *self._time(y, t))
+        return values[..., : self._m], values[..., -2], values[..., -1]
 
     def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
         return self._sizes(y, *self._time(y, t))
@@ -73,8 +83,7 @@ class SymbolicPoles:
         return infinite_between(f, place.cell, self._letters, *ends.tolist())
 
     def name(self, column: int) -> str:
-        g = self._places[column][0].g
-        return f"{sp.sstr(g.xreplace({a: sp.Float(a, 6) for a in g.atoms(sp.Float)}))} = 0"
+        return f"{_written(self._places[column][0].g)} = 0"
 
     def _time(self, y: np.ndarray, t: Any) -> tuple[Any, ...]:
         return (np.broadcast_to(t, y.shape[:-1]),) if self._symbols.timed else ()
@@ -91,6 +100,10 @@ class _Lattice(Protocol):
     r: tuple[sp.Symbol, ...]
     c: tuple[sp.Symbol, ...]
     bonds: dict[int, sp.Expr]
+    params: Any
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]: ...
 
     def of_terms(self, key: str, expressions: Any, q: Any) -> list[tuple[int | None, int, list[Any]]]: ...
 
@@ -111,13 +124,13 @@ class LatticePoles:
         terms = [(lattice.U, lattice.x), *((V, lattice.r) for V in lattice.bonds.values())]
         return any(places(f, x) for f, x in terms)
 
-    def cells(self, y: np.ndarray, t: Any = None) -> np.ndarray:
-        of_terms = self._lattice.of_terms("cells", lambda f, x: [g.cell for g in places(f, x)], self._positions(y))
-        rows = [value.reshape(*y.shape[:-1], -1) for _, _, values in of_terms for value in values]
-        return np.concatenate(rows, axis=-1)
+    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, None]:
+        cells = self._columns("cells", _cells, y)
+        ending = self._columns("endings", _endings, y)
+        return cells, np.where(np.isnan(ending).any(-1), np.nan, 0.0), None
 
-    def sizes(self, y: np.ndarray, t: Any) -> None:
-        return None
+    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
+        raise NotImplementedError("LatticePoles has no sizes: its H is not looked at.")
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         f, x, place, axis, k, i, _ = self._at(column, y)
@@ -128,8 +141,11 @@ class LatticePoles:
         return infinite_between(f, place.cell, letters, *ends)
 
     def name(self, column: int) -> str:
-        *_, axis, k, i, shape = self._at(column, np.zeros(2 * self._lattice.ndof))
-        return self._place(axis, k, i, shape)
+        lattice = self._lattice
+        _, x, place, axis, k, i, shape = self._at(column, np.zeros(2 * lattice.ndof))
+        names = [*lattice.names["x" if axis is None else "r"], *lattice.params]
+        written = place.g.xreplace({s: sp.Symbol(name) for s, name in zip((*x, *lattice.c), names, strict=True)})
+        return f"{_written(written)} = 0 at {self._place(axis, k, i, shape)}"
 
     def nearest(self, q: np.ndarray) -> str:
         """The site or bond of positions (d,) that is nearest to a place, in words."""
@@ -143,11 +159,15 @@ class LatticePoles:
     def _positions(self, y: np.ndarray) -> np.ndarray:
         return y[..., : self._lattice.ndof]
 
+    def _columns(self, key: str, expressions: Any, y: np.ndarray) -> np.ndarray:
+        rows = self._lattice.of_terms(key, expressions, self._positions(y))
+        columns = [value.reshape(*y.shape[:-1], -1) for _, _, values in rows for value in values]
+        return np.concatenate([np.zeros((*y.shape[:-1], 0)), *columns], axis=-1)
+
     def _at(self, column: int, y: np.ndarray) -> tuple[Any, ...]:
         """The term, its letters, its place, the axis and the distance, which site or bond, the shape of these."""
         lattice, lead = self._lattice, y.ndim - 1
-        of_terms = lattice.of_terms("cells", lambda f, x: [g.cell for g in places(f, x)], self._positions(y))
-        for axis, k, values in of_terms:
+        for axis, k, values in lattice.of_terms("cells", _cells, self._positions(y)):
             f, x = (lattice.U, lattice.x) if axis is None else (lattice.bonds[k], lattice.r)
             for place, value in zip(places(f, x), values, strict=True):
                 shape = value.shape[lead:]
@@ -169,6 +189,19 @@ class LatticePoles:
             last[axis] %= n
         ends = [_name(end) if 0 <= end[axis] < n else "the wall" for end in (first, last)]
         return f"the bond of {ends[0]} and {ends[1]}"
+
+
+def _cells(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+    return [place.cell for place in places(f, x)]
+
+
+def _endings(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+    """The parts of f that are no number beyond some place."""
+    return [*f.atoms(*_ENDING), *(power for power in f.atoms(sp.Pow) if power.exp.is_integer is False)]
+
+
+def _written(g: sp.Expr) -> str:
+    return str(g.xreplace({a: sp.Float(a, 6) for a in g.atoms(sp.Float)}))
 
 
 def _name(site: Sequence[int]) -> str:
@@ -200,6 +233,7 @@ _SINGULAR: dict[Any, Callable[..., Sequence[sp.Expr]]] = {
 }
 """What vanishes where a function is infinite, or ends."""
 
+_ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, sp.elliptic_k, sp.elliptic_e
 _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 
 
@@ -241,10 +275,13 @@ def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
         yield touched
     elif len(g.free_symbols) <= FACTORED and _is_rational(g):
         exact = g.xreplace({a: sp.nsimplify(a, rational=True) for a in g.atoms(sp.Number, sp.NumberSymbol)})
+        exact, _ = sp.fraction(sp.together(exact))
         for factor, _ in sp.Poly(exact, *sorted(g.free_symbols, key=str), domain="QQ").factor_list()[1]:
             yield from _of_polynomial(factor.as_expr(), x)
     else:
         yield Place(g, sp.sign(g))
+        if len(g.free_symbols) == 1 and g.subs(s := min(g.free_symbols, key=str), 0).is_zero:  # which it may touch
+            yield Place(g, sp.sign(s))
 
 
 def _touched(g: sp.Expr) -> Place | None:
@@ -264,17 +301,18 @@ def _of_polynomial(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
     """The places of a factor; of one in one letter its real roots."""
     if not g.free_symbols & set(x) or g.is_zero is False:
         return
-    if len(g.free_symbols) > 1 or sp.degree(g) == 1:
+    if len(g.free_symbols) > 1:
         yield Place(_plain(g), sp.sign(_plain(g)))
         return
     (s,) = g.free_symbols
     for root in sp.real_roots(sp.Poly(g, s)):
-        yield Place(s - root.evalf(17), sp.sign(s - root.evalf(17)))
+        root = root if root.is_Integer else root.evalf(17)  # noqa: PLW2901
+        yield Place(s - root, sp.sign(s - root))
 
 
 def _is_rational(g: sp.Expr) -> bool:
-    """Return True for a polynomial of rational numbers and floats."""
-    return g.is_polynomial(*g.free_symbols) and all(a.exp.is_Integer for a in g.atoms(sp.Pow))
+    """Return True for a ratio of polynomials of rational numbers and floats."""
+    return g.is_rational_function(*g.free_symbols) and all(a.exp.is_Integer for a in g.atoms(sp.Pow))
 
 
 def _plain(g: sp.Expr) -> sp.Expr:
@@ -316,7 +354,7 @@ def infinite_between(
                 values = [function(*at(low + side * mpmath.mpf(d))) for d in BESIDE]
                 if any(mpmath.im(value) != 0 or not mpmath.isfinite(value) for value in values):
                     return True
-                before, after = (abs(y - x) for x, y in zip(values, values[1:], strict=False))
+                before, after = (abs(y - x) for x, y in pairwise(values))
                 if after > DECREASES * before:
                     return True
         except (ArithmeticError, ValueError, TypeError, NameError):  # no number there

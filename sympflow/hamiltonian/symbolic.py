@@ -295,7 +295,7 @@ class SymbolicHamiltonian(Definition):
         return self._scalar("Ht")(y, t)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
-        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, under a name of its own."""
+        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
         return self._function(name, lambda: expressions, assemble)
 
     def potential(self, q: Array, *t: Array) -> Array:
