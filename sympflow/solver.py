@@ -282,11 +282,17 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
+    passed = False
+    if system.poles is not None and problem.diagnosed and problem.letters is None and problem.store is None:
+        from sympflow.integrators.diagnosis import note_poles
+
+        if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
+            passed = note_poles(outcome, integrator, problem, stacklevel=4)
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
     if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
         from sympflow.integrators.diagnosis import note_singularities
 
-        note_singularities(outcome, integrator, problem)
+        note_singularities(outcome, integrator, problem, passed)
     if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
     if integrator.absolute_tolerance and not failed and problem.store is None and readable(outcome.y):

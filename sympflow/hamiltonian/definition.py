@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.arrays import Array
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.poles import Poles
 
 
 class Definition:
@@ -47,7 +50,9 @@ class Definition:
     impulses : tuple
         Those of H, DiracDelta in t, if it has some: then there are `between_impulses` and `kicks`.
     leaps : bool
-        True if V is infinite in places that a step may leap over, such as of bodies that meet: then there is `leapt`.
+        True if bodies may meet, over which a step may leap: then there is `leapt`.
+    poles : Poles or None
+        The places that a step may leap over at which H as it is written is infinite or no number.
     """
 
     ndof: int
@@ -64,6 +69,7 @@ class Definition:
     loops: str = ""
     leaps: bool = False
     impulses: tuple[Any, ...] = ()
+    poles: Poles | None = None
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:

@@ -15,6 +15,7 @@ from sympflow.hamiltonian.times import checked_time
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.local import LocalHamiltonian
+    from sympflow.hamiltonian.poles import Poles
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
@@ -507,8 +508,13 @@ class Hamiltonian:
         return self._definition.instead
 
     @property
+    def poles(self) -> Poles | None:
+        """The places that a step may leap over at which H as it is written is infinite or no number, if it has some."""
+        return self._definition.poles
+
+    @property
     def leaps(self) -> bool:
-        """True if V is infinite in places that a step may leap over, such as of bodies that meet."""
+        """True if bodies may meet, over which a step may leap."""
         return self._definition.leaps
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int) -> np.ndarray:

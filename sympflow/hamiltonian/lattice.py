@@ -18,7 +18,7 @@ from sympflow.arrays import Array, concatenate, is_tensor, library
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
-from sympflow.hamiltonian.poles import Poles
+from sympflow.hamiltonian.poles import LatticePoles, Poles
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.normal_modes import SpectralPart
@@ -196,28 +196,15 @@ class LatticeHamiltonian(LocalHamiltonian):
                 kept.append(x)
         return kept
 
-    @cached_property
-    def leaps(self) -> bool:  # type: ignore[override]
-        return Poles(self).there_are
-
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
-        return Poles(self).passed(starts[:, : self.ndof], ends[:, : self.ndof])
-
-    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
-        poles, q0 = Poles(self), start[: self.ndof]
-        if beyond := poles.where(q0, q0):
-            return f"V of {beyond} is no number: take another `y0`"
-        passed = poles.where(q0, y[: self.ndof])
-        return (
-            f"{passed} passed a place where V is infinite between two steps, which saw nothing of it: take shorter ones"
-        )
+    @property
+    def poles(self) -> Poles | None:  # type: ignore[override]
+        return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:
-        if not self.leaps:
+        if self.poles is None:
             return ""
-        return (
-            f"{Poles(self).nearest(q)} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
-        )
+        nearest = LatticePoles(self).nearest(q)
+        return f"{nearest} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
 
     def written_out(self) -> sp.Expr:
         """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""

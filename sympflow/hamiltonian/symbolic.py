@@ -44,6 +44,7 @@ from sympflow.hamiltonian.jumps import (
     has_period,
     split_impulses,
 )
+from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 
 LARGEST = sys.float_info.max
 MOST_LEFT_OUT = 100
@@ -351,6 +352,10 @@ class SymbolicHamiltonian(Definition):
         v = self.inverse_mass * slope
         return (v.T * sp.hessian(self.V, self.q) * v)[0] / 2
 
+    @cached_property
+    def poles(self) -> Poles | None:  # type: ignore[override]
+        return SymbolicPoles(self) or None
+
     # array functions, state y = [q, p] on the last axis -------------------------------------------
 
     def hamiltonian(self, y: Array, *t: Array) -> Array:
@@ -368,6 +373,10 @@ class SymbolicHamiltonian(Definition):
     def time_derivative(self, y: Array, t: Array) -> Array:
         """∂H/∂t: (..., 2d) to (...)."""
         return self._scalar("Ht")(y, t)
+
+    def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
+        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
+        return self._function(name, lambda: expressions, assemble)
 
     def potential(self, q: Array, *t: Array) -> Array:
         return self._scalar("V")(q, *t)
@@ -481,7 +490,8 @@ class SymbolicHamiltonian(Definition):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the generated functions, which cannot be pickled and are generated again."""
-        return {name: value for name, value in vars(self).items() if name not in ("_functions", "_switches")}
+        left_out = ("_functions", "_switches", "poles")
+        return {name: value for name, value in vars(self).items() if name not in left_out}
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
