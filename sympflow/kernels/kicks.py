@@ -324,7 +324,7 @@ def _tried(
 
 def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symbol]) -> sp.Expr:
     """The expression with a symbol for the part of each product that depends on b, g and c, or b and e, alone."""
-    if not f.args or not f.free_symbols - states:
+    if not isinstance(f, sp.Expr) or not f.args or not f.free_symbols - states:
         return f
     if f.is_Mul:
         fixed = [a for a in f.args if not a.free_symbols & states]
@@ -747,7 +747,7 @@ def _collected(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
 def _by_common_factors(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
     """Horner's form: of the factors of the terms that most of them share, one after the other taken out."""
     terms = sp.Add.make_args(f)
-    counts = {s: sum(term.has(s) and (term / s).is_polynomial(s) for term in terms) for s in q}
+    counts = {s: sum(bool(term.has(s) and (term / s).is_polynomial(s)) for term in terms) for s in q}
     symbol = max(q, key=counts.__getitem__)
     if counts[symbol] < 2:
         return f
