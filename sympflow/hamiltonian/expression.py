@@ -101,7 +101,7 @@ def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
     """
     shape = getattr(expression, "shape", ())
     if shape == (1, 1):
-        expression = expression[0, 0]  # type: ignore[index]
+        expression = expression[0, 0]
     elif shape:
         raise Unreadable(f"it is a matrix of shape {shape}, not a number: take one entry")
     if not isinstance(expression, sp.Expr):

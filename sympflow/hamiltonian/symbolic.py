@@ -549,9 +549,7 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
     """Refuse samples that stand beside all coordinates, as those of a V(q) would, where no time is named."""
     terms = sp.Add.make_args(sp.expand(written))
     for symbol, value in values.items():
-        if isinstance(value, sampled) and all(
-            term.free_symbols <= values.keys() for term in terms if term.has(symbol)
-        ):
+        if isinstance(value, sampled) and all(term.free_symbols <= values.keys() for term in terms if term.has(symbol)):
             raise ValueError(
                 f"`params` has {symbol.name}, a spline, which is a function of the time: in a term without q and p it "
                 "moves nothing. Give a potential by functions, HamiltonianSystem(V, ndof=…, gradient=…); where it is "

@@ -453,7 +453,10 @@ def _by_products(symbols: SymbolicHamiltonian, terms: int, prefix: str) -> list[
     schedule = Schedule(known, printed, prefix, PRODUCT, few=True)
     for letter, f in zip(letters.functions, vectorised(list(letters.functions.values())), strict=True):
         schedule.define(letter, f)
-    forms = [printable(_by_common_factors(_expanded(f, x), x)) for f in functions]
+    expanded = [_expanded(f, x) for f in functions]
+    if any(len(f.args) > MOST_TERMS for f in expanded):
+        return []
+    forms = [printable(_by_common_factors(f, x)) for f in expanded]
     shared, forms = sp.cse(forms, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
     for symbol, f in shared:
         schedule.define(symbol, f)
