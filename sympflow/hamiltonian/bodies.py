@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import check_kept, plain, real_number
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
@@ -537,9 +537,11 @@ def _checked_dim(dim: Any) -> int:
 
 
 def _checked_column(name: str, values: Any) -> np.ndarray:
+    check_kept(name, values)
+    values = to_numpy(values) if is_tensor(values) else values
     check_memory(float(np.size(values)), f"`{name}`")
     try:
-        array = np.array(plain(values), dtype=float)
+        array = np.array(values, dtype=float)
     except (TypeError, ValueError):
         raise TypeError(f"`{name}` must be an array (n,) of numbers; got {reprlib.repr(values)}.") from None
     if array.ndim != 1:
@@ -553,6 +555,7 @@ def _checked_column(name: str, values: Any) -> np.ndarray:
 def _checked_length(name: str, value: Any) -> float | None:
     if value is None:
         return None
+    check_kept(name, value)
     value = plain(value)
     if not real_number(value) or not 0 <= value < math.inf or (name == "cutoff" and value == 0):
         raise ValueError(f"`{name}` must be a positive, finite length; got {value!r}.")
@@ -562,8 +565,9 @@ def _checked_length(name: str, value: Any) -> float | None:
 def _checked_box(box: Any, dim: int) -> np.ndarray | None:
     if box is None:
         return None
+    check_kept("box", box)
     try:
-        lengths = np.array(plain(box), dtype=float)
+        lengths = np.array(to_numpy(box), dtype=float)
         lengths = np.broadcast_to(lengths, (dim,)).copy()
     except (TypeError, ValueError):
         raise ValueError(f"`box` must be a length, or {dim} of them, one along each axis; got {box!r}.") from None
@@ -579,6 +583,7 @@ def _checked_params(params: Any) -> dict[str, float]:
     for name, given in (params or {}).items():
         if not isinstance(name, str) or not name.isidentifier():
             raise ValueError(f"`params` must have names as keys; got {name!r}.")
+        check_kept(f"params[{name!r}]", given)
         value = plain(given)
         if not real_number(value) or not math.isfinite(value):
             raise ValueError(

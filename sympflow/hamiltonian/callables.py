@@ -187,6 +187,11 @@ def _check_callable(**functions: Any) -> None:
     for name, function in functions.items():
         if function is not None and not callable(function):
             raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
+        if name in ("potential", "hamiltonian") and functions["gradient"] is None and _is_numba(function):
+            raise TypeError(
+                f"`{name}` is a Numba function, through which torch cannot differentiate: pass the function that it is "
+                "made of, its `.py_func`, written with torch functions, or a `potential` with its `gradient`."
+            )
 
 
 def _is_numba(function: Any) -> bool:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import check_kept, plain, real_number
 from sympflow.arrays import Array, concatenate, is_tensor, library
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
@@ -689,6 +689,7 @@ def checked_params(params: Any, shape: tuple[int, ...]) -> dict[str, float | np.
     for name, given in (params or {}).items():
         if not isinstance(name, str) or not name.isidentifier():
             raise ValueError(f"`params` must have names as keys; got {name!r}.")
+        check_kept(f"params[{name!r}]", given)
         value = plain(given)
         if real_number(value):
             if not math.isfinite(value):

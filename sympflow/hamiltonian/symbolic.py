@@ -19,7 +19,7 @@ import numpy as np
 import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
-from sympflow.arguments import plain
+from sympflow.arguments import check_kept, plain
 from sympflow.arrays import Array, assemble, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
@@ -32,7 +32,7 @@ from sympflow.hamiltonian.driving import (
     sampled_parameter,
     with_letters,
 )
-from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, read
+from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, complex_part, of_sympy, read
 from sympflow.hamiltonian.jumps import (
     MOST_IMPULSES,
     MOST_POINTS,
@@ -49,6 +49,8 @@ from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 LARGEST = sys.float_info.max
 MOST_LEFT_OUT = 100
 """Degrees of freedom up to the last one that a formula may do without."""
+MOST_COORDINATES = 10_000
+"""Of an H that is written out."""
 FAR = 1000.0
 """The time before and after 0 in which it is looked if H jumps, where that is at no zeros of linear functions."""
 
@@ -139,6 +141,8 @@ class SymbolicHamiltonian(Definition):
         H = _valued(written, values, self.time)
         if self.time is not None and self.time in written.free_symbols - H.free_symbols:
             self.time = None
+        if time is None and self.time is not None:
+            _check_samples(written, values)
         if self.time is not None:
             if self.time not in H.free_symbols:
                 raise ValueError(f"`time` is {self.time.name!r}, which H does not depend on: leave it out.")
@@ -155,6 +159,12 @@ class SymbolicHamiltonian(Definition):
             raise ValueError(
                 f"`expression` has coordinates of the number {str(ndof)[:20]}, and depends on {len(used)} degrees of "
                 "freedom: number them from 1, q1 … qd and p1 … pd."
+            )
+        if ndof > MOST_COORDINATES:
+            raise ValueError(
+                f"`expression` has {ndof:,} coordinates by its highest index, more than {MOST_COORDINATES:,}: give a "
+                "system that large by one site and one bond, HamiltonianSystem.lattice, or by one pair, "
+                "HamiltonianSystem.pairs."
             )
         plain = {sp.Symbol("q", real=True), sp.Symbol("p", real=True)} & H.free_symbols
         if plain and ndof > 1:
@@ -175,6 +185,7 @@ class SymbolicHamiltonian(Definition):
                 self._rest.time = None
             H = H.replace(sp.DiracDelta, lambda g, *_: Impulse(g))
         self._set(H)
+        _check_real(self.H)
 
     def _set(self, H: sp.Expr) -> None:
         self.H: sp.Expr = _with_numeric_constants(H)
@@ -327,8 +338,8 @@ class SymbolicHamiltonian(Definition):
         if self.T is None or not self.T.is_polynomial(*self.p):
             return None
         M = hessian(self.T, self.p)
-        p = sp.Matrix(self.p)
-        if M.free_symbols & {*self.p, self.time} or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
+        terms = [entry * self.p[i] * self.p[j] / 2 for (i, j), entry in M.todok().items()]
+        if M.free_symbols & {*self.p, self.time} or sp.expand(self.T - sp.Add(*terms)) != 0:
             return None
         return M
 
@@ -543,11 +554,12 @@ def gradient(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
 
 def hessian(f: sp.Expr, x: Sequence[sp.Symbol]) -> sp.Matrix:
     """∇²f, as `sympy.hessian`, by the terms that are not zero."""
-    rows = [[sp.S.Zero] * len(x) for _ in x]
+    place, entries = {s: i for i, s in enumerate(x)}, {}
     for i, slope in enumerate(gradient(f, x)):
-        for j, entry in enumerate(gradient(slope, x[i:]), i):
-            rows[i][j] = rows[j][i] = entry
-    return sp.Matrix(rows)
+        later = sorted(j for s in slope.free_symbols if (j := place.get(s, -1)) >= i)
+        for j, entry in zip(later, gradient(slope, [x[j] for j in later]), strict=True):
+            entries[i, j] = entries[j, i] = entry
+    return sp.SparseMatrix(len(x), len(x), entries)
 
 
 def parse(expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol | None = None) -> sp.Expr:
@@ -560,10 +572,11 @@ def _read(
 ) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
     """The expression in real symbols, and the numbers, or functions of t, for those that are parameters."""
     names = {name: sp.Symbol(name, real=True) for name in params}
+    meant = {*params, *(() if time is None else (time.name,))}
     if isinstance(expression, str):
         try:
             coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", expression) if _is_coordinate(w))
-            H = read(expression, {*params, *_AMBIGUOUS, *coordinates, *(() if time is None else (time.name,))})
+            H = read(expression, {*meant, *_AMBIGUOUS, *coordinates})
         except Unreadable as error:
             shown = expression if len(expression) <= 200 else expression[:200] + "..."
             raise ValueError(
@@ -577,11 +590,11 @@ def _read(
                 f"`expression` must be a scalar expression; got {type(expression).__name__}: pass a string or a SymPy "
                 "expression."
             ) from None
-    if not isinstance(H, sp.Expr):
-        raise ValueError(f"`expression` must be a scalar expression; got {type(H).__name__}.")
-    if H.has(sp.I):
-        raise ValueError("`expression` is complex: a Hamiltonian must be real, so leave the imaginary unit I out.")
-    H = H.xreplace({s: sp.Symbol(s.name, real=True) for s in H.free_symbols})
+    try:
+        H = of_sympy(H, meant)
+    except Unreadable as error:
+        raise ValueError(f"`expression` must be a scalar expression: {error}.") from None
+    _check_real(H)
     for name in params:
         if names[name] not in H.free_symbols:
             raise ValueError(f"`params` has {name!r}, which the expression does not use: remove it.")
@@ -613,12 +626,30 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
     return H
 
 
+def _check_real(H: sp.Expr) -> None:
+    if (part := complex_part(H)) is not None:
+        remedy = "leave the imaginary unit I out" if part == sp.I else f"write {part} with a positive base"
+        raise ValueError(f"`expression` is complex: a Hamiltonian must be real, so {remedy}.")
+
+
 def _check_values(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
     """Refuse values with which H is not finite or not real, as a mass of 0 or the root of a negative number."""
     numbers = [abs(a) for a in H.atoms(sp.Number)]
-    if H.has(sp.I, sp.zoo, sp.nan, sp.oo) or any(a > LARGEST for a in numbers):
+    if H.has(sp.zoo, sp.nan, sp.oo) or complex_part(H) is not None or any(a > LARGEST for a in numbers):
         shown = ", ".join(f"{s} = {float(value):.9g}" for s, value in values.items() if value.is_number)
         raise ValueError(f"`params` has {shown}, with which the expression is not a finite real one: change them.")
+
+
+def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
+    """Refuse samples that stand beside all coordinates, as those of a V(q) would, where no time is named."""
+    terms = sp.Add.make_args(sp.expand(written))
+    for symbol, value in values.items():
+        if isinstance(value, sampled) and all(term.free_symbols <= values.keys() for term in terms if term.has(symbol)):
+            raise ValueError(
+                f"`params` has {symbol.name}, a spline, which is a function of the time: in a term without q and p it "
+                "moves nothing. Give a potential by functions, HamiltonianSystem(V, ndof=…, gradient=…); where it is "
+                "the time that is meant, pass time='t'."
+            )
 
 
 class _Letters:
@@ -708,6 +739,7 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
         if is_spline(given):
             checked[name] = Samples.of(name, given)
             continue
+        check_kept(f"params[{name!r}]", given)
         value = plain(given)
         if isinstance(value, numbers.Rational | sp.Expr) and not isinstance(value, int):
             try:
@@ -721,7 +753,7 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _is_coordinate(name: str) -> bool:
-    return re.fullmatch(r"[qp]([1-9]\d*)?", name) is not None
+    return re.fullmatch(r"[qp]([1-9][0-9]{0,15})?", name) is not None
 
 
 def _index(symbol: sp.Symbol) -> int:
@@ -821,6 +853,20 @@ def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
     return half * half * x if n % 2 else half * half
 
 
+def _special_functions() -> dict[str, Callable[..., Any]]:
+    """What the printer of SciPy does not know, or by complex numbers: NaN where it is not real."""
+    from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc, lambertw
+
+    def real_lambertw(x: Any, k: Any = 0) -> Any:
+        w = lambertw(x, k)
+        return np.where(w.imag == 0, w.real, np.nan)
+
+    def elliptic_e(*x: Any) -> Any:
+        return (ellipe if len(x) == 1 else ellipeinc)(*x)
+
+    return {"elliptic_k": ellipk, "elliptic_f": ellipkinc, "elliptic_e": elliptic_e, "LambertW": real_lambertw}
+
+
 def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     """Modules of the functions in the generated code; SciPy is brought in for special functions only."""
     from sympy.printing.numpy import NumPyPrinter
@@ -831,8 +877,8 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
         n for n in names - known.keys() if n not in ("Max", "Min", "Abs", "Heaviside", "sign", "Piecewise")
     )
     if library == "numpy":
-        own = {"integer_power": _integer_power}
-        return [own, "scipy", "numpy"] if special else [own, "numpy"]
+        own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
+        return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]
     if special:
         raise TypeError(
             f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "

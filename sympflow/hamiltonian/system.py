@@ -241,7 +241,7 @@ class HamiltonianSystem(Hamiltonian):
             )
         self = cls.__new__(cls)
         M = symbols.inverse_mass
-        inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
+        inverse_mass = None if M is None else matrices.simplest(matrices.from_entries(M.shape, M.todok()))
         Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
         self._set_friction(damping)

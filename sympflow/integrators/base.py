@@ -7,7 +7,8 @@ walks the grid, finds what is not finite, places the outputs and looks for event
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -214,6 +215,9 @@ def _is_counted(cls: type[FixedStep]) -> bool:
 # one run of a method -------------------------------------------------------------------------------
 
 
+_ADVICE = re.compile(r"(, or use|: use|\. Use) backend='array'\.$")
+
+
 class Stepper:
     """One run of a fixed-step integrator: all that a run changes or counts is here.
 
@@ -233,8 +237,12 @@ class Stepper:
     saves_finite: bool = False
     counts_itself: ClassVar[bool] = False
     """True if `evaluations` tells those that were made so far, whatever the steps."""
+    remark: str = ""
+    """Why a run of a formula is not compiled, for its message."""
 
-    def __init__(self, integrator: FixedStep, problem: Problem) -> None:
+    def __init__(self, integrator: FixedStep, problem: Problem, told: Sequence[str] = ()) -> None:
+        if told and problem.system.symbols is not None:
+            self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
         self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.backend = "torch" if is_tensor(problem.y0) else "numpy"
 
@@ -341,7 +349,12 @@ class KernelStepper(Stepper):
 
 
 def compiled_loops(
-    make: Callable[[], Any], y0: Array, backend: str, compensated: bool = False, reason: str | None = None
+    make: Callable[[], Any],
+    y0: Array,
+    backend: str,
+    compensated: bool = False,
+    reason: str | None = None,
+    told: list[str] | None = None,
 ) -> Any:
     """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
 
@@ -357,6 +370,8 @@ def compiled_loops(
         Compiled loops are needed, for compensated sums.
     reason : str, optional
         Why the method has no compiled form at all.
+    told : list of str, optional
+        Takes the reason that `make` gives, where array operations step in for it.
 
     Raises
     ------
@@ -369,6 +384,7 @@ def compiled_loops(
         reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
     elif y0.dtype != np.float64:
         reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
+    asked = reason is None
     if reason is None:
         try:
             return make()
@@ -379,6 +395,8 @@ def compiled_loops(
     if compensated:
         needed = "" if reason.startswith("`compensated`") else "`compensated` sums need compiled loops. "
         raise ValueError(needed + reason) from None
+    if told is not None and backend == "auto" and asked:
+        told.append(reason)
     return None
 
 
@@ -499,7 +517,9 @@ class GridRun:
         if self.problem.store is not None:
             return self._stored(self.problem.store)
         search = self.problem.events
-        return self._whole() if search is None else self._streamed(search)
+        outcome = self._whole() if search is None else self._streamed(search)
+        outcome.message += self.stepper.remark
+        return outcome
 
     def _whole(self) -> Outcome:
         problem, grid, stepper = self.problem, self.grid, self.stepper

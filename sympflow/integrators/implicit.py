@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -104,13 +105,15 @@ class Gauss(OwnStepper):
     def own_stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
         from sympflow.kernels.implicit_loops import implicit_kernel
 
+        told: list[str] = []
         kernel = compiled_loops(
             lambda: implicit_kernel(problem.system, self.tableau, bool(self.compensated)),
             problem.y0,
             problem.backend,
             self.compensated,
+            told=told,
         )
-        return ArrayGauss(self, problem) if kernel is None else CompiledGauss(self, problem, kernel)
+        return ArrayGauss(self, problem, told) if kernel is None else CompiledGauss(self, problem, kernel)
 
 
 class _Counts:
@@ -141,8 +144,8 @@ class ArrayGauss(_Counts, Stepper):
 
     takes_carry = True
 
-    def __init__(self, gauss: Gauss, problem: Problem) -> None:
-        super().__init__(gauss, problem)
+    def __init__(self, gauss: Gauss, problem: Problem, told: Sequence[str]) -> None:
+        super().__init__(gauss, problem, told)
         self.gauss, self.iterations = gauss, 0
 
     def rollout(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copyreg
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -389,9 +389,11 @@ class Splitting(OwnStepper):
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
         make = composition.cuda_kernel if problem.backend == "cuda" else composition.kernel
-        kernel = compiled_loops(lambda: make(bool(self.compensated)), problem.y0, problem.backend, self.compensated)
+        told: list[str] = []
+        compensated = bool(self.compensated)
+        kernel = compiled_loops(lambda: make(compensated), problem.y0, problem.backend, compensated, told=told)
         if kernel is None:
-            return ArrayComposition(self, problem, composition)
+            return ArrayComposition(self, problem, composition, told)
         if problem.letters is not None:
             kernel = kernel.varied(problem.letters)
         return CompiledComposition(self, problem, composition, kernel)
@@ -417,8 +419,10 @@ class ArrayComposition(Stepper):
 
     takes_carry = True
 
-    def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition) -> None:
-        super().__init__(integrator, problem)
+    def __init__(
+        self, integrator: FixedStep, problem: Problem, composition: Composition, told: Sequence[str] = ()
+    ) -> None:
+        super().__init__(integrator, problem, told)
         self.composition = composition
 
     def rollout(
