@@ -508,6 +508,10 @@ class FlowMap(nn.Module):
         self.identity, self.unfitted = description.identity, description.unfitted
         self.drive_times, self.lattice_terms = description.drive_times, dict(description.lattice_terms)
 
+    def identity_parts(self) -> Any:
+        """Return what a store knows it by: the map alone, without what is told of it."""
+        return [self.kind, self.architecture(), self.dt, dict(self.state_dict())]
+
     # its system ---------------------------------------------------------------------------------------------
 
     @property

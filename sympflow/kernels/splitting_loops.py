@@ -151,12 +151,21 @@ class SplittingLoops:
             Sum with Kahan's compensation, which lowers the growth of round-off, in runs.
         ranges
             Of positions: see `functions`.
+
+        Raises
+        ------
+        ValueError
+            If a function in H has no compiled form.
         """
-        return SplittingKernel(self, scheme, compensated, ranges)
+        kernel = SplittingKernel(self, scheme, compensated, ranges)
+        kernel._functions()  # so that what has no compiled form is refused here, and not by a run
+        return kernel
 
     def damped_kernel(self, scheme: Scheme, step: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> DampedKernel:
         """The loops of one scheme on a system with friction; single steps are made by `step(y, h)` on arrays."""
-        return DampedKernel(self, scheme, step)
+        kernel = DampedKernel(self, scheme, step)
+        kernel._functions()
+        return kernel
 
     def takes_values(self, level: int, ranges: Ranges | None = None) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""

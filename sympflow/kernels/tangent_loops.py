@@ -91,6 +91,7 @@ class TangentKernel:
         limit: float = 0.0,
         single: bool = False,
         threads: int | None = None,
+        scale: np.ndarray | None = None,
     ) -> TangentRun:
         """`n_steps` steps of length h of every row of `y0`.
 
@@ -113,6 +114,8 @@ class TangentKernel:
             True to run each orbit by itself, which is faster for one, not in vector lanes.
         threads : int, optional
             The default is as many as pay.
+        scale : ndarray of shape (2d,), optional
+            Lengths are those of scale·w; 1 by default.
         """
         d, table, rollout = self.ndof, self._table(h), self._make(single)
         parts = np.empty((len(y0), 2, 1 + self.vectors, d))
@@ -123,9 +126,10 @@ class TangentKernel:
         spread = np.full((len(y0), len(save) + 1), np.nan)
         reached = np.zeros(len(y0), dtype=np.int64)
         save = np.ascontiguousarray(save, dtype=np.int64)
+        squares = np.ones(2 * d) if scale is None else scale**2
 
         def rows(i: slice, stop: np.ndarray) -> None:
-            rollout(table, x0[i], n_steps, every, save, kind, limit, growth[i], spread[i], reached[i], stop)
+            rollout(table, x0[i], squares, n_steps, every, save, kind, limit, growth[i], spread[i], reached[i], stop)
 
         run_rows(rows, len(y0), n_steps * table.shape[1] * x0.shape[1], threads)
         whole = reached >= 0

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import floats, plain
+from sympflow.arguments import MAX_ASKED_VALUES, floats, plain
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.flow.scaling import Scaling
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
@@ -503,10 +503,20 @@ def _opened(path: Path) -> Any:
             ) from error
     xarray = imported("xarray", "Reading a Dataset")
     if ending == ".zarr":
-        return xarray.open_zarr(path, consolidated=False).load()
+        return _loaded(xarray.open_zarr(path, consolidated=False, chunks=None))
     if ending in (".nc", ".netcdf"):
-        return xarray.load_dataset(path)
+        with xarray.open_dataset(path) as data:
+            return _loaded(data)
     raise ValueError(f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .nc and .zarr are read.")
+
+
+def _loaded(data: Any) -> Any:
+    """The Dataset in memory, unless what its file tells of would not fit there."""
+    if data.nbytes > 8 * MAX_ASKED_VALUES:
+        raise ValueError(
+            f"`data` tells of {data.nbytes / 2**30:.3g} GiB, more than {MAX_ASKED_VALUES:.0e} numbers: give a part."
+        )
+    return data.load()
 
 
 def _check_commas(path: Path) -> None:

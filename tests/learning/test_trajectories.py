@@ -1,5 +1,7 @@
 """Trajectories from arrays, tables, Datasets and results: read alike, and refused by name."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -84,6 +86,12 @@ def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
     assert_same(Trajectories.read(tmp_path / "runs.nc"), runs)
     sol.to_xarray().to_zarr(tmp_path / "runs.zarr", consolidated=False)
     assert_same(Trajectories.read(tmp_path / "runs.zarr"), runs)
+    large = tmp_path / "large.zarr"
+    sol.to_xarray().assign(more=("x", np.zeros(3))).to_zarr(large, consolidated=False, zarr_format=2)
+    described = json.loads((large / "more" / ".zarray").read_text())
+    (large / "more" / ".zarray").write_text(json.dumps(described | {"shape": [10**13]}))
+    with pytest.raises(ValueError, match=r"`data` tells of 7\.28e\+04 GiB"):
+        Trajectories.read(large)
     with pytest.raises(ValueError, match=r"names a file \.mat: \.csv, \.parquet, \.nc and \.zarr are read"):
         (tmp_path / "runs.mat").touch()
         Trajectories.read(tmp_path / "runs.mat")
