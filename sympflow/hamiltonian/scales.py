@@ -29,6 +29,7 @@ def natural_scale(system: HamiltonianSystem) -> np.ndarray:
     over the domain, ω being `fastest_rate`. Without a y0 and a domain s_i = 1. Of a driven system it is that at
     `t_span[0]`. Large lattices and pairs have the ω of a random direction at y0, and their masses.
     """
+    system = system.between_impulses
     if system not in _KNOWN:
         with np.errstate(all="ignore"):
             try:
@@ -51,6 +52,7 @@ def smallest_size(system: HamiltonianSystem, y0: np.ndarray) -> float:
 
     Of states at 0 it is that of their motion in a step `dt`, 1 where there is none.
     """
+    system = system.between_impulses
     scale = weights(system)
     size = np.abs(scale * y0).max(initial=0.0)
     if size == 0:

@@ -49,6 +49,7 @@ from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 LARGEST = sys.float_info.max
 MOST_LEFT_OUT = 100
 """Degrees of freedom up to the last one that a formula may do without."""
+LONGEST_NAME = 40  # in messages
 MOST_COORDINATES = 10_000
 """Of an H that is written out."""
 FAR = 1000.0
@@ -622,7 +623,9 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
         raise TypeError('`expression` depends on the time t: name it by time="t", for a system that is driven.')
     if unknown:
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
-        raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.{meant}")
+        raise ValueError(
+            f"`expression` holds {', '.join(map(_short, unknown))} without a value: give it in `params`.{meant}"
+        )
     return H
 
 
@@ -750,6 +753,10 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
             raise ValueError(f"`params` has {name} = {reprlib.repr(given)}: give a finite real number.")
         checked[name] = value
     return checked
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
 
 
 def _is_coordinate(name: str) -> bool:

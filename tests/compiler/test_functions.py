@@ -14,6 +14,7 @@ EXACT = {  # by mpmath, of functions that have another name there
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
+    "times": lambda a, b: a * b,
     "div": lambda a, b: a / b,
     "neg": lambda a: -a,
     "fma": lambda a, b, c: a * b + c,
@@ -40,7 +41,7 @@ PLACES = [(0.4, -0.8, 1.7), (-0.7, 0.3, -2.2)]
 
 
 def points(name):
-    count = {"fma": 3}.get(name) or (2 if name in {"add", "sub", "mul", "div", "min", "max", "atan2"} else 1)
+    count = {"fma": 3}.get(name) or (2 if name in {"add", "sub", "mul", "times", "div", "min", "max", "atan2"} else 1)
     return POINTS.get(name) or [place[:count] for place in PLACES]
 
 

@@ -9,6 +9,7 @@ import pytest
 AT_ONCE = """
 import sys, threading
 import sympflow
+METHOD = sys.argv[1]
 
 sys.setswitchinterval(1e-5)
 system = sympflow.HamiltonianSystem.from_sympy("p**2/2 + q**2/2 + q**4/7", y0=[1.0, 0.0], dt=0.1)
@@ -17,7 +18,7 @@ start, found = threading.Barrier(8), []
 def run():
     start.wait()
     try:
-        found.append(repr(sympflow.solve(system, "verlet", (0, 1)).y[:, -1].tolist()))
+        found.append(repr(sympflow.solve(system, METHOD, (0, 1)).y[:, -1].tolist()))
     except BaseException as error:
         found.append(repr(error))
 
@@ -29,10 +30,12 @@ print(len(found), *set(found))
 """
 
 
-def told(folder):
+def told(folder, method="gauss_legendre4"):
     """The output of a process with its own cache folder."""
     env = os.environ | {"SYMPFLOW_CACHE_DIR": str(folder), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    ended = subprocess.run([sys.executable, "-c", AT_ONCE], capture_output=True, text=True, check=False, env=env)
+    ended = subprocess.run(
+        [sys.executable, "-c", AT_ONCE, method], capture_output=True, text=True, check=False, env=env
+    )
     assert ended.returncode == 0, ended.stderr
     return ended.stdout
 
@@ -52,6 +55,14 @@ def test_threads_that_compile_at_once_and_files_that_were_cut(tmp_path):
     kept = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nbc")}
     assert told(tmp_path) == first
     assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nbc")} == kept  # compiled once
+
+
+def test_threads_that_trace_at_once(tmp_path):
+    """Eight threads call `solve` first at once with a method over traced numbers: one file is made."""
+    found = told(tmp_path, "verlet")
+    assert found.startswith("8 [0."), found
+    assert found.count("[") == 1
+    assert len([*tmp_path.rglob("*.o")]) == 1
 
 
 @pytest.mark.parametrize("locale", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0"}], ids=str)
