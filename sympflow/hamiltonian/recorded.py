@@ -9,7 +9,7 @@ import sympy as sp
 
 from sympflow.compiler.functions import apply, where
 
-__all__ = ["NotRecorded", "evaluator"]
+__all__ = ["NotRecorded", "can_be_recorded", "evaluator"]
 
 
 class NotRecorded(ValueError):
@@ -40,7 +40,7 @@ _RULES: dict[type, Callable[..., Any]] = {
     sp.sinh: lambda x: apply("sinh", x), sp.cosh: lambda x: apply("cosh", x), sp.tanh: lambda x: apply("tanh", x),
     sp.coth: _reciprocal("tanh"), sp.sech: _reciprocal("cosh"), sp.csch: _reciprocal("sinh"),
     sp.asinh: lambda x: apply("asinh", x), sp.acosh: lambda x: apply("acosh", x),
-    sp.atanh: lambda x: apply("atanh", x), sp.Abs: abs, sp.sign: lambda x: apply("sign", x),
+    sp.atanh: lambda x: apply("atanh", x), sp.erf: lambda x: apply("erf", x), sp.erfc: lambda x: apply("erfc", x), sp.Abs: abs, sp.sign: lambda x: apply("sign", x),
     sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
     sp.Max: _folded("max"), sp.Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
     sp.Not: lambda x: apply("not", x),
@@ -53,6 +53,13 @@ _RULES: dict[type, Callable[..., Any]] = {
 
 def _heaviside(x: Any, at_zero: Any = 0.5) -> Any:
     return where(apply("eq", x, 0.0), at_zero, where(x > 0.0, 1.0, 0.0))
+
+
+def can_be_recorded(f: sp.Expr) -> bool:
+    """True if `evaluator` has a rule for every function in an expression."""
+    functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
+    known = (sp.Piecewise, sp.Heaviside, sp.logic.boolalg.BooleanAtom)
+    return all(a.func in _RULES or isinstance(a, known) for a in functions)
 
 
 def evaluator(numbers: Mapping[sp.Symbol, Any]) -> Callable[[sp.Expr], Any]:

@@ -92,7 +92,8 @@ class SplittingLoops:
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if system.symbols is not None:
-            from sympflow.kernels.codegen import algebra_source  # SymPy, which Numba functions do without
+            from sympflow.hamiltonian.recorded import can_be_recorded  # SymPy, which Numba functions do without
+            from sympflow.kernels.codegen import algebra_source
             from sympflow.kernels.terms import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
@@ -109,7 +110,7 @@ class SplittingLoops:
                 damped = damped_drift(system, False)
                 self._compile = partial(symbolic_loops, system.symbols, algebra_source(system.symbols), damped)
                 self._has_ranges = True
-                self.traced = True
+                self.traced = all(map(can_be_recorded, (system.symbols.V, system.symbols.T)))
                 V = system.symbols.V
                 self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial(*system.symbols.q) else LANES
         elif system.numba_functions is not None:

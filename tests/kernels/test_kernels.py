@@ -128,8 +128,8 @@ def test_kernel_agrees_with_numpy_on_every_kind_of_system(systems, name, scheme)
 
 def test_functions_of_every_kind():
     V = "0.3*sin(q1)*cos(q2)**2 + Abs(q2)**3 + Piecewise((q1**2, q1 > 0), (0, True)) + Max(q1, q2) + asin(q1)"
-    V += " + tan(q1*q2) + q1**2.5 + q2**(5/2) + 2**q2 + q1**(-3) + (q1**2 + q2**2)**(-3/2) + atan2(q1, 1 + q2**2) + log(q1 + 3)"
-    V += " + tanh(q2)"
+    V += " + tan(q1*q2) + q1**2.5 + q2**(5/2) + 2**q2 + q1**(-3) + (q1**2 + q2**2)**(-3/2) + log(q1 + 3)"
+    V += " + tanh(q2) + atan2(q1, 1 + q2**2) + erf(q1)"
     system = HamiltonianSystem.from_sympy(f"(p1**2 + p2**2/2)/2 + cosh(p1) + {V}", y0=[0.5, 0.4, 0.1, 0.2])
     y = splitting_loops(system).kernel(VERLET).step(0.01, system.y0[None]).states[0]
     assert np.abs(y - plain_run(system, VERLET, 0.01, system.y0, 1)[-1]).max() < 1e-14
