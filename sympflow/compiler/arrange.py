@@ -70,7 +70,7 @@ class Plan(NamedTuple):
 
     @property
     def cost(self) -> tuple[int, int]:
-        """A single trajectory waits for the chain, lanes side by side for the operations: both count alike."""
+        """A single trajectory waits for the chain, lanes side by side for the operations: both count."""
         return 2 * self.depth + 3 * self.operations, self.operations
 
 

@@ -439,7 +439,9 @@ class DampedKernel(SplittingKernel):
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         assert self.loops.friction is not None
         table = _damped_stages(self.scheme, h, self.loops.friction)
-        return table.timed_rows(self.loops.values, h, t0) if self.loops.driven else table.packed
+        if self.loops.driven:
+            return table.timed_rows(self.loops.values, h, t0)
+        return table.rows(self.loops.values if self.loops.takes_values(table.level) else ())
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         y, h = np.asarray(y, dtype=np.float64), np.asarray(h, dtype=np.float64)

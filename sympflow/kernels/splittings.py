@@ -27,12 +27,11 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-    from sympflow.kernels.stage_times import Driving
 
 __all__ = ["SplittingCode"]
 
-LANES_OF_SUMS = LANES_OF_FUNCTIONS = 16
-"""Trajectories side by side: two registers or four, so that one need not wait for the other."""
+LANES = 16
+"""Trajectories side by side: of two registers or four, so that one need not wait for the other."""
 MOST_TABLES = 64  # that are kept
 AT_ONCE = 4096  # trajectories with tables of their own
 EARLY = -4  # when momenta are known before the positions, in cycles
@@ -45,7 +44,7 @@ class Splitting:
     Attributes
     ----------
     symbols : SymbolicHamiltonian
-        Separable; parameters are numbers of a table, in a driven system those that stay and then those that change.
+        Separable; its parameters are numbers of a table.
     level, monomials
         Of the kicks: see `sympflow.schemes.Scheme`.
     compensated : bool
@@ -116,9 +115,8 @@ class _Shape:
             momenta = [made.written(p + x) for p, x in zip(self.p, changes, strict=True)]
             positions, momenta = self._drifted(momenta)
         outputs = [*positions, *momenta, *errors]
-        cost = max(made.depth(x) for x in outputs)
         arranged = made.finish(outputs)
-        return cost + len(arranged.body), arranged
+        return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
 
     def _changes(self) -> list[Any]:
         """The change of p by a kick."""
@@ -236,22 +234,20 @@ class SplittingCode:
     Parameters
     ----------
     splitting : Splitting
-    driving : Driving, optional
-        What changes with the time, of a system that depends on it; its form is that of the splitting.
     """
 
-    def __init__(self, splitting: Splitting, driving: Driving | None = None) -> None:
-        self._splitting, self._driving = splitting, driving
+    def __init__(self, splitting: Splitting) -> None:
+        self._splitting = splitting
         self._lock = threading.RLock()
         self._functions: dict[Any, Callable[..., None]] = {}
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         symbols = splitting.symbols
-        assert symbols.V is not None
         self._n_out = 2 * symbols.ndof
         self._n_values = self._n_out * (1 + splitting.compensated)
         self._own = len(symbols.parameters)
-        of_sums = symbols.V.is_polynomial(*symbols.q)
-        self._width = LANES_OF_SUMS if of_sums else LANES_OF_FUNCTIONS
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SplittingCode, (self._splitting,)
 
     @cached_property
     def _kinds(self) -> list[Arranged]:
@@ -399,7 +395,7 @@ class SplittingCode:
         """Rows side by side; those that end before the last step once more, by themselves, to find that end."""
         before = running.copy() if first > 0 else running
         rest = stop, first
-        width = self._width if len(y0) > 1 else 1
+        width = LANES if len(y0) > 1 else 1
         self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width)
         for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
             one = slice(i, i + 1)
@@ -492,7 +488,7 @@ class SplittingCode:
         if not len(y):
             return
         entries, kinds = self._prepared(table)
-        function = self._function("map", 1 if len(y) == 1 else self._width)
+        function = self._function("map", 1 if len(y) == 1 else LANES)
         arrays = entries, kinds, y, out
         table_at, kinds_at, rows_at, out_at = (x.ctypes.data for x in arrays)
         function(table_at, kinds_at, len(kinds), kinds_at, 1, rows_at, len(y), out_at)
@@ -502,7 +498,7 @@ class SplittingCode:
     ) -> None:
         """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
         own = " own" if y.shape[1] > self._n_out else ""
-        step = self._function("step" + own, 1 if len(y) == 1 else self._width)
+        step = self._function("step" + own, 1 if len(y) == 1 else LANES)
         table = np.ascontiguousarray(table)
         table_at, x_at, h_at, t_at, rows_at, out_at = (a.ctypes.data for a in (table, x, h, t, y, out))
         step(table_at, table.shape[1], table.shape[2], x_at, h_at, t_at, rows_at, len(y), out_at)
