@@ -24,6 +24,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
 from sympflow.learning.fitting import (
+    LAG,
     SILENT,
     Fitted,
     Held,
@@ -40,7 +41,7 @@ from sympflow.learning.library import library_for
 from sympflow.learning.models import Formula, FreeField, Model, Polynomial
 from sympflow.learning.shooting import Field, Method
 from sympflow.learning.smoothing import smoothed
-from sympflow.learning.symplecticity import Reading, best_by_increments, free_reading
+from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
 from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
@@ -59,6 +60,7 @@ POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, tha
 LEAST_SECONDS = 1.0  # for the flow, however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
+CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
 ROUGH = 60  # points from which the roughness of the data tells their noise to a fifth
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
@@ -170,8 +172,10 @@ def learn(
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
     smooth = smoothed(data)
-    setting = Setting(_noise(noise, data), huber, seen=smooth.sigma if data.n_points >= ROUGH else None)
-    said = replace(said, flow_scaling=data.scaling._replace(t=_step(data, smooth.slopes) if dt is None else float(dt)))
+    rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
+    seen = smooth.sigma if data.n_points >= ROUGH else None
+    setting = Setting(_noise(noise, data), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
+    said = replace(said, flow_scaling=data.scaling._replace(t=_step(data, rate) if dt is None else float(dt)))
     chosen = families(said, family)
     folds = data.folds(HELD_OUT, seed)
     if len(folds) == 1:
@@ -191,9 +195,8 @@ def learn(
         return flow
 
 
-def _step(data: Trajectories, slopes: np.ndarray) -> float:
+def _step(data: Trajectories, rate: float) -> float:
     """Δt of a flow that is fitted itself: in which states move by about their spread, but no longer than the data."""
-    rate = float(np.sqrt(np.mean((slopes / data.scales) ** 2))) if len(slopes) else 0.0
     longest = max(run.span for run in data.runs)
     step = min(1 / rate, longest) if rate > 0 else longest
     return float(f"{step:.1g}")
@@ -354,6 +357,13 @@ class Freedom:
     rate: float
 
 
+def _certain(forces: int, fit: Fitted, held: Held) -> bool:
+    """True if the factor of one of the forces is more than chance, which noise that is correlated makes larger."""
+    repeated = min(max(held.correlation, 0.0), 0.99) if math.isfinite(held.correlation) else 0.99
+    errors = np.sqrt(np.diag(fit.fit.covariance())[-forces:] * (1 + repeated) / (1 - repeated))
+    return bool((np.abs(fit.theta[-forces:]) > CERTAIN * max(held.loudness, 1.0) * errors).any())
+
+
 @dataclass
 class Search:
     """The models that were fitted so far, and the best of them."""
@@ -408,7 +418,8 @@ class Search:
         because = (
             "its residuals on held-out trajectories are no more than rounding"
             if held.exact
-            else "it explains held-out trajectories best, and its residuals are noise: one tells nothing of the next"
+            else "it explains held-out trajectories best, and its residuals are noise: one tells nothing of "
+            f"{held.later}"
             if held.explained
             else f"it explains held-out trajectories best; but its residuals are not noise: {held.complaint}"
         )
@@ -444,7 +455,8 @@ class Search:
             self._simplify(with_unit_mass(self.winner[0], self.said), setting, session)
         candidate, self.final, _ = self.winner
         if not deadline.over():
-            self.final = fitted(candidate.model, self.all, setting, self.final.theta)
+            found = fitted(candidate.model, self.all, setting, self.final)
+            self.final = self.final if setting.stop() and found.span < self.final.span else found
         self.cut = deadline.over()
 
     def _ask(self, names: list[str], setting: Setting, session: Session) -> None:
@@ -586,7 +598,8 @@ class Search:
                 return
         smooth = smoothed(self.data)
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
-        said += " " + hint(library_for(None, self.data.ndof, 4, smooth.points)[0], smooth, self.data, otherwise)
+        library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.said.rates > 0
+        said += " " + hint(library, smooth, self.data, otherwise, damped)
         warnings.warn(said, UserWarning, stacklevel=4)
 
     def freedom(self, setting: Setting) -> Freedom | None:
@@ -601,24 +614,29 @@ class Search:
 
     def _freedom(self, setting: Setting) -> Freedom | None:
         """The same by one division of the trajectories: a difference as large as is asked for needs no more."""
+        if self.reading is not None:
+            return self._beside(self.reading, setting)
+        best, scales = self.winner[0].model, self.data.scales
+        damped = [] if best.rates or not isinstance(best, Model) else forced(best)[:1]
+        free = next((r for r in map(partial(free_reading, scales), (3, 2)) if self._affords_field(r.field)), None)
+        found = (self._beside(r, setting) for r in (*damped, free) if r is not None and self._affords_field(r.field))
+        return next((one for one in found if one is not None), None)
+
+    def _beside(self, reading: Reading, setting: Setting) -> Freedom | None:
+        """A reading beside the best H; None if it does not explain much more."""
         data, others = self.folds[0]
         scales, rivals = data.scales, [self.winner[0].model]
-        reading = self.reading
-        if reading is None:
-            reading = next(
-                (r for r in map(partial(free_reading, scales), (3, 2)) if self._affords_field(r.field)), None
-            )
-        if reading is None:
-            return None
         if isinstance(reading.field, FreeField):
             rivals.append(self.said.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
         fit = fitted(reading.field, reading.of(data), setting.turned(reading.rows))
         theirs = judged(fit, reading.of(others), self.setting.turned(reading.rows))
         left, share = theirs.squares(scales[[*reading.rows]]), 0.0
+        if reading.forces and not _certain(reading.forces, fit, theirs):
+            return None
         for model in rivals:
             _, held = self._first_fold(model, setting)
             share = max(share, left / held.squares(scales))
-            if not gains(held, theirs) or not share < FREER:
+            if not gains(held, theirs) or not share < (DAMPED if reading.forces else FREER):
                 return None
         return Freedom(reading.said, reading.remedy(fit.theta), share, *reading.test(fit.theta, fit.states.T, scales))
 

@@ -27,12 +27,12 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from sympflow.learning.models import FreeField, Linear, Model
+from sympflow.learning.models import Forced, FreeField, Linear, Model
 from sympflow.learning.trajectories import Run, Trajectories
 from sympflow.schemes import Scheme, scheme_named
 from sympflow.training.least_squares import Damping
 
-Field = Model | FreeField
+Field = Model | Forced | FreeField
 """A vector field with numbers θ."""
 
 MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the cache
@@ -360,6 +360,12 @@ class Normal:
         return np.where(usable, slope**2 / np.where(usable, curvature, 1.0), 0.0)
 
 
+def rho(r: np.ndarray, huber: float | None) -> np.ndarray:
+    """Huber's ρ of residuals in σ; their squares without a limit."""
+    inside = r if huber is None else np.clip(r, -huber, huber)
+    return inside * (2 * r - inside)
+
+
 @dataclass(frozen=True)
 class Problem:
     """Least squares of θ and the initial states of pieces of trajectories.
@@ -410,10 +416,7 @@ class Problem:
         return r, batch.seen[k] * np.minimum(1.0, self.huber / np.maximum(np.abs(r), self.huber))
 
     def _cost(self, r: np.ndarray) -> float:
-        if self.huber is None:
-            return float(np.sum(r * r))
-        size = np.abs(r)
-        return float(np.sum(np.where(size <= self.huber, r * r, self.huber * (2 * size - self.huber))))
+        return float(np.sum(rho(r, self.huber)))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def cost(self, theta: np.ndarray, states: np.ndarray) -> float:
