@@ -227,7 +227,7 @@ def _states(found: Fitted, data: Trajectories, pieces: Trajectories, sigma: np.n
     """The initial states (N, 2d) of pieces, by a few points each: the first observation alone leads far astray."""
     few = data.pieces(FIRST_POINTS)
     short = Problem(found.model, few, found.method, sigma, frozen=True, huber=setting.huber)
-    orbits = minimized(short, found.theta, first_states(few), iterations=20).orbits
+    orbits = minimized(short, found.theta, first_states(few), iterations=20, patience=1).orbits
     return np.concatenate(orbits, axis=1)[:, _starts(pieces.runs)].T
 
 
@@ -334,7 +334,7 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
     states = _states(found, held, pieces, sigma, setting)
-    fit = minimized(problem, found.theta, states, iterations=20)
+    fit = minimized(problem, found.theta, states, iterations=20, patience=1)
     residuals = fit.residuals
     ends = np.cumsum([run.n_points for run in held.runs])
     owner = np.searchsorted(ends, _starts(pieces.runs), side="right")

@@ -418,10 +418,13 @@ class Problem:
     def _cost(self, r: np.ndarray) -> float:
         return float(np.sum(rho(r, self.huber)))
 
+    def _unlikely(self, theta: np.ndarray) -> float:
+        return 0.0 if self.frozen else float(np.sum((self.model.prior * theta) ** 2))
+
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def cost(self, theta: np.ndarray, states: np.ndarray) -> float:
-        """Σ ρ(r); not finite where an orbit is not."""
-        total = 0.0
+        """Σ ρ(r), and what numbers of an unlikely size cost; not finite where an orbit is not."""
+        total = self._unlikely(theta)
         for batch in self.batches:
             for k, x, _ in self._orbits(batch, theta, states, False):
                 total += self._cost(self._weighted(batch, k, x)[0])
@@ -478,6 +481,10 @@ class Problem:
                         made.c += by_theta @ rest
             made.A[batch.index], made.B[batch.index] = A.transpose(2, 0, 1), B.transpose(2, 0, 1)
             made.a[batch.index] = a.T
+        if n:
+            made.cost += self._unlikely(theta)
+            made.C[np.diag_indices(n)] += self.model.prior**2
+            made.c -= self.model.prior**2 * theta
         return made
 
 
@@ -716,14 +723,15 @@ def matched(model: Field, theta: np.ndarray, data: Trajectories, weights: np.nda
         return theta
     level = Damping(1e-10 if steps == 1 else 1e-3)
     r, J = _increments(model, theta, pieces, weights)
+    prior = model.prior * np.sqrt(r @ r / len(r))
     for _ in range(steps):
         scale = np.sqrt(np.sum(J * J, axis=0))
         D = np.where(scale > 0, scale, 1.0)
-        normal = (J / D).T @ (J / D)
+        normal = (J / D).T @ (J / D) + np.diag((prior / D) ** 2)
         for _ in range(TRIES):
-            step = np.linalg.solve(normal + level.value * np.eye(len(D)), (J / D).T @ r) / D
+            step = np.linalg.solve(normal + level.value * np.eye(len(D)), ((J / D).T @ r - prior**2 * theta / D)) / D
             after, K = _increments(model, theta + step, pieces, weights)
-            if after @ after < r @ r:
+            if after @ after + np.sum((prior * (theta + step)) ** 2) < r @ r + np.sum((prior * theta) ** 2):
                 level.accepted(0.9)
                 theta, r, J = theta + step, after, K
                 break

@@ -133,14 +133,14 @@ def free_reading(scales: np.ndarray, degree: int) -> Reading:
 
 def best_by_increments(
     data: Trajectories, held: Trajectories, models: Sequence[Model]
-) -> tuple[int, Reading | None] | None:
+) -> tuple[int, Reading | None, dict[int, float]] | None:
     """The place of the model, linear in its numbers, that explains held-out increments best, and a doubt, if any.
 
     Returns
     -------
-    tuple of int and (Reading or None), or None
-        The reading of the data that leaves much less than all models, None if there is none; None in place of the pair
-        if there are too few points to tell.
+    tuple of int, (Reading or None) and dict, or None
+        The reading of the data that leaves much less than all models, None if there is none; the squares that the
+        models leave, by their places; None in place of all if there are too few points to tell.
     """
     scales, d = data.scales, data.ndof
     fitted, others = _smooth(data), _smooth(held)
@@ -150,7 +150,7 @@ def best_by_increments(
     squares = {k: _left(models[k], fitted, others, scales) for k in affordable}
     best = min(affordable, key=lambda k: squares[k])
     if not 0 < squares[best] < math.inf:
-        return best, None
+        return best, None, squares
 
     def compared(reading: Reading) -> Reading:
         a, b = reading.of(fitted), reading.of(others)
@@ -168,9 +168,9 @@ def best_by_increments(
     for some in kinds.values():  # the plainest that is about as good as the best
         likeliest = min(some, key=lambda reading: reading.share, default=None)
         if likeliest is not None and likeliest.share <= min(PLAINER * least, PLAINER * freest):
-            return best, (likeliest if likeliest.share < (DAMPED if likeliest.forces else DOUBTFUL) else None)
+            return best, (likeliest if likeliest.share < (DAMPED if likeliest.forces else DOUBTFUL) else None), squares
     likeliest = min(found, key=lambda reading: reading.share, default=None)
-    return best, (likeliest if likeliest is not None and likeliest.share < DOUBTFUL else None)
+    return best, (likeliest if likeliest is not None and likeliest.share < DOUBTFUL else None), squares
 
 
 def _affords(data: Trajectories, model: Field) -> bool:

@@ -34,8 +34,8 @@ BESIDE = ("energy", "status")
 """Columns of tables of sympflow that are no states."""
 ORDERS = ("halves", "pairs")
 FEW = 8
-"""Trajectories from which some are held out for good; of fewer each is left out in turn."""
-HELD_LEAST = 3
+"""Trajectories from which some are held out for good; of fewer each is left out in turn, or in one of three parts."""
+HELD_LEAST = PARTS = 3
 JUMP, STEP = 0.75, 0.3
 """Shares of a period: steps of an angle that was wrapped are longer than the first, or shorter than the second."""
 ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}
@@ -284,7 +284,8 @@ class Trajectories:
         return self.subset(i for i in range(len(self.runs)) if i not in drawn), self.subset(sorted(drawn))
 
     def folds(self, share: float = 0.2, seed: int = 0) -> list[tuple[Trajectories, Trajectories]]:
-        """Divisions as by `split`: one, of three held-out trajectories at least; of few trajectories each in turn.
+        """Divisions as by `split`: one, of three held-out trajectories at least; of few trajectories each is left out
+        in one of three, or in turn.
 
         Raises
         ------
@@ -295,7 +296,8 @@ class Trajectories:
         if n >= FEW:
             return [self.split(max(share, HELD_LEAST / n), seed)]
         self.split(share, seed)  # of one trajectory that is refused
-        return [(self.subset(j for j in range(n) if j != i), self.subset([i])) for i in range(n)]
+        parts = [range(i, n, PARTS) for i in range(min(n, PARTS))]
+        return [(self.subset(j for j in range(n) if j not in part), self.subset(part)) for part in parts]
 
     def subset(self, index: Any) -> Trajectories:
         """The trajectories of some places, which may repeat, as a bootstrap draws them."""

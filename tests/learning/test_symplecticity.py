@@ -72,7 +72,7 @@ def test_increments_tell_data_of_no_hamiltonian(name):
     data = Trajectories.read(make())
     about = _said(data, None, None, False, None, None)
     models = [c.model for family in FAMILIES.values() if family.linear for c in family.models(about)]
-    _, reading = best_by_increments(*data.split(), models)
+    _, reading, _ = best_by_increments(*data.split(), models)
     assert (reading is None) == (not said)
     assert reading is None or said in reading.said
 
