@@ -3,11 +3,14 @@
 The metadata entry "sympflow" is a JSON object: format, version (of the package), kind, architecture, dt, domain,
 system, fingerprint, recipe, figures, checksum (of the tensors), and, where there are any, certificate, identity
 (the H of the system, at states of the domain and as an expression), unfitted (intervals of t without labels)
-drive_times (where a drive without a period was fitted), and lattice_terms (the terms of a lattice, as texts).
+drive_times (where a drive without a period was fitted), and lattice_terms (the terms of a lattice, as texts). The entry
+"sympflow_checksum" is of this object's text; files of format 1 have none, and their weights alone are known to be those
+that were saved.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -36,8 +39,8 @@ from sympflow.hamiltonian.domain import Domain, domain_from_dict
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 
-FORMAT = 1
-KEY = "sympflow"
+FORMAT = 2
+KEY, SUM = "sympflow", "sympflow_checksum"
 MAX_HEADER = 2**20
 MAX_FILE = 2**28
 MIN_DT, MAX_DT = 1e-18, 1e18  # were they seconds, from an attosecond to more than the age of the universe
@@ -192,7 +195,8 @@ def write(
         Description.of_record(record, architecture["ndof"])
     except Refused as reason:
         raise ValueError(f"`flow` cannot be saved as it is: {reason}. Set it right first.") from None
-    content = save_tensors(tensors, {KEY: json.dumps(record, allow_nan=False, separators=(",", ":"))})
+    text = json.dumps(record, allow_nan=False, separators=(",", ":"))
+    content = save_tensors(tensors, {KEY: text, SUM: text_checksum(text)})
     if (length := struct.unpack("<Q", content[:8])[0]) > MAX_HEADER:
         raise ValueError(
             f"`flow` cannot be saved as it is: its description takes {length:,} bytes, more than {MAX_HEADER:,}. "
@@ -208,6 +212,11 @@ def write(
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+
+
+def text_checksum(text: str) -> str:
+    """Return the SHA-256 of a record's text."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _finite(value: Any) -> Any:
@@ -247,17 +256,22 @@ def load(
     ------
     ValueError
         If the file is missing, truncated, of another or a later format, or anything in it is not as it should be:
-        tensors of the wrong name, shape or dtype, weights that are not finite or not those that were saved, an absurd
-        architecture. Or if `system` is not the one that the flow was made for, or `device` is not to be had.
+        tensors of the wrong name, shape or dtype, weights that are not finite, weights or a record (Δt, architecture,
+        domain, figures) that are not those that were saved, an absurd architecture. Of a file of format 1, as earlier
+        versions wrote them and as flows ship, the weights alone are compared with what was saved. Or if `system` is not
+        the one that the flow was made for, or `device` is not to be had.
     TypeError
         If `path` is not a path, or `device` not a device.
     """
     file, device = _path(path), checked_device(device)
     try:
-        content, header, record = _read(file)
+        content, header, record, altered = _read(file)
         flow = _build(record, _dtype_of(header))
         _fill(flow, content, header, record)
-        flow.describe(Description.of_record(record, flow.ndof))
+        description = Description.of_record(record, flow.ndof)
+        if altered:
+            raise Refused("its record is not the one that was saved: its checksum differs, the file was altered")
+        flow.describe(description)
     except Refused as reason:
         raise _refusal(file, str(reason), reason.remedy) from None
     except OverflowError:
@@ -280,8 +294,8 @@ def _refusal(path: Path, reason: str, remedy: str) -> ValueError:
     return ValueError(f"`path` {str(path)!r} is not a usable flow: {reason}. {remedy}.")
 
 
-def _read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any]]:
-    """Return the bytes of the file, its safetensors header, and the record in it."""
+def _read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any], bool]:
+    """Return the bytes of the file, its safetensors header, the record in it, and True if that was altered."""
     try:
         found = path.is_file()
     except OSError:  # a name that no file can have
@@ -318,7 +332,8 @@ def _read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any]]:
         raise Refused(f"its format {format_} is later than {FORMAT}, which this version of sympflow reads: update it")
     if record.get("kind") not in KINDS:
         raise Refused(f"its kind {record.get('kind')!r} is unknown")
-    return content, header, record
+    altered = format_ > 1 and notes.get(SUM) != text_checksum(notes[KEY])
+    return content, header, record, altered
 
 
 def _parsed(text: str | bytes, what: str) -> dict[str, Any]:

@@ -22,7 +22,8 @@ def from_hamiltonian(H: Callable[[Tensor, Tensor], Tensor], ndof: int, **scene: 
     """The system of a callable H(q, p), written with torch functions on (..., d).
 
     Where H turns out to be ½ pᵀM⁻¹p + V(q), as far as eight random states near y0 can tell, it is made a separable
-    system, to which the splitting methods apply.
+    system, to which the splitting methods apply. M is fixed then: where ∂H/∂p depends on tensors that require
+    gradients, such as a mass that is trained, the system stays H(q, p), which gives them gradients.
 
     Parameters
     ----------
@@ -74,7 +75,8 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
     Gauss–Legendre quadrature, after it has been tested at random states that f is the field of some autonomous H.
 
     That the field does not depend on t is tested at ten times only (`TIMES`): one that changes between them passes for
-    autonomous, and is solved as it is at t = 0.
+    autonomous, and is solved as it is at t = 0. It is made separable under the same conditions as by
+    `from_hamiltonian`.
 
     Parameters
     ----------
@@ -183,7 +185,10 @@ def _mass(hessian: Tensor, gradient: Callable[[Tensor], Tensor], probes: Tensor)
     M_inverse = _clean((K[0] + K[0].T) / 2, units)
     p, at_rest = probes[:, d:].numpy(), probes.clone()
     at_rest[:, d:] = 0.0
-    slope, rest = (gradient(y).detach().numpy() for y in (probes, at_rest))
+    slopes = gradient(probes)
+    if _trained(slopes[:, d:]):
+        return None
+    slope, rest = slopes.detach().numpy(), gradient(at_rest).detach().numpy()
     span = np.ptp((slope[:, :d] * probes[:, :d].numpy()).sum(-1)) * M_inverse.diagonal()
     linear = np.abs(slope[:, d:] - p @ M_inverse) <= TOLERANCE * (np.abs(p) @ np.abs(M_inverse))
     if not linear.all() or (rest[:, d:] ** 2 > EXACT**2 * span).any():
@@ -193,6 +198,23 @@ def _mass(hessian: Tensor, gradient: Callable[[Tensor], Tensor], probes: Tensor)
         return None
     mass = np.linalg.inv(scaled) / units
     return _clean(mass, np.sqrt(np.outer(mass.diagonal(), mass.diagonal())))
+
+
+def _trained(values: Tensor) -> bool:
+    """True if values depend on tensors that require gradients: a part of a graph that gives no slope is none."""
+    if not values.requires_grad:
+        return False
+    nodes, leaves = [values.grad_fn], []
+    met = {values.grad_fn}
+    while nodes:
+        node = nodes.pop()
+        leaves += [node.variable] if hasattr(node, "variable") else []
+        further = {parent for parent, _ in node.next_functions if parent is not None} - met
+        met |= further
+        nodes += further
+    weights = torch.rand(values.shape, dtype=values.dtype, generator=torch.Generator().manual_seed(0))
+    slopes = torch.autograd.grad((weights * values).sum(), leaves, allow_unused=True)
+    return any(slope is not None and bool((slope != 0).any()) for slope in slopes)
 
 
 def _size(A: np.ndarray) -> np.ndarray:

@@ -30,6 +30,7 @@ from sympflow.learning.shooting import Fit, Method, Problem, chosen_method, mini
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
 from sympflow.learning.trajectories import Run, Trajectories, periods_of
+from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training.session import Session
 
 if TYPE_CHECKING:
@@ -69,6 +70,8 @@ MOST_VALUES = 20_000
 """Values to which models are fitted on the way; the one that is chosen is fitted to all."""
 COMPARED = 2000
 """States over which terms are compared, and of a flow's Hamiltonian."""
+STARTS = 4
+"""Regressions from which the search begins at most."""
 OF_A_FLOW = 5.0
 """Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are no noise."""
 
@@ -112,15 +115,17 @@ class Discovery:
     expected_noise : ndarray of shape (2d,)
         The noise as it was given, or seen in the data without a model; 0 where they cannot tell.
     explains : bool
-        False if the model leaves more than noise.
+        False if the model leaves more than noise, or the data do not tell it from others: see `unseen`.
     remark : str
-        What the data say where no model explains them, or where the noise that was given is too large.
+        What the data say where no model explains them or many do, or where the noise that was given is too large.
     path : tuple of Model
         The best model of each number of terms.
     library : tuple of sympy.Expr
         The terms there were to choose from.
     superfluous : tuple of sympy.Expr
         The terms of the library that others make up on the data, or that are not finite there.
+    unseen : tuple of sympy.Expr
+        Functions that are the same at all points of the data, to the noise, so that H is not told along them.
     """
 
     terms: tuple[sp.Expr, ...]
@@ -133,6 +138,7 @@ class Discovery:
     path: tuple[Model, ...]
     library: tuple[sp.Expr, ...]
     superfluous: tuple[sp.Expr, ...] = field(repr=False)
+    unseen: tuple[sp.Expr, ...] = ()
 
     def formula(self) -> str:
         """H with its coefficients, rounded to their standard errors."""
@@ -236,7 +242,7 @@ def discover(
         The most terms of a model.
     domain : Domain, optional
         Where a flow's Hamiltonian is looked at; the default is the flow's own. Of the system that is made: the
-        default is a box around the data.
+        default is a box around the data, or a tube around one trajectory where they do not tell H beyond it.
     seed : int
         Of the trajectories that are held out.
     name : str
@@ -258,7 +264,9 @@ def discover(
     -----
     UserWarning
         If no model explains the data: its residuals are larger than their noise. The message says by how much, and
-        what the data rather look like: friction, velocities in place of momenta, columns in another order. If the noise
+        what the data rather look like: friction, velocities in place of momenta, columns in another order. If a
+        function of the coordinates is the same at all points of the data, as on circular orbits of one radius: any
+        function of it may be added to H. If the noise
         that was given is much larger than the residuals. If the time budget ended the search.
 
     Raises
@@ -296,7 +304,8 @@ def discover(
         discovery = search.run()
     box = np.array([trajectories.states.min(0), trajectories.states.max(0)])
     first = max(trajectories.runs, key=lambda run: run.span)
-    scene = {"domain": domain or Box(box[0].tolist(), box[1].tolist()), "y0": trajectories.states[0]}
+    around = search.tube or Box(box[0].tolist(), box[1].tolist())
+    scene = {"domain": domain or around, "y0": trajectories.states[0]}
     system = _system(discovery, trajectories.ndof, name=name, t_span=(0.0, first.span), dt=STEP / search.rate, **scene)
     if discovery.remark:
         warnings.warn(discovery.remark, stacklevel=3)
@@ -332,6 +341,7 @@ class _Search:
     ) -> None:
         self.session, self.over = session, session.deadline.over
         self.doubt: Reading | None = None
+        self.tube: Domain | None = None
         self.data, self.say, self.most_terms, self.huber = data, say, most_terms, huber
         self.known = _noise(noise, 2 * data.ndof)
         n = len(data.runs)
@@ -392,7 +402,7 @@ class _Search:
         if self.doubt is not None:
             chosen = self._first(DOUBTED, SKETCHED)
             record = self._record(chosen, self._met(chosen))
-            if not record.explains:
+            if not (record.explains or record.unseen):
                 return record
             self.doubt = None
             self._begin()
@@ -419,23 +429,21 @@ class _Search:
     def _first(self, most: int, steps: int) -> list[int]:
         """The best model of several regressions whose predictions do not diverge; pieces are shortened until it is so.
 
-        Where terms are nearly alike, as the cosine of a difference and powers, adding them one at a time ends elsewhere
-        than among polynomials alone, or by dropping them.
+        Where terms are nearly alike, as cosines, powers and distances, adding them one at a time ends elsewhere than
+        dropping them, and than the same among a part of the library. The best of the regressions are fitted.
         """
         regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
-        powers = [k for k, f in enumerate(self.library.expressions) if f.is_polynomial()]
         most = min(most, self.most_terms)
-        ways = [regression.forward(most)]
-        if self.doubt is None:
-            ways.append(regression.backward(most))
-            if 0 < len(powers) < len(self.library):
-                ways.append(regression.forward(most, powers))
+        found = [way(most, part) for part in self._parts() for way in (regression.forward, regression.backward)]
+        ways = sorted({tuple(sorted(active)) for active in found}, key=lambda way: regression.criterion([*way]))[
+            :STARTS
+        ]
         for _ in range(8):
             starts = []
-            for active in ways:
+            for active in map(list, ways):
                 self.guess = dict(zip(active, regression.coefficients(active), strict=True))
-                if self._fit(sorted(active), steps=steps) is not None:
-                    starts.append(sorted(active))
+                if self._fit(active, steps=steps) is not None:
+                    starts.append(active)
             if starts:
                 return min(starts, key=self._criterion)
             self.piece /= 2
@@ -444,6 +452,17 @@ class _Search:
             "`data` cannot be followed by any model of the library, however short the pieces: give other `terms`, or "
             "look whether the columns are q1 … qd, p1 … pd."
         )
+
+    def _parts(self) -> list[list[int]]:
+        """Parts of the library: powers, waves and others in turn, with any kinetic energy and with ½ pᵀM⁻¹p."""
+        terms, d = self.library.expressions, self.data.ndof
+        degree = np.array([sp.Poly(f).total_degree() if f.is_polynomial() else 0 for f in terms])
+        kind = np.array([term.kind(d) for term in self.library.terms])
+        power, wave = degree > 0, np.array([f.has(sp.cos, sp.sin) for f in terms])
+        square = power & (degree <= 2)
+        shapes = np.stack([power | True, power, ~wave, square | ~(power | wave), square | wave, square])
+        parts = np.unique(np.concatenate([shapes, shapes & ((kind == "q") | (kind == "p") & square)]), axis=0)
+        return [np.flatnonzero(part).tolist() for part in parts if part.any()]
 
     def _known(self, active: Sequence[int]) -> Fit:
         """The fit of a model that was fitted, and did not diverge."""
@@ -641,7 +660,9 @@ class _Search:
         limit = UNEXPLAINED + 4 / math.sqrt(max(self.data.n_points, 1))
         explains = not (told & (excess > limit)).any()
         explains &= bool((noise < 0.5 * self.data.scales).all())
-        remark = self._too_loud(noise) if explains else self._remark(noise, excess)
+        same = self._unseen(chosen, fit) if explains else ()
+        explains &= not same
+        remark = remark_on(same) if same else self._too_loud(noise) if explains else self._remark(noise, excess)
         if self.session.cut:
             remark = f"{remark} The time budget, or Ctrl-C, ended the search: give it more.".strip()
         order = np.argsort([str(self.library.expressions[k]) for k in chosen])
@@ -656,7 +677,21 @@ class _Search:
             models,
             self.library.expressions,
             self.superfluous,
+            same,
         )
+
+    def _unseen(self, chosen: list[int], fit: Fit) -> tuple[sp.Expr, ...]:
+        """Functions that are the same along all orbits: of q alone and of p alone where H is separable."""
+        d = self.data.ndof
+        states = np.concatenate(fit.orbits, axis=1).T
+        errors = fit.noise() * math.sqrt(fit.states.size / fit.counts.sum())
+        separable = all(self.library.terms[k].kind(d) != "y" for k in chosen)
+        groups = [range(d), range(d, 2 * d)] if separable else [range(2 * d)]
+        found = tuple(g for columns in groups for g in unseen(states, errors, columns))
+        if found:
+            index = self.fitted if fit is self._known(chosen) else range(len(self.data.runs))
+            self.tube = tube(states, [self.data.runs[i] for i in index], self.data.scales)
+        return found
 
     def _chosen_fit(self, chosen: list[int]) -> Fit:
         """The chosen model, fitted to all trajectories."""

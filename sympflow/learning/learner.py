@@ -8,7 +8,7 @@ import warnings
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from sympflow.arguments import check_flag, floats, plain
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian import matrices
-from sympflow.hamiltonian.domain import Box, EnergySublevel
+from sympflow.hamiltonian.domain import Box, EnergySublevel, Tube
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
@@ -38,11 +38,12 @@ from sympflow.learning.fitting import (
     restored,
 )
 from sympflow.learning.library import library_for
-from sympflow.learning.models import Formula, FreeField, Model, Polynomial
+from sympflow.learning.models import Formula, FreeField, Model, Pairs, Part, Polynomial
 from sympflow.learning.shooting import Field, Method
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
 from sympflow.learning.trajectories import FEW, Trajectories, periods_of
+from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
 from sympflow.training.starts import suited_step
@@ -67,6 +68,7 @@ MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
 CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
 ROUGH = 60  # points from which the roughness of the data tells their noise to a fifth
+GROWS = 4.0  # standard errors below 0, from which a negative friction is no chance
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
@@ -351,6 +353,30 @@ def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number
     return fitted(model, data.subset(drawn), setting, theta).theta
 
 
+def without_growth(found: Fitted) -> Fitted:
+    """The fit with rates of friction that are not negative: those below 0 are 0, and other numbers the best beside.
+
+    Of data without friction chance makes half of the rates negative. One that is more than chance is told.
+    """
+    model, theta = found.model, found.theta
+    first = model.n - (model.rates if isinstance(model, Model) else 0)
+    growing = np.arange(model.n) >= np.where(theta < 0, first, model.n)
+    if not growing.any():
+        return found
+    covariance = found.fit.covariance()
+    errors = np.sqrt(np.diag(covariance))
+    worst = int(np.argmin(np.where(growing, theta / errors, np.inf)))
+    if theta[worst] < -GROWS * errors[worst]:
+        warnings.warn(
+            f"`damping` is {theta[worst]:.2g} ± {errors[worst]:.1g} by the data, whose energy grows: it is taken as 0. "
+            "Look at the order of the times and the sign of the momenta, or leave `damping` out.",
+            UserWarning,
+            stacklevel=5,
+        )
+    moved = covariance[:, growing] @ np.linalg.pinv(covariance[np.ix_(growing, growing)]) @ theta[growing]
+    return replace(found, theta=np.where(growing, 0.0, theta - moved))
+
+
 Chosen = tuple[Candidate, Fitted, Held]
 
 
@@ -610,6 +636,8 @@ class Search:
     def diagnose(self, session: Session) -> None:
         """Warn where the residuals of the best model are no noise, with what may be the reason."""
         candidate, _, held = self.winner
+        if self.unseen:
+            warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
         if held.explained:
             share = float(np.min(self.winner[1].sigma / self.data.scales))
             if share > SILENT:
@@ -705,15 +733,40 @@ class Search:
 
     # the flow ---------------------------------------------------------------------------------------------------------
 
+    @cached_property
+    def unseen(self) -> list[Any]:
+        """Functions that are the same along all orbits, and that the chosen model could depend on in any way."""
+        model, d, states = self.winner[0].model, self.data.ndof, self.final.states
+        if not np.isfinite(states).all():
+            return []
+        q, p = range(d), range(d, 2 * d)
+        groups: list[tuple[range, Part | None]] = []
+        parts = [part for part in model.parts if part.n] if isinstance(model, Model) else []
+        if not parts or any(part.of == "y" and not part.inertial for part in parts):
+            groups.append((range(2 * d), None))
+        else:
+            pairs = next((part for part in parts if isinstance(part, Pairs)), None)
+            if pairs is not None:
+                groups.append((q, Pairs(pairs.bodies, (2,), 1.0, shared=False)))
+            elif any(part.of != "p" for part in parts):
+                groups.append((q, None))
+            if any(part.of != "q" for part in parts):
+                groups.append((p, Polynomial.up_to(1, "p", self.data.scales[d:])))
+        errors = self.final.sigma * math.sqrt(self.final.fit.states.size / self.data.n_values)
+        return [g for columns, part in groups for g in unseen(states, errors, columns, part)]
+
     def _states(self) -> np.ndarray:
         """The states (n, 2d) of all orbits that do not diverge; those of the data where all do."""
         states = self.final.states
         finite = np.isfinite(states).all(axis=1)
         return states[finite] if finite.any() else self.all.states
 
-    def _box(self) -> tuple[Box, np.ndarray]:
-        """A box around the states (n, 2d) of all orbits, and these."""
+    def _domain(self) -> tuple[Box | Tube, np.ndarray]:
+        """A box around the states (n, 2d) of all orbits, or a tube where they do not tell H beyond them; and these."""
         states = self._states()
+        if self.unseen:
+            fitted = next(data for data in (self.all, self.data) if data.n_points == len(states))
+            return tube(states, fitted.runs, self.all.scales), states
         low, high = states.min(axis=0), states.max(axis=0)
         wider = MARGIN * (high - low)
         return Box(low - wider, high + wider), states
@@ -721,15 +774,17 @@ class Search:
     def system(self, name: str) -> HamiltonianSystem:
         """The H that was learned."""
         found, model = self.final, self.winner[0].model
-        box, states = self._box()
+        domain, states = self._domain()
         energies = model.hamiltonian(found.theta, states.T)
-        top = float(energies.max())
+        if isinstance(domain, Box) and np.isfinite(energies).all():
+            top = float(energies.max())
+            domain = EnergySublevel(top + MARGIN * (top - float(energies.min())), domain)
         rates = found.theta[model.n - model.rates :]
         return HamiltonianSystem.from_sympy(
             model.expression(found.theta),
             damping=None if not model.rates else float(rates[0]) if model.rates == 1 else rates,
             name=name,
-            domain=EnergySublevel(top + MARGIN * (top - float(energies.min())), box),
+            domain=domain,
             y0=states[0],
             t_span=(0.0, max(run.span for run in self.data.runs)),
             dt=self.data.time_scale,
@@ -756,12 +811,12 @@ class Search:
 
     def _own(self, flow: Any, name: str) -> Any:
         """The flow that was fitted itself, with the system of its own Hamiltonian."""
-        box, states = self._box()
-        flow.domain, flow.history = box, self.history
+        domain, states = self._domain()
+        flow.domain, flow.history = domain, self.history
         flow.recipe = {"learned": {**self._learned, "own_hamiltonian": True}}
         flow.figures = {**self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
         longest = max(run.span for run in self.data.runs)
-        flow.take_learned(flow.mean_system(name=name, domain=box, y0=states[0], t_span=(0.0, longest), dt=flow.dt))
+        flow.take_learned(flow.mean_system(name=name, domain=domain, y0=states[0], t_span=(0.0, longest), dt=flow.dt))
         return flow
 
     def _primed(self, system: HamiltonianSystem, dt: float | None, session: Session) -> FlowMap:

@@ -81,8 +81,8 @@ class _Term:
     def __init__(self, expression: sp.Expr, symbols: Sequence[sp.Symbol]) -> None:
         self.expression = expression
         self.rows = [i for i, x in enumerate(symbols) if x in expression.free_symbols]
-        self._symbols = [symbols[i] for i in self.rows]
-        self._slopes = [sp.diff(expression, x) for x in self._symbols]
+        self.symbols = [symbols[i] for i in self.rows]
+        self._slopes = [sp.diff(expression, x) for x in self.symbols]
 
     def kind(self, ndof: int) -> str:
         """The coordinates that it depends on: "q", "p" or "y" for both."""
@@ -90,15 +90,15 @@ class _Term:
 
     @cached_property
     def quadratic(self) -> bool:
-        return self.expression.is_polynomial() and sp.Poly(self.expression, *self._symbols).homogeneous_order() == 2
+        return self.expression.is_polynomial() and sp.Poly(self.expression, *self.symbols).homogeneous_order() == 2
 
     @cached_property
     def value(self) -> Any:
-        return generate([self.expression], self._symbols, "numpy")
+        return generate([self.expression], self.symbols, "numpy")
 
     @cached_property
     def gradient(self) -> Any:
-        return generate(self._slopes, self._symbols, "numpy")
+        return generate(self._slopes, self.symbols, "numpy")
 
 
 class Library:
@@ -280,14 +280,14 @@ def library_for(terms: Any, ndof: int, degree: int, states: np.ndarray) -> tuple
     given = LIBRARIES if terms is None else [terms] if isinstance(terms, str | sp.Expr) else list(terms)
     if not given:
         raise ValueError(f"`terms` is an empty list: name terms, or some of {', '.join(LIBRARIES)}, or leave it out.")
-    near = _near_the_centre(states[:, :ndof])
+    near, finite = _near_the_centre(states[:, :ndof]), distances(ndof)[4:]  # r, which has no pole
     expressions: list[sp.Expr] = []
     named: set[sp.Expr] = set()
     for term in given:
         if isinstance(term, str) and term == "polynomials":
             found = polynomials(ndof, degree)
         elif isinstance(term, str) and term in LIBRARIES:
-            found = [] if term == "distances" and near else LIBRARIES[term](ndof)
+            found = [f for f in LIBRARIES[term](ndof) if not (term == "distances" and near and f not in finite)]
         else:
             found = [_read(term, ndof)]
             named |= set(found)

@@ -83,9 +83,9 @@ class Regression:
                 active = fewer
         return active
 
-    def backward(self, most: int) -> list[int]:
+    def backward(self, most: int, among: Sequence[int] | None = None) -> list[int]:
         """Terms dropped one at a time from all of them, while the criterion falls or there are more than `most`."""
-        active = [*range(len(self.b))]
+        active = [*range(len(self.b))] if among is None else [*among]
         while len(active) > 1:
             theta, _ = self._solve(active)
             inverse = np.linalg.pinv(self.G[np.ix_(active, active)], rcond=1e-13)

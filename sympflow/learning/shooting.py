@@ -163,7 +163,7 @@ class Gauss(Stepper):
         c = X.shape[1]
         f = model.field(theta, inner.reshape(m, s * N), True, c > m)
         assert f.slope is not None
-        S = f.slope.reshape(m, m, s, N)
+        S = np.broadcast_to(f.slope, (m, m, s * N)).reshape(m, m, s, N)
         rhs = np.einsum("klin,lcn->nikc", S, X, optimize=True)
         if f.by_parameters is not None:
             rhs[..., m:] += f.by_parameters.reshape(m, c - m, s, N).transpose(3, 2, 0, 1)

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 import sympflow
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, solve, systems
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
-from sympflow.flow.files import KEY, load
+from sympflow.flow.files import KEY, SUM, load, text_checksum
 from sympflow.flow.shipped import named, shipped
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
@@ -259,7 +259,8 @@ def test_a_certificate_that_was_tampered_with_is_refused(tmp_path, edit, message
     (length,) = struct.unpack("<Q", content[:8])
     record = json.loads(json.loads(content[8 : 8 + length])["__metadata__"][KEY])
     edit(record["certificate"])
-    save_file(load_file(path), path, {KEY: json.dumps(record)})
+    text = json.dumps(record)
+    save_file(load_file(path), path, {KEY: text, SUM: text_checksum(text)})
     with pytest.raises(ValueError, match=rf"^`path` .*{message}"):
         sympflow.load(path)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from sympflow.flow.files import KEY, load
+from sympflow.flow.files import KEY, SUM, load, text_checksum
 from sympflow.flow.io import save
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
@@ -46,13 +46,17 @@ def record(path):
     return json.loads(json.loads(content[8 : 8 + length])["__metadata__"][KEY])
 
 
-def tampered(path, change_record=lambda record: None, change_tensors=lambda tensors: None, rechecked=True):
+def tampered(
+    path, change_record=lambda record: None, change_tensors=lambda tensors: None, rechecked=True, altered=False
+):
+    """The file with another record or other tensors, and with checksums that fit them unless it is said otherwise."""
     notes, tensors = record(path), load_file(path)
     change_record(notes)
     change_tensors(tensors)
     if "checksum" in notes:
         notes["checksum"] = checksum(tensors) if rechecked else notes["checksum"]
-    save_file(tensors, path, {KEY: notes if isinstance(notes, str) else json.dumps(notes)})
+    text, kept = json.dumps(notes), json.dumps(record(path), separators=(",", ":"))
+    save_file(tensors, path, {KEY: text, SUM: text_checksum(kept if altered else text)})
     return path
 
 
@@ -218,6 +222,30 @@ def change(*keys, value):
 def test_a_false_record_is_refused(file, edit, message):
     with pytest.raises(ValueError, match=message):
         load(tampered(file, change_record=edit))
+
+
+def turned(record):
+    record["architecture"]["layers"].reverse()
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        change("dt", value=0.7),
+        change("architecture", "layers", 0, "potential", "activation", value="tanh"),
+        change("system", value="pendulum"),
+        change("figures", value={"one_step_error": 1e-12}),
+        change("domain", value=Box([-1.0] * 4, [1.0] * 4).to_dict()),
+        change("recipe", value={"seed": 1}),
+        turned,
+    ],
+)
+def test_an_altered_record_is_refused(file, edit):
+    """Entries that are admissible, but not those that were saved; files of format 1 could not tell, and still load."""
+    load(tampered(file))
+    with pytest.raises(ValueError, match=r"`path` .* its record is not the one that was saved: its checksum differs"):
+        load(tampered(file, change_record=edit, altered=True))
+    load(tampered(file, change_record=change("format", value=1), altered=True))
 
 
 def rename(tensors):

@@ -9,6 +9,7 @@ import pytest
 from watchdog import watched
 
 from sympflow import Ball, SympFlow, Tube, load, solve, systems
+from sympflow.flow.files import text_checksum
 
 
 def with_header(header, rest=b""):
@@ -41,7 +42,8 @@ def edited(content, **entries):
 def described(content, **record):
     """The file with another record."""
     header, rest = parts(content)
-    header["__metadata__"]["sympflow"] = json.dumps({**json.loads(header["__metadata__"]["sympflow"]), **record})
+    text = json.dumps({**json.loads(header["__metadata__"]["sympflow"]), **record})
+    header["__metadata__"] = {"sympflow": text, "sympflow_checksum": text_checksum(text)}
     return with_header(header, rest)
 
 

@@ -17,6 +17,7 @@ from safetensors.torch import save as save_tensors
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, solve, symplecticity_defect, systems, train
+from sympflow.flow.files import KEY, SUM, text_checksum
 from sympflow.schemes import SCHEMES
 
 EPS = np.finfo(float).eps
@@ -372,7 +373,8 @@ def test_a_damaged_plan_is_refused(tmp_path, change):
     length = int.from_bytes(content[:8], "little")
     record = json.loads(json.loads(content[8 : 8 + length])["__metadata__"]["sympflow"])
     record["architecture"]["primed"] |= change
-    path.write_bytes(save_tensors(load_tensors(content), {"sympflow": json.dumps(record)}))
+    text = json.dumps(record)
+    path.write_bytes(save_tensors(load_tensors(content), {KEY: text, SUM: text_checksum(text)}))
     with pytest.raises(ValueError, match="is not a usable flow"):
         sympflow.load(path)
 

@@ -8,6 +8,7 @@ import sympy as sp
 from watchdog import watched
 
 from sympflow import HamiltonianSystem, SympFlow, load, systems
+from sympflow.flow.files import KEY, SUM, text_checksum
 from sympflow.hamiltonian.expression import Unreadable, read
 
 q, p, q1, q2 = sp.symbols("q p q1 q2", real=True)
@@ -113,9 +114,10 @@ def edit(path, change):
     content = path.read_bytes()
     (n,) = struct.unpack("<Q", content[:8])
     header = json.loads(content[8 : 8 + n])
-    record = json.loads(header["__metadata__"]["sympflow"])
+    record = json.loads(header["__metadata__"][KEY])
     change(record)
-    header["__metadata__"]["sympflow"] = json.dumps(record)
+    text = json.dumps(record)
+    header["__metadata__"] = {KEY: text, SUM: text_checksum(text)}
     text = json.dumps(header).encode()
     path.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + n :])
 

@@ -174,3 +174,48 @@ def test_a_function_of_arrays_is_told_to_use_torch():
         from_hamiltonian(lambda q, p: torch.from_numpy((q.numpy() ** 2 + p.numpy() ** 2).sum(-1)), 2)
     with pytest.raises(ValueError, match=r"^`H` .*with torch functions; .* gave a NumPy array"):
         from_hamiltonian(lambda q, p: (q.detach().numpy() ** 2).sum(-1), 2)
+
+
+class Trained(torch.nn.Module):
+    """p²/(2m) + b p + k q²/2 with numbers to be trained, as H(q, p) and as a field."""
+
+    def __init__(self, **start):
+        super().__init__()
+        for name, value in {"m": 1.0, "b": 0.0, "k": 1.0, "c": 0.0, **start}.items():
+            self.register_parameter(name, torch.nn.Parameter(torch.tensor(value, dtype=torch.float64)))
+
+    def hamiltonian(self, q, p):
+        V = self.k * q**2 / 2
+        return (p**2 / (2 * self.m) + self.b * p + self.c * q * p + V).sum(-1)
+
+    def forward(self, t, y):
+        q, p = y[..., :1], y[..., 1:]
+        return torch.cat([p / self.m + self.b + self.c * q, -self.k * q - self.c * p], -1)
+
+
+@pytest.mark.parametrize("frozen", [(), ("m",), ("m", "b"), ("m", "b", "c")])
+def test_a_kinetic_energy_that_is_trained_keeps_its_gradients(frozen):
+    """Numbers of ∂H/∂p, even where they are 0 as yet, make no separable system; those of V alone do."""
+    module = Trained(m=1.3)
+    for name in frozen:
+        getattr(module, name).requires_grad_(False)
+    y0 = torch.tensor([1.0, 0.2], dtype=torch.float64)
+    trained = [v for v in module.parameters() if v.requires_grad]
+    for system in (from_hamiltonian(module.hamiltonian, 1), from_module(module, 1)):
+        assert system.separable == (len(frozen) == 3)
+        found = solve(system, "rk4", (0, 0.4), y0, dt=0.1).y[0, -1]
+        slopes = torch.autograd.grad(found, trained)
+        for number, slope in zip(trained, slopes, strict=True):
+            ends, value = [], number.item()
+            for moved in (value + 1e-4, value - 1e-4, value):
+                with torch.no_grad():
+                    number.fill_(moved)
+                ends.append(solve(system, "rk4", (0, 0.4), y0, dt=0.1).y[0, -1].item())
+            assert slope.item() == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-6)
+
+
+def test_a_network_in_q_alone_leaves_the_system_separable():
+    """The zeros that a slice of [q, p] sends back to p are no dependence."""
+    V = torch.nn.Sequential(torch.nn.Linear(1, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1)).double()
+    system = from_hamiltonian(lambda q, p: V(torch.cat([q, p], -1)[..., :1])[..., 0] + (p**2).sum(-1) / 2, 1)
+    assert system.separable
