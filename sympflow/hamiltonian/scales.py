@@ -71,9 +71,10 @@ def _of_hessians(system: HamiltonianSystem) -> np.ndarray:
         s = diagonal = np.full(2 * d, np.nan)
     good = np.isfinite(s[:d]) & (s[:d] > 0) & (diagonal[d:] > 0)
     rate = None if good.all() else fastest_rate(system)
-    if rate is None:
+    found = np.empty((0, 0, 0)) if rate is None else _hessians(system, t0)
+    if not len(found):
         return np.where(good, s[:d], 1.0)
-    curvatures = np.median(np.abs(np.diagonal(_hessians(system, t0), axis1=-2, axis2=-1)), axis=0)
+    curvatures = np.median(np.abs(np.diagonal(found, axis1=-2, axis2=-1)), axis=0)
     squares = np.where(curvatures[d:] > 0, rate / curvatures[d:], curvatures[:d] / rate)
     return np.where(good, s[:d], np.sqrt(squares))
 
@@ -116,5 +117,7 @@ def _hessians(system: HamiltonianSystem, t: float) -> np.ndarray:
 def _median_rate(system: HamiltonianSystem, t: float) -> float:
     """The median over the states of the largest |λ| of J∇²H; 0 where none is finite."""
     S, d = _hessians(system, t), system.ndof
+    if not len(S):
+        return 0.0
     rates = np.abs(np.linalg.eigvals(np.concatenate([S[:, d:], -S[:, :d]], axis=1))).max(-1)
-    return float(np.median(rates)) if len(S) else 0.0
+    return float(np.median(rates))

@@ -204,8 +204,8 @@ def _trained(values: Tensor) -> bool:
     """True if values depend on tensors that require gradients: a part of a graph that gives no slope is none."""
     if not values.requires_grad:
         return False
-    nodes, leaves = [values.grad_fn], []
-    met = {values.grad_fn}
+    nodes: list[Any] = [values.grad_fn]
+    leaves, met = [], {*nodes}
     while nodes:
         node = nodes.pop()
         leaves += [node.variable] if hasattr(node, "variable") else []

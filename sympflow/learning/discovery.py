@@ -435,12 +435,11 @@ class _Search:
         regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
         most = min(most, self.most_terms)
         found = [way(most, part) for part in self._parts() for way in (regression.forward, regression.backward)]
-        ways = sorted({tuple(sorted(active)) for active in found}, key=lambda way: regression.criterion([*way]))[
-            :STARTS
-        ]
+        different = [[*way] for way in {tuple(sorted(active)) for active in found}]
+        ways = sorted(different, key=regression.criterion)[:STARTS]
         for _ in range(8):
             starts = []
-            for active in map(list, ways):
+            for active in ways:
                 self.guess = dict(zip(active, regression.coefficients(active), strict=True))
                 if self._fit(active, steps=steps) is not None:
                     starts.append(active)

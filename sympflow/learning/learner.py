@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from scipy import stats
 
 from sympflow.arguments import check_flag, floats, plain
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian import matrices
-from sympflow.hamiltonian.domain import Box, EnergySublevel, Tube
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
@@ -189,8 +190,8 @@ def learn(
     folds = [(_cut(one, rate), _cut(others, rate)) for one, others in _divided(data, seed)]
     if len(folds) == 1:
         folds = [(_few(folds[0][0], seed), _few(folds[0][1], seed))]
-    if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0:
-        raise ValueError(f"`replicas` must be an integer, 0 or more; got {replicas!r}: 20 give useful bands.")
+    if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0 or replicas == 1:
+        raise ValueError(f"`replicas` must be an integer, 0, or 2 or more; got {replicas!r}: 20 give useful bands.")
     options = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
     identity = _identity(data, said, setting, options)
     search = Search(_cut(data, rate), folds, said, setting, seed, identity=identity, whole=data)
@@ -317,12 +318,15 @@ class Replicas:
     theta : ndarray of shape (n,)
         The numbers of the flow.
     thetas : ndarray of shape (replicas, n)
+    drawn : int
+        The number of trajectories that are drawn.
     """
 
     model: Model
     method: Method
     theta: np.ndarray
     thetas: np.ndarray
+    drawn: int
 
     def predictions(self, y0: ArrayLike, t: ArrayLike) -> np.ndarray:
         """The orbits (replicas, 2d, n) from y0 (2d,) at times t (n,), ascending from the time of y0, t[0]."""
@@ -339,11 +343,18 @@ class Replicas:
         return np.stack(orbits)
 
     def bands(self, y0: ArrayLike, t: ArrayLike, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds (2d, n) and (2d, n) between which this share of the orbits from y0 lies at each time."""
+        """Bounds (2d, n) and (2d, n) between which the true orbit from y0 lies at each time with this probability.
+
+        They lie t standard deviations of the replicas about the orbit of the flow, t by Student's distribution, for few
+        replicas of few trajectories tell these deviations but roughly. The family of models is taken for true.
+        """
         if not 0 < level < 1:
             raise ValueError(f"`level` must lie between 0 and 1; got {level!r}: 0.9 is usual.")
-        low, high = np.quantile(self.predictions(y0, t), [(1 - level) / 2, (1 + level) / 2], axis=0)
-        return low, high
+        n = self.drawn
+        deviation = self.predictions(y0, t).std(axis=0, ddof=1) * math.sqrt(n / (n - 1))  # of n that are drawn from n
+        wide = deviation * stats.t.ppf((1 + level) / 2, min(n, len(self.thetas)) - 1)
+        middle = replace(self, thetas=self.theta[None]).predictions(y0, t)[0]
+        return middle - wide, middle + wide
 
 
 def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number: int) -> np.ndarray:
@@ -636,9 +647,9 @@ class Search:
     def diagnose(self, session: Session) -> None:
         """Warn where the residuals of the best model are no noise, with what may be the reason."""
         candidate, _, held = self.winner
-        if self.unseen:
-            warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
         if held.explained:
+            if self.unseen:
+                warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
             share = float(np.min(self.winner[1].sigma / self.data.scales))
             if share > SILENT:
                 warnings.warn(
@@ -729,7 +740,7 @@ class Search:
                 UserWarning,
                 stacklevel=4,
             )
-        return Replicas(model, self.final.method, self.final.theta, np.stack(thetas))
+        return Replicas(model, self.final.method, self.final.theta, np.stack(thetas), len(self.all.runs))
 
     # the flow ---------------------------------------------------------------------------------------------------------
 
@@ -774,6 +785,7 @@ class Search:
     def system(self, name: str) -> HamiltonianSystem:
         """The H that was learned."""
         found, model = self.final, self.winner[0].model
+        domain: Domain
         domain, states = self._domain()
         energies = model.hamiltonian(found.theta, states.T)
         if isinstance(domain, Box) and np.isfinite(energies).all():

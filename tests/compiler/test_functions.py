@@ -4,7 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 import torch
-from test_elementary import run
+from test_functions_in_code import run
 
 from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.program import derivatives, traced

@@ -83,6 +83,83 @@ def test_missing_values_irregular_times_and_one_trajectory():
     assert all(model.held_out is None for model in system.discovery.path)
 
 
+def noisy(H, ndof, seed, n=6, sigma=0.01):
+    """Trajectories of a symbolic H over a period or so, with noise."""
+    random = np.random.default_rng(seed)
+    system = sympflow.HamiltonianSystem.from_sympy(H, y0=[0.7] * (2 * ndof))
+    times = np.linspace(0, 6, 41)
+    starts = random.uniform(-1, 1, (n, 2 * ndof))
+    y = np.stack([sympflow.solve(system, "gauss_legendre6", (0, 6), x, t_eval=times, dt=0.05).y for x in starts])
+    return times, y + sigma * random.normal(size=y.shape)
+
+
+OSCILLATOR = "(p1**2 + p2**2 + q1**2 + q2**2)/2"
+TURNED = f"{OSCILLATOR} + 0.1*(q1*p2 - q2*p1)"
+
+
+@pytest.mark.parametrize(
+    ("H", "n", "seed"),
+    [
+        pytest.param(f"{OSCILLATOR} - sqrt(q1**2 + q2**2)", 10, 1, marks=pytest.mark.slow),  # a spring of length 1
+        pytest.param(f"{OSCILLATOR} - sqrt(q1**2 + q2**2)", 6, 4, marks=pytest.mark.slow),
+        pytest.param(OSCILLATOR, 10, 1, marks=pytest.mark.slow),
+        pytest.param(TURNED, 6, 2),
+        pytest.param(TURNED, 10, 1, marks=pytest.mark.slow),
+    ],
+)
+def test_terms_that_are_nearly_alike_are_told_apart(H, n, seed):
+    """Cosines, powers and distances make up each other nearly; the search does not end among them."""
+    found = sympflow.discover(noisy(H, 2, seed, n))
+    truth = sp.expand(sp.sympify(H, {s.name: s for pair in coordinates(2) for s in pair})).as_coefficients_dict()
+    assert found.discovery.explains
+    assert set(found.discovery.terms) == set(truth)
+    for f, c, error in zip(found.discovery.terms, found.discovery.coefficients, found.discovery.errors, strict=True):
+        assert abs(c - float(truth[f])) < 5 * error
+
+
+@pytest.mark.parametrize(
+    ("H", "ndof"),
+    [("0.3*q*p", 1), ("q1*p2 - q2*p1", 2), ("(p1**2 + p2**2)/2 + 0.8*(q1*p2 - q2*p1) + 0.32*(q1**2 + q2**2)", 2)],
+    ids=["q p", "rotation", "Larmor"],
+)
+def test_quadratic_forms_of_q_and_p_are_found(H, ndof):
+    found = sympflow.discover(noisy(H, ndof, 0), "polynomials", degree=2)
+    names = {s.name: s for pair in coordinates(ndof) for s in pair} | ({"q": q, "p": p} if ndof == 1 else {})
+    assert set(found.discovery.terms) == set(sp.expand(sp.sympify(H, names)).as_coefficients_dict())
+    assert found.discovery.explains
+
+
+def circles(sigma):
+    """Ten orbits of one radius: those of q²/2 + p²/2, of −1/r + p²/2, of q1 p2 − q2 p1."""
+    random = np.random.default_rng(0)
+    angle = random.uniform(0, 2 * np.pi, 10)[:, None] + t
+    y = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], 1)
+    return t, y + sigma * random.normal(size=y.shape)
+
+
+def doubled(sigma):
+    """A pendulum and twice the same."""
+    times, y = measured(pendulum(), 0.0, n=8)
+    y = y[:, [0, 0, 1, 1]] * [[1.0], [2.0], [1.0], [2.0]]
+    return times, y + sigma * np.random.default_rng(0).normal(size=y.shape)
+
+
+@pytest.mark.parametrize(
+    ("data", "same"),
+    [(circles(0.0), "p2 - q1, p1 + q2"), (circles(0.01), "p2 - q1, p1 + q2"), (doubled(0.01), "q1 - 0.5*q2")],
+)
+def test_what_the_data_do_not_tell_is_said(data, same):
+    with pytest.warns(UserWarning, match="The data do not tell H beyond themselves: .* to the noise, ") as said:
+        found = sympflow.discover(data, "polynomials", degree=2)
+    assert same in str(said[-1].message)
+    record = found.discovery
+    assert not record.explains
+    assert record.unseen
+    assert Library(record.unseen, 2).values(data[1][0].T).std(axis=0).max() < 0.1
+    assert found.domain.contains(data[1][0].T).all()
+    assert not found.domain.contains(np.zeros((1, 4))).any() or same.startswith("q1")
+
+
 def test_friction_and_a_wrong_library_are_told():
     with pytest.warns(UserWarning, match=r"No sparse Hamiltonian .* times the noise. Friction p' = -γp with γ = 0"):
         system = sympflow.discover(measured(damped_pendulum(0.1), 0.01), ["p**2", "cos(q)"])

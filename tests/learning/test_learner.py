@@ -11,7 +11,17 @@ import sympflow
 from sympflow.learning.families import FAMILIES, Candidate, Said, pruned
 from sympflow.learning.fitting import Held, Setting, fitted, judged, left_out, restored
 from sympflow.learning.inertia import Inertia
-from sympflow.learning.learner import MOST_VALUES, Replicas, Search, _cut, _divided, _few, _said, replica
+from sympflow.learning.learner import (
+    MOST_VALUES,
+    Replicas,
+    Search,
+    _cut,
+    _divided,
+    _few,
+    _said,
+    replica,
+    without_growth,
+)
 from sympflow.learning.library import Library, Terms
 from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Polynomial, Waves
 from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
@@ -375,7 +385,7 @@ def test_replicas_tell_how_certain_a_prediction_is():
     model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
     found = fitted(model, data, Setting())
     thetas = np.stack([replica((model, data, Setting(), found.theta, 0), k) for k in range(6)])
-    replicas = Replicas(model, found.method, found.theta, thetas)
+    replicas = Replicas(model, found.method, found.theta, thetas, 8)
     low, high = replicas.bands([0.5, 0.0], np.linspace(0, 4, 5))
     with pytest.raises(ValueError, match="`y0` must be one finite state"):
         replicas.bands([[0.5, 0.0], [0.1, 0.0]], [0, 1])
@@ -384,6 +394,57 @@ def test_replicas_tell_how_certain_a_prediction_is():
     theta = found.theta
     assert np.std(thetas, axis=0) == pytest.approx(np.sqrt(np.diag(found.fit.covariance())), rel=0.9)
     assert np.abs(thetas.mean(0) - theta).max() < 0.05
+
+
+@pytest.mark.slow
+def test_bands_cover_the_truth_as_often_as_they_say():
+    """Of 20 sets of nine trajectories; quantiles of 20 replicas covered 82 % in place of 90."""
+    times = np.linspace(0, 4, 5)
+    field = lambda t, y: [y[1] / MASS, -STIFF * y[0] - QUARTIC * y[0] ** 3]  # noqa: E731
+    true = solve_ivp(field, (0, 4), [0.5, 0.0], t_eval=times, rtol=1e-12, atol=1e-13).y
+    model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+    inside = []
+    for seed in range(20):
+        data = Trajectories.read(trajectories(9, 15, noise=0.05, seed=seed))
+        found = fitted(model, data, Setting())
+        thetas = np.stack([replica((model, data, Setting(), found.theta, seed), k) for k in range(20)])
+        low, high = Replicas(model, found.method, found.theta, thetas, 9).bands([0.5, 0.0], times)
+        inside.append(((low <= true) & (true <= high))[:, 1:].mean())
+    assert np.mean(inside) == pytest.approx(0.9, abs=1.5 * 0.3 / np.sqrt(20))  # values of one set are correlated
+
+
+@pytest.mark.parametrize("damping", [True, "each"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_friction_that_chance_makes_negative_is_none(damping, seed):
+    """Data without friction: one rate in two is below 0 by chance."""
+    found = sympflow.learn(
+        trajectories(8, 15, noise=0.01, seed=seed), damping=damping, family="polynomial", time_budget=30
+    )
+    friction = found.system.friction
+    assert friction is None or 0 <= friction.largest < 0.01
+
+
+def test_friction_below_0_is_0_and_one_that_is_no_chance_is_told(clean):
+    growing = Trajectories.read(trajectories(8, 15, rate=-RATE, noise=0.01))
+    with pytest.warns(UserWarning, match=r"`damping` is -0.2.* by the data, whose energy grows: it is taken as 0"):
+        found = without_growth(fitted(quartic(growing, 1), growing, Setting()))
+    assert found.theta[-1] == 0
+    rest = Trajectories.read(trajectories(8, 15, noise=0.01))
+    fit = fitted(quartic(rest, 1), rest, Setting())
+    shifted = replace(fit, theta=fit.theta - [*np.zeros(len(fit.theta) - 1), fit.theta[-1] + 1e-4])
+    conservative = [*fitted(quartic(rest), rest, Setting()).theta, 0.0]
+    np.testing.assert_allclose(without_growth(shifted).theta, conservative, rtol=0.02, atol=0.02)
+
+
+def test_a_flow_of_data_that_do_not_tell_h_is_of_these_data():
+    """Circular orbits of one radius: V may be any function with one slope there."""
+    t = np.linspace(0, 6, 31)
+    angle = np.linspace(0, 5, 10)[:, None] + t
+    y = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], 1)
+    with pytest.warns(UserWarning, match=r"do not tell H beyond themselves: .* q1\*\*2 \+ q2\*\*2 is the same"):
+        flow = sympflow.learn((t, y), time_budget=20)
+    assert flow.domain.contains(y[0].T).all()
+    assert not flow.domain.contains(np.zeros((1, 4))).any()
 
 
 def test_chaotic_trajectories_are_followed_in_pieces():
