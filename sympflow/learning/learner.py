@@ -520,6 +520,7 @@ class Search:
             smooth = replace(setting, seen=None) if self.winner[2].lag else setting
             found = fitted(candidate.model, self.whole or self.all, smooth, self.final)
             self.final = self.final if setting.stop() and found.span < self.final.span else found
+        self.final = without_growth(self.final)
         self.cut = deadline.over()
 
     def _ask(self, names: list[str], setting: Setting, session: Session) -> list[tuple[bool, list[Candidate]]]:
@@ -648,8 +649,6 @@ class Search:
         """Warn where the residuals of the best model are no noise, with what may be the reason."""
         candidate, _, held = self.winner
         if held.explained:
-            if self.unseen:
-                warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
             share = float(np.min(self.winner[1].sigma / self.data.scales))
             if share > SILENT:
                 warnings.warn(
@@ -659,6 +658,8 @@ class Search:
                     UserWarning,
                     stacklevel=4,
                 )
+            elif self.unseen:
+                warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
             return
         said = (
             f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: "

@@ -1,5 +1,6 @@
 """A flow from trajectories: shooting recovers H to rounding, to what the noise allows, and says what it did."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
