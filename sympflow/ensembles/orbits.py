@@ -42,7 +42,7 @@ class Given:
         return ""
 
     def parts(self) -> tuple[Any, ...]:
-        """What a store knows the states by: all of them."""
+        """The identity of the states for a store: all of them."""
         return (self.y0,)
 
     def sent(self, start: int, stop: int) -> Given:
@@ -106,7 +106,7 @@ class Drawn:
         return f" by seed {self.seed}"
 
     def parts(self) -> tuple[Any, ...]:
-        """What a store knows the states by: all of them, or of very many the sampler and states spread over them."""
+        """The identity of the states for a store: all of them; of very many the sampler, and states among them."""
         blocks = np.arange(-(-self.n // DRAWN))
         most = MOST_DIGESTED // DRAWN
         spread = blocks if len(blocks) <= most else np.unique(np.linspace(0, len(blocks) - 1, most).astype(int))

@@ -49,7 +49,7 @@ def identity(
     reduction: Reduction,
     backend: str,
 ) -> Known:
-    """What an ensemble is known by."""
+    """The identity of an ensemble."""
     known = known_by(system, integrator, backend)
     known.texts |= {"dt": repr(integrator.step_length(system)), "t_span": f"{t_span[0]!r} to {t_span[1]!r}"}
     known.add("t_eval", "every step" if t_eval is None else f"{len(t_eval)} times", t_eval)

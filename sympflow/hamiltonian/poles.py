@@ -38,7 +38,7 @@ class Poles(Protocol):
         """
 
     def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
-        """What vanishes at the places: (..., m)."""
+        """The values that vanish at the places: (..., m)."""
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         """Return True if H is infinite, or no number, on the way between states y (2, 2d) in two cells."""
@@ -231,7 +231,7 @@ _SINGULAR: dict[Any, Callable[..., Sequence[sp.Expr]]] = {
     sp.bessely: lambda n, a: [a],
     sp.besselk: lambda n, a: [a],
 }
-"""What vanishes where a function is infinite, or ends."""
+"""Expressions that vanish where a function is infinite, or ends."""
 
 _ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, sp.elliptic_k, sp.elliptic_e
 _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign

@@ -51,7 +51,7 @@ MOST_LEFT_OUT = 100
 """Degrees of freedom up to the last one that a formula may do without."""
 LONGEST_NAME = 40  # in messages
 MOST_COORDINATES = 10_000
-"""Of an H that is written out."""
+"""Degrees of freedom of an H that is written out."""
 FAR = 1000.0
 """The time before and after 0 in which it is looked if H jumps, where that is at no zeros of linear functions."""
 
@@ -861,7 +861,7 @@ def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
 
 
 def _special_functions() -> dict[str, Callable[..., Any]]:
-    """What the printer of SciPy does not know, or by complex numbers: NaN where it is not real."""
+    """Functions that SciPy's printer does not know, or has complex: NaN where they are not real."""
     from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc, lambertw
 
     def real_lambertw(x: Any, k: Any = 0) -> Any:

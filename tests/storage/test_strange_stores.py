@@ -111,7 +111,7 @@ def longer(path):
 BOMB = zlib.compress(bytes(3 * 10**8), 9)
 STRANGE = {
     "path up": (renamed("../victim"), "../victim"),
-    "absolute path": (renamed("/tmp/victim"), "/tmp/victim"),
+    "absolute path": (renamed("/victim"), "/victim"),
     "Windows' path": (renamed("..\\victim"), "victim"),
     "NUL": (renamed("q\0"), "q"),
     "hidden": (renamed(".lock"), ".lock"),
