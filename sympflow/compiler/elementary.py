@@ -609,7 +609,7 @@ TRIGAMMA = (1 / 6, -1 / 30, 1 / 42, -1 / 30, 5 / 66, -691 / 2730, 7 / 6)
 
 
 def _raised(x: Value, term: Callable[[Value], Value]) -> tuple[Value, Value, Value, Value]:
-    """The condition x < 1/2; 1/z of a number z ≥ 16 above x or 1 − x, the sum of the terms between, πx less whole turns."""
+    """The condition x < 1/2; 1/z of z ≥ 16 above x or 1 − x, the sum of the terms between, πx less whole turns."""
 
     def step(k: Value, values: Sequence[Value]) -> list[Value]:
         z, total = values
