@@ -44,7 +44,7 @@ REFUSED = [
     (lambda: made("p**2/2 + asin(2)*q"), ValueError, "^`expression` is complex"),
     (lambda: made(sp.Matrix([[p**2, q], [q, p]])), ValueError, r"^`expression` must be a scalar.*\(2, 2\)"),
     (lambda: made(f"p**2/2 + Max({','.join(f'{i}*q' for i in range(63))})"), ValueError, "Max has 63 arguments"),
-    (lambda: made("p1**2/2 + q99999999999"), ValueError, "^`expression` has 99,999,999,999 coordinates"),
+    (lambda: made("p1**2/2 + q99999999999"), ValueError, "^`expression` has coordinates of the number 99999999999"),
     (lambda: HamiltonianSystem(hamiltonian=compiled_H, ndof=1), TypeError, "^`hamiltonian` is a Numba function"),
 ]
 
@@ -88,7 +88,7 @@ def test_special_functions_have_their_values_and_are_undefined_elsewhere():
     ("text", "more"),
     [
         ("p**2/2 + exp(-exp(-q))", {}),
-        ("p**2/2 + Piecewise((q**2*t, q < 1), (q**2, True))", {"time": "t"}),
+        ("p**2/2 + Piecewise((q**2*t, q < 1), (t*(2*q - 1), True))", {"time": "t"}),
         ("p**2/2 + Piecewise((q**2, q < 1))", {}),
         ("p**2/2 + (q + 1)**300*1e-40", {}),
     ],
