@@ -435,9 +435,8 @@ class _Search:
         regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
         most = min(most, self.most_terms)
         found = [way(most, part) for part in self._parts() for way in (regression.forward, regression.backward)]
-        ways = sorted({tuple(sorted(active)) for active in found}, key=lambda way: regression.criterion([*way]))[
-            :STARTS
-        ]
+        different = [*map(list, {tuple(sorted(active)) for active in found})]
+        ways = sorted(different, key=regression.criterion)[:STARTS]
         for _ in range(8):
             starts = []
             for active in ways:

@@ -1,5 +1,6 @@
 """A flow from trajectories: shooting recovers H to rounding, to what the noise allows, and says what it did."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -423,15 +424,17 @@ def test_friction_below_0_is_0_and_one_that_is_no_chance_is_told(clean):
     rest = Trajectories.read(trajectories(8, 15, noise=0.01))
     fit = fitted(quartic(rest, 1), rest, Setting())
     shifted = replace(fit, theta=fit.theta - [*np.zeros(len(fit.theta) - 1), fit.theta[-1] + 1e-4])
-    np.testing.assert_allclose(without_growth(shifted).theta, fitted(quartic(rest), rest, Setting()).theta.tolist() + [0.0], rtol=0.02, atol=0.02)
+    alone = fitted(quartic(rest), rest, Setting()).theta
+    np.testing.assert_allclose(without_growth(shifted).theta, [*alone, 0.0], rtol=0.02, atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_flow_of_data_that_do_not_tell_h_is_of_these_data():
     """Circular orbits of one radius: V may be any function with one slope there."""
     t = np.linspace(0, 6, 31)
     angle = np.linspace(0, 5, 10)[:, None] + t
     y = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], 1)
-    with pytest.warns(UserWarning, match=r"The data do not tell H beyond themselves: .* q1\*\*2 \+ q2\*\*2 is the same"):
+    with pytest.warns(UserWarning, match=r"The data do not tell H .* q1\*\*2 \+ q2\*\*2 is the same"):
         flow = sympflow.learn((t, y), time_budget=20)
     assert flow.domain.contains(y[0].T).all()
     assert not flow.domain.contains(np.zeros((1, 4))).any()
