@@ -31,6 +31,7 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
     (("kernels",), "compiled loops behind one protocol"),
     (("systems",), "the built-in scenes"),
     (("hamiltonian",), "H, its structure and derivatives; domains"),
+    (("compiler",), "traced numbers → programs → machine code"),
     (
         ("schemes", "events", "workers", "storage"),
         "tables; zeros along a run; maps over workers; stores",

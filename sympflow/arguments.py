@@ -73,6 +73,15 @@ def check_not_followed(name: str, times: Any) -> None:
         )
 
 
+def check_kept(name: str, value: Any) -> None:
+    """Raise a TypeError if a number that a system keeps carries derivatives, which would be dropped in silence."""
+    if is_tensor(value) and differentiable(value):
+        raise TypeError(
+            f"`{name}` is a tensor that torch differentiates or transforms, but it is kept as numbers: write H with "
+            "it, as HamiltonianSystem(hamiltonian=...), or pass `.detach()`."
+        )
+
+
 def check_not_traced(function: str) -> None:
     """Raise a TypeError in a graph that `torch.compile` traces, into which a whole run does not go."""
     import torch

@@ -44,6 +44,11 @@ def concatenate(parts: Sequence[Array]) -> Array:
     return np.concatenate(parts, axis=-1)
 
 
+def join(parts: Sequence[Array]) -> Array:
+    """Join arrays, or tensors, along the first axis."""
+    return library(parts[0]).concatenate(list(parts))
+
+
 def stack(parts: Sequence[Array], axis: int = -1) -> Array:
     """Join arrays along a new axis."""
     if is_tensor(parts[0]):

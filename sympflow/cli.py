@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 
 
@@ -12,6 +13,9 @@ def main() -> None:
         import typer  # noqa: F401
     except ImportError as error:
         sys.exit(f'The command line needs {error.name}: pip install "sympflow[cli]".')
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # tables hold Δ and ψ, whatever the locale
+            stream.reconfigure(encoding="utf-8")
     from sympflow.commands import app
 
     app()

@@ -11,6 +11,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.scales import weights
 
 if TYPE_CHECKING:
     import os
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from sympflow.storage.runs import RunStore
 
 SMALLEST_SCALE = 1e-12
-"""|H(y0)| below which an energy error is absolute, unless the system declares its `energy_scale`."""
+"""|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
 
 
 @dataclass
@@ -177,11 +178,7 @@ class Solution:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
         if self.varied and not self.system.autonomous:
             return gathered(self, lambda part: part.energy_scale())
-        declared = self.system.energy_scale
-        H0 = np.abs(_energy(self, self.y0, self.t_span[0]))
-        if declared is not None:
-            return np.full_like(H0, declared)
-        return np.where(H0 < SMALLEST_SCALE, np.nan, H0)
+        return known_scale(self.system, to_numpy(self.y0), self.t_span[0], _energy(self, self.y0, self.t_span[0]))
 
     def to_scipy(self) -> OptimizeResult:
         """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; of a single trajectory.
@@ -332,15 +329,17 @@ def dataset(sol: Solution, energy: bool = True, asked: str = "to_xarray()") -> x
 
 
 LARGEST_DIFFERENCE = 1e-6
-"""Difference of the two copies, over the largest number of the states, beyond which a physical solution warns."""
+"""Difference of the two copies, over the size of the states, beyond which a physical solution warns."""
 
 
 def physical_solution(sol: Solution) -> Solution:
     """The physical part of a solution of a doubled system: see `Solution.physical`."""
     doubled = sol.system.as_doubled()
     with np.errstate(all="ignore"):
-        apart, size = (abs(to_numpy(y)).max(initial=0.0) for y in (doubled.difference(sol.states), sol.states))
-    if apart > LARGEST_DIFFERENCE * size:
+        both, scale = (doubled.difference(sol.states), doubled.physical_limit(sol.states)), weights(doubled.physical)
+        apart = abs(to_numpy(both[0])).max(initial=0.0)
+        scaled_apart, size = (abs(scale * to_numpy(y)).max(initial=0.0) for y in both)
+    if scaled_apart > LARGEST_DIFFERENCE * size:
         warnings.warn(
             f"The doubled variables q₋, p₋ have grown to {apart:.3g}: the run has left the physical limit. Reduce "
             "`dt`, or project every step, solve(system, 'projected', of=method).",
@@ -377,6 +376,16 @@ def check_solution(sol: object, name: str = "sol") -> None:
         raise TypeError(f"`{name}` must be a Solution; got {type(sol).__name__}. Pass what solve() returns.")
 
 
+def known_scale(system: HamiltonianSystem, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:
+    """The system's `energy_scale`, else |H0| of the states y0 (..., 2d); NaN where H0 is 0 but for rounding: (...)."""
+    if system.energy_scale is not None:
+        return np.full_like(H0, system.energy_scale)
+    with np.errstate(all="ignore"):
+        y = y0.astype(float)
+        terms = np.abs(y * np.asarray(system.gradient(y, None if system.autonomous else t0))).sum(-1)
+        return np.where(np.isfinite(H0) & (np.abs(H0) <= SMALLEST_SCALE * terms), np.nan, np.abs(H0))
+
+
 def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> np.ndarray:
     """H(y(t)) − H(y0) in float64, (..., n): the metric `sympflow.energy_error`, where it is documented.
 
@@ -397,7 +406,7 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
         scale = sol.energy_scale()
         if (absolute := np.isnan(scale)).any():
             warnings.warn(
-                f"The energy error is absolute where |H(y0)| < {SMALLEST_SCALE:g}: give the system an `energy_scale`.",
+                "The energy error is absolute where H(y0) is 0 but for rounding: give the system an `energy_scale`.",
                 RuntimeWarning,
                 stacklevel=stacklevel,
             )

@@ -28,8 +28,15 @@ from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap, warn_of_loss
+from sympflow.integrators.domain_exit import (
+    check_domain,
+    check_system_along,
+    warn_of_leap,
+    warn_of_loss,
+    warn_of_tolerance,
+)
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
+from sympflow.integrators.impulses import run_between_impulses
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, naming_plugin
 from sympflow.solution import Solution, StoredSolution, joined
@@ -63,6 +70,7 @@ def solve(
     progress: Asked = False,
     store: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    same: bool = False,
     checkpoint_every: float | None = None,
     **options: Any,
 ) -> Solution:
@@ -124,7 +132,12 @@ def solve(
         ``xarray.open_zarr(store)`` reads it at any time.
     resume : bool
         Go on with the run that is in the store, if there is one: after a kill at any moment, or to a later end of
-        `t_span`, with later times in `t_eval`, the bits are those of a run that was never interrupted.
+        `t_span`, with later times in `t_eval`, the bits are those of a run that was never interrupted. A store of
+        another run is refused: it is known by all that it is made of, functions and classes by their code and the
+        values that they use.
+    same : bool
+        With `resume`, take functions and objects of Python for those of the store: where one cannot be told from
+        another, such as what a compiled library made, or where code was rewritten and means the same.
     checkpoint_every : float, optional
         Seconds of work, at most, that a kill loses; the default is 10. Outputs are chosen by `t_eval` and `save_every`.
     **options
@@ -190,11 +203,14 @@ def solve(
     if store is not None:
         from sympflow.storage.runs import RunStore
 
-        kept = RunStore(store, resume, checkpoint_every)
+        kept = RunStore(store, resume, checkpoint_every, same)
         check_stored(problem, action, rows)
         problem = replace(problem, store=kept)
-    elif resume or checkpoint_every is not None:
-        raise ValueError("`resume` and `checkpoint_every` are for runs with a `store`: give one, or leave them out.")
+    elif resume or same or checkpoint_every is not None:
+        raise ValueError(
+            "`resume` and `checkpoint_every` are for runs with a `store`, and `same` with them: give one, or leave "
+            "them out."
+        )
     if progress is False:
         return _answered(integrator, problem, action, rows)
     sign = math.copysign(1.0, t1 - t0)
@@ -234,18 +250,29 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     """The solution of a validated problem."""
     system, y_start = problem.system, problem.y0
     n_times = 0 if problem.t_eval is None else len(problem.t_eval)
-    integrator = integrator.resolved(system, y_start, abs(problem.t1 - problem.t0), n_times)
-    check_applies(integrator, system, y_start)
+    between = system.between_impulses
+    integrator = integrator.resolved(between, y_start, abs(problem.t1 - problem.t0), n_times)
+    check_applies(integrator, between, y_start)
     integrator.check_library(y_start)
-    if not system.autonomous:
-        warn_of_jumps(system, problem.t0, problem.t1, integrator.step_length(system), stacklevel=4)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
+    if between is not system:
+        _check_impulses(problem, integrator)
+        run = partial(run_between_impulses, _run)
+    elif not system.autonomous:
+        warn_of_jumps(
+            system,
+            problem.t0,
+            problem.t1,
+            integrator.step_length(system),
+            integrator.label if integrator.forces_at_ends(system) else None,
+            stacklevel=4,
+        )
     if problem.t1 in (math.inf, -math.inf):
         run = _run_endless
     elif problem.store is not None:
         run = partial(_run_stored, action=action)
     else:
-        check_memory(integrator, problem)
+        check_memory(integrator, replace(problem, system=between))
 
     start, stopped = time.perf_counter(), None
     with naming_plugin(integrator):
@@ -255,20 +282,28 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
+    passed = False
+    if system.poles is not None and problem.diagnosed and problem.letters is None and problem.store is None:
+        from sympflow.integrators.diagnosis import note_poles
+
+        if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
+            passed = note_poles(outcome, integrator, problem, stacklevel=4)
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
     if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
         from sympflow.integrators.diagnosis import note_singularities
 
-        note_singularities(outcome, integrator, problem)
+        note_singularities(outcome, integrator, problem, passed)
     if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
+    if integrator.absolute_tolerance and not failed and problem.store is None and readable(outcome.y):
+        warn_of_tolerance(outcome, system, integrator.absolute_tolerance, stacklevel=4)
     if system.functions_given and readable(outcome.y):
         system.check_functions_along(outcome.y)
     if integrator.trained:
-        check_system_along(outcome, integrator, system, y_start)
+        check_system_along(outcome, integrator, between, y_start)
     if action != "ignore" and readable(outcome.y):
-        check_domain(outcome, integrator, system, action)
-        if problem.store is None and not failed:
+        check_domain(outcome, integrator, between, action)
+        if problem.store is None and not failed and between is system:
             warn_of_loss(outcome, integrator, system, y_start, stacklevel=4)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     sol = (Solution if problem.store is None else StoredSolution)(
@@ -300,7 +335,8 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     """
     states = problem.y0.reshape(-1, problem.y0.shape[-1])
     groups = []
-    for group in rows.by_form() if action == "ignore" else rows.distinct():
+    alike = action == "ignore" and problem.system.between_impulses is problem.system
+    for group in rows.by_form() if alike else rows.distinct():
         together = replace(problem, system=group.system, y0=states[group.places], letters=group.letters)
         if group.letters is None or integrator.takes_letters(together):
             groups.append((group.places, together))
@@ -367,6 +403,18 @@ def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
     if search is None or integrator.finds_events:
         return integrator.run(problem), problem
     return run_and_search(integrator, problem, search), problem
+
+
+def _check_impulses(problem: Problem, integrator: Integrator) -> None:
+    """Refuse what is not done of a system with impulses."""
+    system, search = problem.system, problem.events
+    if problem.store is not None:
+        system.check_impulses("and a run into a `store` makes no kicks", "leave `store` out")
+    if not math.isfinite(problem.t1):
+        system.check_impulses("and `t_span` has no end up to which they are known", "give it a finite one")
+    if search is not None and search.events and integrator.keeps:
+        what = f"after each of which {integrator.keeps} begins anew in method {integrator.name!r}, and so do `events`"
+        system.check_impulses(what, "use another method")
 
 
 def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[Outcome, Problem]:

@@ -99,6 +99,7 @@ def test_time_reversal(method, y0, dt, n):
         np.testing.assert_allclose(back, y0, atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:`atol`, by default")  # of states that are smaller
 @pytest.mark.parametrize(
     "method", ["verlet", "kahan_li8", "rk4", "rk45", "implicit_midpoint", "impulse", "mlp", "sympflow"]
 )

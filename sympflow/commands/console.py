@@ -45,6 +45,8 @@ PHRASES = {
     "sympflow.train(system)": "`sympflow train`",
     "flow.certificate(system)": "`sympflow certificate`",
     "poincare_section": "`sympflow section`",
+    "period=2*np.pi": "period=6.283185307179586",
+    "period=np.inf": "`--period inf`",
 }
 """Remedies in Python, and what they are on the command line."""
 
@@ -64,11 +66,11 @@ def in_options(message: str, context: typer.Context) -> str:
         if option is not None:
             options.setdefault(name, option)
     message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", in_words(message))
-    given = re.compile(r"`?(?<![\w:.-])(?P<name>\w+)=(?P<value>'[^']*'|[\d.eE+-]*\d|(?=\W|$))`?")
+    given = re.compile(r"`?(?<![\w:.-])(?P<name>\w+)=(?P<value>'[^']*'|\"[^\"]*\"|True|[\d.eE+-]*\d|(?=\W|$))`?")
 
     def as_option(found: re.Match[str]) -> str:
-        option, value = options.get(found["name"]), found["value"].strip("'")
-        return found[0] if option is None else f"`{option} {value}`" if value else f"`{option}`"
+        option, value = options.get(found["name"]), found["value"].strip("'\"")
+        return found[0] if option is None else f"`{option}`" if value in ("", "True") else f"`{option} {value}`"
 
     return given.sub(as_option, message)
 

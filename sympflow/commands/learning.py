@@ -42,7 +42,7 @@ def learn(
         list[str] | None, typer.Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Which trajectories are held out.")] = 0,
-    time_budget: Annotated[float | None, typer.Option(help="Seconds that it may take.")] = None,
+    time_budget: Annotated[float, typer.Option(help="Seconds that it may take.")] = 60.0,
     checkpoint: Annotated[Path | None, typer.Option(help="File to keep the state of the run in.")] = None,
     resume: Annotated[Path | None, typer.Option(help="Checkpoint to go on from.")] = None,
     to: Annotated[Path, typer.Option("--out", help="File for the flow.")] = Path("flow.safetensors"),

@@ -99,8 +99,8 @@ class Chunk:
 
     @cached_property
     def _stepper(self) -> Stepper | None:
-        """A run with fixed steps; None with a method that chooses them."""
-        if not isinstance(self.integrator, FixedStep):
+        """A run with fixed steps; None with a method that chooses them, and with impulses between them."""
+        if not isinstance(self.integrator, FixedStep) or self.system.between_impulses is not self.system:
             return None
         return self.integrator.stepper(Problem(self.system, *self.t_span, self.y0[:1], backend=self.backend))
 

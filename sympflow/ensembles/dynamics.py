@@ -12,6 +12,7 @@ import numpy as np
 from sympflow.arguments import check_counts
 from sympflow.ensembles.chunks import BLOCK, MOST_VALUES, Chunk
 from sympflow.ensembles.reductions import Fields, Reduction
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.chaos import (
     ALIGNED,
     ALIGNMENT,
@@ -151,24 +152,23 @@ class Lines(Reduction):
         if not (self.signal is None or callable(self.signal)):
             raise TypeError(f"`signal` must be a function of states; got {type(self.signal).__name__}.")
 
-    @property
-    def _taken(self) -> Signal:
-        return rotations if self.signal is None else self.signal
+    def _taken(self, system: HamiltonianSystem) -> Signal:
+        return rotations(system) if self.signal is None else self.signal
 
     def fields(self, problem: Chunk) -> Fields:
         times = problem.times
         gaps = np.diff(times)
         if len(times) < 16 or np.ptp(gaps) > 1e-6 * np.abs(gaps).max():
             raise ValueError("`t_eval` must be 16 equidistant times or more, for frequencies: use numpy.linspace.")
-        shape = (signals(self._taken, problem.y0[:1, :, None], 1).shape[1], self.n)
+        shape = (signals(self._taken(problem.system), problem.y0[:1, :, None], 1).shape[1], self.n)
         return {"frequencies": (shape, np.dtype(float)), "amplitudes": (shape, np.dtype(complex))}
 
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
-        times, parts = chunk.times, []
+        times, parts, taken = chunk.times, [], self._taken(chunk.system)
         most = max(1, MOST_VALUES // (len(times) * (chunk.y0.shape[1] + 4 * self.n)))
         for start in range(0, len(chunk), most):
             part = chunk.rows(start, start + most)
-            parts.append(lines(signals(self._taken, part.states(times), len(times)), times, self.n))
+            parts.append(lines(signals(taken, part.states(times), len(times)), times, self.n))
             chunk.take(part)
         omega, amplitude = (np.concatenate(found) for found in zip(*parts, strict=True))
         return {"frequencies": omega, "amplitudes": amplitude}
@@ -204,7 +204,8 @@ class Escape(Reduction):
 class PlaneCrossings(Reduction):
     """The first crossings of the plane y[coordinate] = level; see `sympflow.poincare_section`.
 
-    They are `n_crossings`, `crossing_times` (most,) and `crossing_states` (most, 2d), NaN where there are fewer.
+    They are `n_crossings`, `crossing_times` (most,) and `crossing_states` (most, 2d), NaN where there are
+    fewer, and of an orbit that failed.
     """
 
     coordinate: int = 0
@@ -237,9 +238,11 @@ class PlaneCrossings(Reduction):
             found = crossings(chunk.integrator, chunk.system, chunk.t_span, chunk.y0[rows], plane, chunk.system.dt)
             ends = np.searchsorted(found.trajectory, np.arange(len(rows) + 1))
             for j, i in enumerate(rows.tolist()):
+                if found.status[j] < 0:
+                    count[i] = np.nan
+                    chunk.fail(i, "The orbit ceased to be finite. Reduce `dt`, or end `t_span` earlier.")
+                    continue
                 own = slice(ends[j], min(ends[j + 1], ends[j] + self.most))
                 k = own.stop - own.start
                 count[i], times[i, :k], states[i, :k] = ends[j + 1] - ends[j], found.t[own], found.states[own]
-                if found.status[j] < 0:
-                    chunk.fail(i, "The orbit ceased to be finite. Reduce `dt`, or end `t_span` earlier.")
         return {"n_crossings": count, "crossing_times": times, "crossing_states": states}

@@ -12,9 +12,13 @@ from sympflow.arrays import is_tensor
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import check_y0
+from sympflow.storage.identity import digest
 
 DRAWN = 4096
 """States that a sampler draws at a time, from a seed and their number, so that no state depends on the chunks."""
+
+MOST_DIGESTED = 1 << 20
+"""Drawn states that are all compared, to know those of a store."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,15 @@ class Given:
 
     def states(self, start: int, stop: int) -> np.ndarray:
         return self.y0[start:stop]
+
+    @property
+    def drawn(self) -> str:
+        """How the states were drawn, in words that follow their number."""
+        return ""
+
+    def parts(self) -> tuple[Any, ...]:
+        """The identity of the states for a store: all of them."""
+        return (self.y0,)
 
     def sent(self, start: int, stop: int) -> Given:
         """The part that a worker needs for the states start … stop: these, numbered from 0."""
@@ -86,6 +99,20 @@ class Drawn:
         if not np.isfinite(states).all():
             raise ValueError("`y0` draws states that are not finite: mend the sampler.")
         return states
+
+    @property
+    def drawn(self) -> str:
+        """How the states were drawn, in words that follow their number."""
+        return f" by seed {self.seed}"
+
+    def parts(self) -> tuple[Any, ...]:
+        """The identity of the states for a store: all of them; of very many the sampler, and states among them."""
+        blocks = np.arange(-(-self.n // DRAWN))
+        most = MOST_DIGESTED // DRAWN
+        spread = blocks if len(blocks) <= most else np.unique(np.linspace(0, len(blocks) - 1, most).astype(int))
+        ends = ((k * DRAWN, min((k + 1) * DRAWN, self.n)) for k in spread.tolist())
+        states = [digest(self.states(*part)) for part in ends]
+        return (states,) if len(blocks) <= most else (states, self.sampler)
 
     def sent(self, start: int, stop: int) -> Drawn:
         """The part that a worker needs for the states start … stop: the sampler, and where to begin."""

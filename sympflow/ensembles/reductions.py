@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from sympflow.ensembles.chunks import Chunk
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.solution import SMALLEST_SCALE
+from sympflow.solution import known_scale
 
 Fields = dict[str, tuple[tuple[int, ...], np.dtype]]
 """Names of what is kept of each orbit, with the shape of one orbit and the dtype."""
@@ -34,6 +34,8 @@ REDUCTIONS: dict[str, str] = {
 }
 """The names that `reduce` takes: "module:Class" below sympflow, called without arguments."""
 
+EXACT = 2**53
+"""The largest of the integers that floats hold exactly."""
 MOST_TRIED = 64
 """First orbits of which a user's function is tried on the first that does not fail."""
 
@@ -59,10 +61,6 @@ class Reduction(ABC):
     @abstractmethod
     def fields(self, problem: Chunk) -> Fields:
         """Return the fields of one orbit, for a problem that is given as a chunk of some first orbits."""
-
-    def settings(self) -> dict[str, Any]:
-        """Return what the reduction was made with: by that a store knows it again. Dataclasses tell their fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.compare} if is_dataclass(self) else vars(self)
 
     @abstractmethod
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
@@ -104,7 +102,7 @@ class Final(Reduction):
 class EnergyError(Reduction):
     """The largest relative energy error |H(y(t)) − H(y0)| / |H(y0)| along each orbit: `energy_error`.
 
-    It is absolute where |H(y0)| is below 1e-12, and relative to the system's `energy_scale` if it has one.
+    It is absolute where H(y0) is 0 but for rounding, and relative to the system's `energy_scale` if it has one.
     """
 
     def check(self, system: HamiltonianSystem) -> None:
@@ -118,8 +116,7 @@ class EnergyError(Reduction):
         system = chunk.system
         with np.errstate(all="ignore"):
             H0 = np.asarray(system.hamiltonian(chunk.y0))
-            scale = np.where(np.abs(H0) < SMALLEST_SCALE, 1.0, np.abs(H0))
-            scale = scale if system.energy_scale is None else np.full_like(H0, system.energy_scale)
+            scale = np.nan_to_num(known_scale(system, chunk.y0, chunk.t_span[0], H0), nan=1.0)
             worst = np.zeros(len(chunk))
             for _, y in chunk.windows():
                 H = np.asarray(system.hamiltonian(y.swapaxes(1, 2)))
@@ -131,8 +128,8 @@ class EnergyError(Reduction):
 class OfFunction(Reduction):
     """A user's function of (t (m,), y (2d, m)) of one orbit, which returns a number, an array, or a dict of such.
 
-    The shapes are those of the first orbit. An orbit for which the function raises, or returns another shape, has
-    failed, with that message.
+    The shapes are those of the first orbit, and numbers are complex if its are. An orbit for which the function raises,
+    or returns another shape, or imaginary parts where the first has none, has failed, with that message.
     """
 
     function: Callable[[np.ndarray, np.ndarray], Any]
@@ -159,7 +156,10 @@ class OfFunction(Reduction):
                     f"`reduce` raises {type(error).__name__}: {error}, for orbit {i}: it is called with the times "
                     f"{t.shape} and the states {y.shape} of one orbit."
                 ) from error
-            self.found.update({name: (v.shape, v.dtype) for name, v in _arrays(value).items()})
+            try:
+                self.found.update({name: (v.shape, v.dtype) for name, v in _arrays(value).items()})
+            except ValueError as error:
+                raise ValueError(f"`reduce` cannot be kept: {error}") from None
             return dict(self.found)
         raise ValueError(
             f"`reduce` cannot be tried: the first {len(problem)} orbits all fail. Reduce `dt`, or mend `y0`."
@@ -172,9 +172,16 @@ class OfFunction(Reduction):
                 continue
             try:
                 values = _arrays(self.function(t, y))
-                shapes = {name: (v.shape, np.result_type(v, float)) for name, v in values.items()}
-                if {name: s for name, (s, _) in shapes.items()} != {name: s for name, (s, _) in self.found.items()}:
+                if {name: v.shape for name, v in values.items()} != {name: s for name, (s, _) in self.found.items()}:
                     raise ValueError(f"`reduce` returns {_described(values)}, but {_described(out, 1)} for the first")
+                for name, v in values.items():
+                    if v.dtype.kind == "c" and out[name].dtype.kind != "c":
+                        if v.imag.any():
+                            raise ValueError(
+                                f"`reduce` returns complex {name}, and real ones for the first orbit: return complex "
+                                "numbers for all"
+                            )
+                        values[name] = v.real
             except Exception as error:
                 chunk.fail(i, f"`reduce` failed: {type(error).__name__}: {error}.")
                 continue
@@ -196,6 +203,11 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
             array = np.asarray(v)
         except ValueError:  # rows of different lengths
             array = np.empty(0, dtype=object)
+        whole = array.dtype.kind in "iu" or (array.dtype == object and all(isinstance(x, int) for x in array.flat))
+        if whole and array.size and max(-int(array.min()), int(array.max())) > EXACT:
+            raise ValueError(
+                f"{name} has an integer beyond 2**53, which floats would change: return its parts, or a float"
+            )
         if array.dtype.kind not in "biufc" or not isinstance(name, str):
             raise TypeError(
                 f"`reduce` must return numbers, an array of them, or a dict of such by name; got {type(v).__name__}."

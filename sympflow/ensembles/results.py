@@ -26,7 +26,7 @@ from sympflow.storage.layout import (
     imported,
     table,
 )
-from sympflow.storage.store import Field
+from sympflow.storage.store import STORABLE, Field, is_name
 
 if TYPE_CHECKING:
     import pandas
@@ -163,7 +163,18 @@ class Layout:
         return found
 
     def stored(self, sizes: Index) -> dict[str, Field]:
-        """Return the arrays of a store with chunks of such a shape along the axes."""
+        """Return the arrays of a store with chunks of such a shape along the axes.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If a store takes none of such a name, or of such things.
+        """
+        for name, (_, dtype) in self.fields.items():
+            if not is_name(name):
+                raise ValueError(f"`reduce` returns {name!r}, which no array of a `store` can be called: rename it.")
+            if dtype.kind not in STORABLE:
+                raise TypeError(f"`reduce` returns {name!r} of {dtype}, and a `store` takes numbers: convert them.")
         made = {v.name: (v.dims, (*self.shape, *v.shape), v.dtype, (*sizes, *v.shape)) for v in self.variables()}
         for name in ("q0", "p0"):
             made[name] = ((ORBIT, DOF), (self.n, self.ndof), np.dtype(float), (sizes[-1], self.ndof))

@@ -16,12 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow._version import __version__
-from sympflow.ensembles.callables import fingerprint
 from sympflow.ensembles.orbits import Drawn, Given
 from sympflow.ensembles.results import Block, Done, Index, Layout
-from sympflow.integrators.provenance import digest, flow_checksum, option_text
-from sympflow.integrators.registry import name_of
+from sympflow.integrators.provenance import known_by
+from sympflow.storage.identity import Known
 from sympflow.storage.layout import halves, imported
 from sympflow.storage.store import Store
 
@@ -50,28 +48,15 @@ def identity(
     axes: Mapping[str, np.ndarray],
     reduction: Reduction,
     backend: str,
-) -> dict[str, str]:
-    """The identity of an ensemble, each part as a text; two are the same if all parts are."""
-    states = orbits.y0 if isinstance(orbits, Given) else orbits.states(0, min(len(orbits), 64))
-    return {
-        "version": __version__,
-        "system": f"{system.name} {digest([system.expression, dict(system.params), list(system.fingerprint)])}",
-        "method": f"{name_of(integrator)}, {option_text(integrator)}, flow={flow_checksum(integrator, system)}",
-        "dt": repr(integrator.step_length(system)),
-        "t_span": f"{t_span[0]!r} to {t_span[1]!r}",
-        "t_eval": "every step" if t_eval is None else f"{len(t_eval)} times {digest(t_eval)}",
-        "y0": f"{len(orbits)} states{'' if isinstance(orbits, Given) else f' by seed {orbits.seed}'} {digest(states)}",
-        "params": ", ".join(f"{len(v)} values of {name} {digest(v)}" for name, v in axes.items()) or "none",
-        "reduce": _described(reduction),
-        "backend": backend,
-    }
-
-
-def _described(reduction: Reduction) -> str:
-    """A reduction with its options; a user's function by its fingerprint."""
-    settings = reduction.settings().items()
-    told = (f"{name}={fingerprint(value) if callable(value) else repr(value)}" for name, value in settings)
-    return f"{type(reduction).__name__}({', '.join(told)})"
+) -> Known:
+    """The identity of an ensemble."""
+    known = known_by(system, integrator, backend)
+    known.texts |= {"dt": repr(integrator.step_length(system)), "t_span": f"{t_span[0]!r} to {t_span[1]!r}"}
+    known.add("t_eval", "every step" if t_eval is None else f"{len(t_eval)} times", t_eval)
+    known.add("y0", f"{len(orbits)} states{orbits.drawn}", *orbits.parts())
+    known.add("params", ", ".join(f"{len(v)} values of {name}" for name, v in axes.items()) or "none", axes)
+    known.add("reduce", type(reduction).__name__, reduction)
+    return known
 
 
 # the store -----------------------------------------------------------------------------------------------------------
@@ -94,7 +79,9 @@ class EnsembleStore:
     sizes: Index
 
     @classmethod
-    def at(cls, path: Any, layout: Layout, sizes: Index, attributes: dict[str, Any], resume: bool) -> EnsembleStore:
+    def at(
+        cls, path: Any, layout: Layout, sizes: Index, attributes: dict[str, Any], known: Known, resume: bool, same: bool
+    ) -> EnsembleStore:
         """Make the store of an ensemble, or, with `resume`, find the one that is there, with chunks of its own.
 
         Raises
@@ -107,16 +94,18 @@ class EnsembleStore:
         if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
             raise TypeError(f"`store` must be the path of a folder; got {type(path).__name__}.")
         place = Path(os.path.abspath(os.fspath(path)))
-        made = layout.stored(sizes)
+        made, told = layout.stored(sizes), {KNOWN: json.dumps(known.texts), "chunk_shape": list(sizes)}
         try:
-            Store.create(place, made, attributes | {"chunk_shape": list(sizes)}, layout.coordinates())
+            Store.create(place, made, attributes | told, layout.coordinates())
         except FileExistsError:
             if not resume:
                 raise ValueError(
                     f"`store` {str(path)!r} exists: pass resume=True to go on with it, or name another folder."
                 ) from None
             store = Store.open(place)
-            sizes = _same(store, str(path), attributes)
+            store.check_same(KNOWN, known, str(path), "ensemble", "Name another folder.", same)
+            sizes = _chunk_shape(store, layout)
+            store.check_made_of(layout.stored(sizes))
             for name, values in layout.coordinates().items():
                 if not store.has(name, (0,)):  # as in one of an earlier version that was killed as it made it
                     store.write(name, (0,), values)
@@ -159,8 +148,14 @@ class EnsembleStore:
     def is_done(self, block: Block) -> bool:
         """True if the orbits of a block have been run, and all that was kept of them is there."""
         store, number = self._store, self._number(block)
-        kept = ((v.name, (*number, *(0,) * len(v.shape))) for v in self.layout.variables())
-        return store.has("status", number) and all(store.has(*chunk) for chunk in kept)
+        return store.has("status", number) and not self._missing(number)
+
+    def _missing(self, number: Index) -> str:
+        """The name of an array of which a chunk that has been run is not there; "" if all are."""
+        kept = {v.name: (*number, *(0,) * len(v.shape)) for v in self.layout.variables()}
+        if not any(number[:-1]):
+            kept |= {f"{letter}0": (number[-1], 0) for letter, _ in halves(self.layout.ndof)}
+        return next((name for name, index in kept.items() if not self._store.has(name, index)), "")
 
     def finish(self) -> None:
         """Note that all orbits have been run."""
@@ -172,15 +167,33 @@ class EnsembleStore:
 
     @property
     def fields(self) -> Mapping[str, np.ndarray]:
-        return _Read(self._store, self.layout)
+        return _Read(self)
+
+    def read(self, field: str) -> np.ndarray:
+        """Return a field, NaN where orbits have not been run.
+
+        Raises
+        ------
+        StoreError
+            If what has been run is damaged, or not there.
+        """
+        store = self._store
+        for number in np.ndindex(*store.fields["status"].grid):
+            if store.has("status", number) and (name := self._missing(number)):
+                raise store.damaged(f"a chunk of {name!r} is missing, and is run again by the same call, resume=True")
+        arrays = [store.read(v.name) for v in self.layout.variables() if v.field == field]
+        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=len(self.layout.shape))
 
     @property
     def messages(self) -> Mapping[Index, str]:
         found = {}
         for file in (Path(self.path) / MESSAGES).glob("*.json"):
-            for row, text in json.loads(file.read_text(encoding="utf-8")).items():
-                index = np.unravel_index(int(file.stem) + int(row), self.layout.shape)
-                found[tuple(map(int, index))] = text
+            try:
+                for row, text in json.loads(file.read_text(encoding="utf-8")).items():
+                    index = np.unravel_index(int(file.stem) + int(row), self.layout.shape)
+                    found[tuple(map(int, index))] = str(text)
+            except (ValueError, AttributeError, RecursionError, OSError) as error:
+                raise self._store.damaged(f"its messages {file.name} cannot be read ({error})") from None
         return dict(sorted(found.items()))
 
     def dataset(self) -> xarray.Dataset:
@@ -191,14 +204,13 @@ class EnsembleStore:
 class _Read(Mapping[str, np.ndarray]):
     """The fields of a store, read when they are asked for."""
 
-    def __init__(self, store: Store, layout: Layout) -> None:
-        self.store, self.layout = store, layout
+    def __init__(self, store: EnsembleStore) -> None:
+        self.store, self.layout = store, store.layout
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.layout.fields:
             raise KeyError(name)
-        arrays = [self.store.read(v.name) for v in self.layout.variables() if v.field == name]
-        return arrays[0] if len(arrays) == 1 else np.concatenate(arrays, axis=len(self.layout.shape))
+        return self.store.read(name)
 
     def __contains__(self, name: object) -> bool:
         return name in self.layout.fields
@@ -210,7 +222,11 @@ class _Read(Mapping[str, np.ndarray]):
         return len(self.layout.fields)
 
 
-def _same(store: Store, path: str, attributes: Mapping[str, Any]) -> Index:
-    """Return the shape of the chunks of a store, if it is of the same ensemble."""
-    store.check_same(KNOWN, json.loads(attributes[KNOWN]), path, "ensemble", "Name another folder.")
-    return tuple(store.attributes["chunk_shape"])
+def _chunk_shape(store: Store, layout: Layout) -> Index:
+    """The shape of the chunks of orbits of a store, which is none larger than all orbits."""
+    sizes = store.attributes.get("chunk_shape")
+    if not isinstance(sizes, list) or len(sizes) != len(layout.shape):
+        raise store.damaged("its chunk_shape is missing")
+    if not all(isinstance(k, int) and 1 <= k <= n for k, n in zip(sizes, layout.shape, strict=True)):
+        raise store.damaged(f"its chunk_shape {sizes} is none of {layout.shape} orbits")
+    return tuple(sizes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import os
 import threading
@@ -55,6 +54,7 @@ def ensemble(
     chunk: int | None = None,
     store: str | os.PathLike[str] | None = None,
     resume: bool = False,
+    same: bool = False,
     progress: bool | Callable[[int, int], Any] = False,
     backend: str = "auto",
     **options: Any,
@@ -97,7 +97,11 @@ def ensemble(
         A folder, in zarr's format, into which the workers write what is kept, each chunk when it is done, so that none
         of it stays in memory. `xarray.open_zarr` reads it; workers on other machines must see it by the same path.
     resume : bool
-        Go on with the store of the same ensemble, if there is one: what is there is not done again.
+        Go on with the store of the same ensemble, if there is one: what is there is not done again. It is known by all
+        that it is made of: functions and classes by their code and the values that they use.
+    same : bool
+        With `resume`, take functions and objects of Python for those of the store: where one cannot be told from
+        another, such as what a compiled library made, or where code was rewritten and means the same.
     progress : bool or callable
         True prints how far the ensemble is; a callable is called with the numbers of orbits done and in all.
     backend : "auto", "compiled", "array" or "cuda"
@@ -135,8 +139,9 @@ def ensemble(
     check_backend(backend, integrator)
     workers = checked_workers(workers)
     check_flag("resume", resume)
-    if resume and store is None:
-        raise ValueError("`resume` goes on with a `store`: name one.")
+    check_flag("same", same)
+    if (resume or same) and store is None:
+        raise ValueError(f"`{'resume' if resume else 'same'}` goes on with a `store`: name one.")
     kept = reduction(reduce)
     if backend == "cuda" and kept.own_loops:
         raise ValueError(
@@ -150,7 +155,7 @@ def ensemble(
         system = system.with_params(**fixed)
     first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
     integrator = integrator.resolved(system, first, abs(t1 - t0), 0 if times is None else len(times))
-    check_applies(integrator, system, first)
+    check_applies(integrator, system if kept.own_loops else system.between_impulses, first)
     for system_of in _telling(system, axes):
         kept.check(system_of)
     varied = kept.takes_params and _runs_together(system, integrator, (t0, t1), axes, first, backend)
@@ -166,10 +171,10 @@ def ensemble(
     attributes = partial(provenance, system, integrator, (t0, t1))
     keeper: Keeper = Memory(layout, orbits, attributes)
     if store is not None:
-        from sympflow.ensembles.stores import KNOWN, EnsembleStore, identity
+        from sympflow.ensembles.stores import EnsembleStore, identity
 
         known = identity(system, integrator, (t0, t1), times, orbits, axes, kept, backend)
-        keeper = made = EnsembleStore.at(store, layout, sizes, attributes() | {KNOWN: json.dumps(known)}, bool(resume))
+        keeper = made = EnsembleStore.at(store, layout, sizes, attributes(), known, bool(resume), bool(same))
         sizes, task = made.sizes, replace(task, store=made)
     pieces = blocks(layout.shape, sizes)
     left = [piece for piece in pieces if not keeper.is_done(piece)]
@@ -390,12 +395,17 @@ def run_piece(task: Task, item: tuple[Block, Given | Drawn]) -> Done:
 
 def _reduced(task: Task, chunk: Chunk, start: int) -> Done:
     fields = task.reduction.reduce(chunk)
+    for name, (_, dtype) in task.fields.items():
+        found = np.asarray(fields[name]).dtype
+        if not np.can_cast(found, dtype, "same_kind"):
+            raise TypeError(f"`reduce` returns {name} as {found}, which its `fields` told as {dtype}: let them agree.")
     return Done(fields, chunk.status, {start + k: text for k, text in chunk.messages.items()})
 
 
 def _without_a_system(task: Task, n: int, start: int, values: Mapping[str, float], error: Exception) -> Done:
     """The orbits of values of the parameters for which there is no system, or no such reduction: all failed."""
-    fields = {name: np.full((n, *shape), np.nan, dtype) for name, (shape, dtype) in task.fields.items()}
+    unknown = {name: np.nan if dtype.kind in "fc" else 0 for name, (_, dtype) in task.fields.items()}
+    fields = {name: np.full((n, *shape), unknown[name], dtype) for name, (shape, dtype) in task.fields.items()}
     shown = ", ".join(f"{name} = {value:.9g}" for name, value in values.items())
     text = f"`params` has {shown}: {error}"[:LONGEST_MESSAGE]
     return Done(fields, np.full(n, FAILED, dtype=np.int8), dict.fromkeys(range(start, start + n), text))

@@ -508,6 +508,10 @@ class FlowMap(nn.Module):
         self.identity, self.unfitted = description.identity, description.unfitted
         self.drive_times, self.lattice_terms = description.drive_times, dict(description.lattice_terms)
 
+    def identity_parts(self) -> Any:
+        """Return what a store knows it by: the map alone, without what is told of it."""
+        return [self.kind, self.architecture(), self.dt, dict(self.state_dict())]
+
     # its system ---------------------------------------------------------------------------------------------
 
     @property
@@ -790,6 +794,11 @@ class FlowMap(nn.Module):
                     f"`t` of shape {tuple(t.shape)} does not broadcast against the batch shape "
                     f"{tuple(x.shape[:-1])} of `x`: add axes, as by t[:, None]."
                 ) from None
+            if t.ndim == x.ndim > 1 and t.shape == (*x.shape[:-1], 1) and len(t) > 1:
+                raise ValueError(
+                    f"`t` of shape {tuple(t.shape)} would take every state to the time of every other: pass t[..., 0], "
+                    "one time for each state; or x[None], if all times of all states are meant."
+                )
             return t
         try:
             value = float(t)

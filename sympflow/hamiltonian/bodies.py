@@ -12,8 +12,9 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import check_kept, plain, real_number
 from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
 
 MOST_AXES = 3
@@ -146,6 +147,7 @@ class PairsHamiltonian(LocalHamiltonian):
         self.columns = np.array([x for x, is_used in zip(columns.values(), used, strict=True) if is_used])
         self.columns = self.columns.reshape(-1, self.n_bodies)
         self.c, self.constants = c, tuple(self.params.values())
+        self._written = V
         V = V.subs(r, sp.sqrt(self.s))
         if self.cutoff is not None:
             end = sp.Symbol("end", positive=True)
@@ -153,6 +155,19 @@ class PairsHamiltonian(LocalHamiltonian):
             V = V - V.subs(self.s, end) - (self.s - end) * slope
             self.c, self.constants = (*self.c, end), (*self.constants, self.cutoff**2 + self.softening**2)
         self.V = V
+        self._check_continuous()
+
+    def _check_continuous(self) -> None:
+        """Refuse a V that jumps."""
+        columns = [*self.columns, *self.columns, *self.params.values()]
+        letters_of = (*self.first, *self.second, *self.c[: len(self.params)])
+        names = dict(zip(self.c, self.params, strict=False))
+        distance = [s for s in self._written.free_symbols if s.name == "r"]
+        check_continuous("potential", self._written, distance, dict(zip(letters_of, columns, strict=True)), names)
+
+    def identity_parts(self) -> Any:
+        made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
+        return [made_with, self.V, self.columns, list(self.params.items())]
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
@@ -161,6 +176,7 @@ class PairsHamiltonian(LocalHamiltonian):
         other.constants = (*other.params.values(), *self.constants[len(self.params) :])
         for name in ("terms", "bond_length"):
             vars(other).pop(name, None)
+        other._check_continuous()
         return other
 
     @property
@@ -521,9 +537,11 @@ def _checked_dim(dim: Any) -> int:
 
 
 def _checked_column(name: str, values: Any) -> np.ndarray:
+    check_kept(name, values)
+    values = to_numpy(values) if is_tensor(values) else values
     check_memory(float(np.size(values)), f"`{name}`")
     try:
-        array = np.array(plain(values), dtype=float)
+        array = np.array(values, dtype=float)
     except (TypeError, ValueError):
         raise TypeError(f"`{name}` must be an array (n,) of numbers; got {reprlib.repr(values)}.") from None
     if array.ndim != 1:
@@ -537,6 +555,7 @@ def _checked_column(name: str, values: Any) -> np.ndarray:
 def _checked_length(name: str, value: Any) -> float | None:
     if value is None:
         return None
+    check_kept(name, value)
     value = plain(value)
     if not real_number(value) or not 0 <= value < math.inf or (name == "cutoff" and value == 0):
         raise ValueError(f"`{name}` must be a positive, finite length; got {value!r}.")
@@ -546,8 +565,9 @@ def _checked_length(name: str, value: Any) -> float | None:
 def _checked_box(box: Any, dim: int) -> np.ndarray | None:
     if box is None:
         return None
+    check_kept("box", box)
     try:
-        lengths = np.array(plain(box), dtype=float)
+        lengths = np.array(to_numpy(box), dtype=float)
         lengths = np.broadcast_to(lengths, (dim,)).copy()
     except (TypeError, ValueError):
         raise ValueError(f"`box` must be a length, or {dim} of them, one along each axis; got {box!r}.") from None
@@ -563,6 +583,7 @@ def _checked_params(params: Any) -> dict[str, float]:
     for name, given in (params or {}).items():
         if not isinstance(name, str) or not name.isidentifier():
             raise ValueError(f"`params` must have names as keys; got {name!r}.")
+        check_kept(f"params[{name!r}]", given)
         value = plain(given)
         if not real_number(value) or not math.isfinite(value):
             raise ValueError(

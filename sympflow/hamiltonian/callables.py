@@ -55,6 +55,9 @@ class CallableHamiltonian(Definition):
         self._potential, self._gradient = arrays.potential, arrays.gradient
         self._hessian_vector = None if hessian_vector is None else arrays.hessian_vector
 
+    def identity_parts(self) -> Any:
+        return [self.ndof, self._potential, self._hamiltonian, self._gradient, self._hessian_vector]
+
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None:
             return False
@@ -184,6 +187,11 @@ def _check_callable(**functions: Any) -> None:
     for name, function in functions.items():
         if function is not None and not callable(function):
             raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
+        if name in ("potential", "hamiltonian") and functions["gradient"] is None and _is_numba(function):
+            raise TypeError(
+                f"`{name}` is a Numba function, through which torch cannot differentiate: pass the function that it is "
+                "made of, its `.py_func`, written with torch functions, or a `potential` with its `gradient`."
+            )
 
 
 def _is_numba(function: Any) -> bool:
@@ -317,6 +325,9 @@ class DrivenCallables(Definition):
         now = self._at(0.0)
         self.given, self.separable = now.given, now.separable
         self.has_hessian_vector, self.differentiates_itself = now.has_hessian_vector, now.differentiates_itself
+
+    def identity_parts(self) -> Any:
+        return [self.ndof, self._functions]
 
     def _at(self, t: Any) -> CallableHamiltonian:
         """The functions at one time."""

@@ -65,7 +65,7 @@ def stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times:
         while not done.all() and iteration < MOST_ITERATIONS:
             iteration += 1
             M, residual = _equations(system, y, K, h, times, A, scale)
-            change = solved(M, residual[..., None])[..., 0].reshape(K.shape)
+            change = solved(M, residual[..., None], variable_sizes(y, K, residual))[..., 0].reshape(K.shape)
             K = np.where(done[..., None, None], K, K - change)
             size = _relative_size(change, y, K, system.ndof)
             small = (size <= eps**0.7) | ((size <= eps**0.57) & (size >= before / 2))
@@ -88,7 +88,8 @@ def _tensor_stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any
         start, length = y.detach(), h.detach() if is_tensor(h) else h
         K, iterations = _solved_tensors(system, start, length, times, A, scale)
         M, _ = newton_matrix(system, start[..., None, :] + A @ K, length, times, A, scale)
-        inverse = torch.linalg.inv_ex(M)[0]
+        sizes = variable_sizes(start, K, 0 * M[..., 0])
+        inverse = sizes[..., :, None] * torch.linalg.inv_ex(_scaled(M, sizes))[0] / sizes[..., None, :]
     for _ in range(DIFFERENTIATED):
         K = K - (inverse @ _residual(system, y, K, h, times, A, scale)[..., None])[..., 0].reshape(K.shape)
     return K, iterations
@@ -108,7 +109,9 @@ def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, times: Any, A: An
     done = before < 0
     for iteration in range(1, MOST_ITERATIONS + 1):
         M, residual = _equations(system, y, K, h, times, A, scale)
-        change = torch.linalg.solve_ex(M, residual[..., None])[0][..., 0].reshape(K.shape)
+        sizes = variable_sizes(y, K, residual)
+        change = torch.linalg.solve_ex(_scaled(M, sizes), (residual / sizes)[..., None])[0][..., 0] * sizes
+        change = change.reshape(K.shape)
         K = torch.where(done[..., None, None], K, K - change)
         size = _relative_size(change, y, K, system.ndof)
         small = (size <= eps**0.7) | ((size <= eps**0.57) & (size >= before / 2))
@@ -194,16 +197,34 @@ def newton_matrix(
     return M + np.eye(s * n, dtype=M.dtype), D
 
 
-def solved(M: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """M⁻¹x, NaN where M is singular."""
+def variable_sizes(y: Array, K: Array, residual: Array) -> Array:
+    """The size of each unknown of a step, (..., s·2d), as a power of 2: of its own, or of its kind where that is 0."""
+    xp, n = library(y), y.shape[-1]
+    both = xp.maximum(xp.amax(abs(K), -2), xp.amax(abs(residual).reshape(K.shape), -2))
+    own = xp.maximum(abs(y), both).reshape(*y.shape[:-1], 2, n // 2)
+    kind = xp.amax(own, -1)[..., None] + 0 * own
+    size = xp.where(own > 0, own, xp.where(kind > 0, kind, 1 + 0 * kind))
+    most = int(0.4 * math.log2(float(xp.finfo(y.dtype).max)))  # so that their ratios are numbers
+    powers = xp.exp2(xp.clip(xp.round(xp.log2(size)), -most, most)).reshape(*y.shape[:-1], 1, n) + 0 * K
+    return powers.reshape(*y.shape[:-1], -1)
+
+
+def _scaled(M: Array, sizes: Array) -> Array:
+    """M for unknowns in units of their sizes."""
+    return M * (sizes[..., None, :] / sizes[..., :, None])
+
+
+def solved(M: np.ndarray, x: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """M⁻¹x by elimination in units of the sizes of the unknowns, NaN where M is singular."""
+    M, x = _scaled(M, sizes), x / sizes[..., None]
     try:
-        return np.linalg.solve(M, x)
+        return np.linalg.solve(M, x) * sizes[..., None]
     except np.linalg.LinAlgError:
         out = np.full(x.shape, np.nan, dtype=x.dtype)
         for i in np.ndindex(M.shape[:-2]):
             if np.isfinite(M[i]).all() and np.linalg.matrix_rank(M[i]) == len(M[i]):
                 out[i] = np.linalg.solve(M[i], x[i])
-        return out
+        return out * sizes[..., None]
 
 
 def _relative_size(change: Array, y: Array, K: Array, d: int) -> Array:

@@ -2,11 +2,12 @@
 
 On the states [q, x, p, y] of two copies, (q, p) and (x, y), the Hamiltonian
 
-    H(q, y) + H(x, p) + ω (|q − x|² + |p − y|²)/2
+    H(q, y) + H(x, p) + ω Σ_i (s_i² (q_i − x_i)² + (p_i − y_i)²/s_i²)/2
 
-has the solutions of H where the copies agree. Neither of its first two parts holds a coordinate with its own momentum,
-so each is solved exactly; the third binds the copies, and is an oscillator of frequency 2ω in their difference. Where H
-depends on t the time stands still in the first two, and moves with the third.
+has the solutions of H where the copies agree; s = √(mω), `natural_scale`, makes q and p comparable, and is 1 in Tao's
+paper. Neither of its first two parts holds a coordinate with its own momentum, so each is solved exactly; the third
+binds the copies, and is an oscillator of frequency 2ω in their difference. Where H depends on t the time stands still
+in the first two, and moves with the third.
 
 References
 ----------
@@ -24,26 +25,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate
+from sympflow.arrays import Array, concatenate, library, like, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative
 from sympflow.hamiltonian.parts import ExactParts, PartFunctions
-from sympflow.hamiltonian.times import probe_times
+from sympflow.hamiltonian.scales import fastest_rate, natural_scale
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
 
-STATES = 64
-"""States of a domain at which the default ω is taken, where there is no y0."""
-
 
 class Coupling(LinearPart):
-    """ω (|q − x|² + |p − y|²)/2, in the sums and differences of the copies over √2: these are its normal modes."""
+    """The coupling of the copies; its normal modes are the sums and differences of s q and s x over √2."""
 
     @cached_property
     def _spectrum(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        d, one = self.ndof // 2, np.eye(self.ndof // 2) / sqrt(2)
-        C = np.block([[one, one], [one, -one]])
-        return np.repeat([np.nan, (2 * self.inverse_mass[0, 0]) ** 2], d), C, C
+        d, K, B = self.ndof // 2, self.stiffness_matrix, self.inverse_mass
+        s = np.diag((np.diag(K) / np.diag(B))[:d] ** 0.25)
+        C, inverse = (np.block([[one, one], [one, -one]]) / sqrt(2) for one in (np.linalg.inv(s), s))
+        return np.repeat([np.nan, 4 * K[0, 0] * B[0, 0]], d), C, inverse
 
 
 class FunctionsOfCopies:
@@ -74,9 +73,9 @@ def two_copies(system: HamiltonianSystem, omega: float) -> ExactParts:
     import sympy as sp
 
     d, symbols = system.ndof, system.symbols
-    one = np.eye(d)
-    matrix = omega * np.block([[one, -one], [-one, one]])
-    coupling = Coupling(matrix, matrix, np.zeros(2 * d))
+    squares = np.diag(natural_scale(system) ** 2)
+    B, K = (omega * np.block([[one, -one], [-one, one]]) for one in (np.linalg.inv(squares), squares))
+    coupling = Coupling(B, K, np.zeros(2 * d))
     if symbols is None:
         return ExactParts(coupling, [FunctionsOfCopies(system, first) for first in (True, False)], 2 * d)
     q, p = (tuple(sp.symbols(f"{letter}1:{2 * d + 1}", real=True)) for letter in "qp")
@@ -96,16 +95,17 @@ def mean(x: Array, d: int) -> Array:
     return concatenate([(x[..., :d] + x[..., d : 2 * d]) / 2, (x[..., 2 * d : 3 * d] + x[..., 3 * d :]) / 2])
 
 
-def distance(x: Array, d: int) -> Array:
-    """The largest difference of the two copies in a coordinate or momentum: (..., 4d) to (...)."""
+def distance(x: Array, s: np.ndarray) -> Array:
+    """The largest |s(q − x)| or |(p − y)/s|, and the largest of these variables: (..., 4d) to (..., 2)."""
+    d = len(s)
+    x = x * like(np.concatenate([s, s, 1 / s, 1 / s]), x)
     apart = concatenate([x[..., :d] - x[..., d : 2 * d], x[..., 2 * d : 3 * d] - x[..., 3 * d :]])
-    return abs(apart).max(-1) if isinstance(apart, np.ndarray) else abs(apart).amax(-1)
+    xp = library(x)
+    return stack([xp.amax(abs(apart), -1), xp.amax(abs(x), -1)], axis=-1)
 
 
 def coupling_strength(system: HamiltonianSystem) -> float:
-    """The default ω: the largest |λ| of J∇²H at y0, or the median over the domain; 1 where that is 0 or not finite.
-
-    Where H depends on t, the largest of a few times within its period, or else the system's interval.
+    """The default ω: the fastest rate of the linearised motion, see `fastest_rate`.
 
     The copies stay together where the coupling is as strong as what drives them apart; far stronger, its frequency asks
     for shorter steps.
@@ -115,25 +115,10 @@ def coupling_strength(system: HamiltonianSystem) -> float:
     ValueError
         If there is neither a y0 nor a domain.
     """
-    if system.y0 is not None:
-        y = system.y0[None]
-    elif system.domain is not None:
-        y = system.domain.sample(STATES, 0)
-    else:
+    rate = fastest_rate(system)
+    if rate is None:
         raise ValueError(
             f"`system` {system.name!r} has neither a `y0` of its own nor a domain to take the coupling from: give "
             "`omega`, or the system one of these."
         )
-    t0, t1 = system.t_span
-    times = [t0] if system.autonomous else probe_times(t0, t1 if system.period is None else t0 + system.period)
-    return max(_median_rate(system, y, float(t)) for t in times) or 1.0
-
-
-def _median_rate(system: HamiltonianSystem, y: np.ndarray, t: float) -> float:
-    """The median over the states of the largest |λ| of J∇²H; 0 where none is finite."""
-    d = system.ndof
-    with np.errstate(all="ignore"):
-        S = np.asarray(system.hessian(y, t))
-    S = S[np.isfinite(S).all((-1, -2))]
-    rates = np.abs(np.linalg.eigvals(np.concatenate([S[:, d:], -S[:, :d]], axis=1))).max(-1)
-    return float(np.median(rates)) if len(S) else 0.0
+    return rate

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.arrays import Array
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.poles import Poles
 
 
 class Definition:
@@ -44,8 +47,12 @@ class Definition:
         `sympflow.hamiltonian.local`.
     instead : str
         The methods that are advised where H is not separable, in words.
+    impulses : tuple
+        Those of H, DiracDelta in t, if it has some: then there are `between_impulses` and `kicks`.
     leaps : bool
-        True if V is infinite in places that a step may leap over, such as of bodies that meet: then there is `leapt`.
+        True if bodies may meet, over which a step may leap: then there is `leapt`.
+    poles : Poles or None
+        The places that a step may leap over at which H as it is written is infinite or no number.
     """
 
     ndof: int
@@ -61,11 +68,26 @@ class Definition:
     has_third_derivative: bool = False
     loops: str = ""
     leaps: bool = False
+    impulses: tuple[Any, ...] = ()
+    poles: Poles | None = None
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
         """The times (n,) between two others at which H is known to jump; `step` as of `Hamiltonian.jump_times`."""
         return np.zeros(0)
+
+    @property
+    def between_impulses(self) -> Any:
+        """The definition without its impulses: itself, where it has none."""
+        return self
+
+    def kicks(self, low: float, high: float, step: float) -> list[Any]:
+        """The impulses within two times, in their order; `step` as of `jump_times`."""
+        return []
+
+    def has_period(self, period: float) -> bool | None:
+        """Return True if H, up to a function of t alone, has a period in t; None where its values are to be tried."""
+        return None
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""

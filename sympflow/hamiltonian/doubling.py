@@ -49,6 +49,7 @@ class DoubledSystem(HamiltonianSystem):
         `external_force`. Runge–Kutta methods and `solve_ivp` integrate it as it is; all others take the doubled one.
     """
 
+    _continuous = False
     physical: HamiltonianSystem
 
     def as_doubled(self) -> DoubledSystem:

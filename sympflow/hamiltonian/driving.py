@@ -24,8 +24,6 @@ JUMP = 1e-9
 
 MOST_TURNS = 1000
 """Periods of samples, and zeros of a function, beyond which jumps are not listed."""
-MOST_POINTS = 2**14
-"""Times at which a function that is not linear is looked at for its zeros."""
 
 # samples -------------------------------------------------------------------------------------------
 
@@ -256,39 +254,6 @@ def with_letters(f: list[sp.Expr]) -> tuple[list[sp.Expr], dict[sampled, sp.Symb
     found = sorted({a for each in f for a in each.atoms(sampled)}, key=str)
     letters = {a: sp.Symbol(f"sample_{i}", real=True) for i, a in enumerate(found)}
     return ([each.xreplace(letters) for each in f] if letters else f), letters
-
-
-# jumps ---------------------------------------------------------------------------------------------
-
-
-def switches(H: sp.Expr, time: sp.Symbol) -> tuple[sp.Expr, ...]:
-    """The functions of t alone at whose zeros H may jump: of steps, of signs, of the conditions of pieces."""
-    found = [a.args[0] for a in H.atoms(sp.Heaviside, sp.sign)]
-    for pieces in H.atoms(sp.Piecewise):
-        found += [r.lhs - r.rhs for _, condition in pieces.args for r in condition.atoms(sp.core.relational.Relational)]
-    return tuple(sorted({g for g in found if g.free_symbols == {time}}, key=str))
-
-
-def zeros(g: sp.Expr, time: sp.Symbol, low: float, high: float, step: float) -> np.ndarray:
-    """The zeros of g(t) between two times: of a linear g exactly, else where its sign changes within a time `step`.
-
-    Of one that is not linear, in the first `MOST_POINTS` of these times at most.
-    """
-    slope = sp.diff(g, time)
-    if slope.is_number:
-        found = np.array([float(-g.subs(time, 0) / slope)]) if slope != 0 else np.zeros(0)
-        return found[(found > low) & (found < high)]
-    f = sp.lambdify(time, g, "numpy")
-    t = low + step * np.arange(min(MOST_POINTS, math.ceil((high - low) / step)) + 1)
-    with np.errstate(all="ignore"):
-        up = f(t) > 0
-        changed = np.flatnonzero(up[1:] != up[:-1])[:MOST_TURNS]
-        left, right, up = t[changed], t[changed + 1], up[changed]
-        for _ in range(60):
-            middle = (left + right) / 2
-            same = (f(middle) > 0) == up
-            left, right = np.where(same, middle, left), np.where(same, right, middle)
-    return right[(right > low) & (right < high)]
 
 
 # drifts of T(p, t) ---------------------------------------------------------------------------------

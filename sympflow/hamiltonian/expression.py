@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import math
 import re
+import unicodedata
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -22,6 +23,8 @@ MAX_BITS = 4096  # of an exact fraction; a longer one is rounded
 MAX_TERMS = 50_000  # that the expression may have when it is multiplied out
 MAX_ARGUMENT = 1e4  # of a special function of numbers
 MAX_ARGUMENTS = 64
+MAX_COMPARED = 16
+"""Arguments of Max and Min, each of which is compared with all others in every derivative: 20 s for 16, 150 for 24."""
 TERMS_IN_A_ROW = 200
 
 # fmt: off
@@ -36,13 +39,14 @@ SPECIAL = (
 )
 # fmt: on
 FUNCTIONS: dict[str, Callable[..., Any]] = {
-    **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Max", "Min", "Rational")},
+    **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Max", "Min", "Rational", "DiracDelta")},
     "ln": sp.log,
     "abs": sp.Abs,
     "max": sp.Max,
     "min": sp.Min,
 }
 CONSTANTS = {"pi": sp.pi, "E": sp.E, "I": sp.I}
+EXTREMA = ("Max", "Min", "max", "min")
 RELATIONS = {ast.Lt: sp.Lt, ast.LtE: sp.Le, ast.Gt: sp.Gt, ast.GtE: sp.Ge}
 
 
@@ -76,19 +80,70 @@ def read(text: str, names: Collection[str] = ()) -> sp.Expr:
             "and one bond, HamiltonianSystem.lattice, by one pair, HamiltonianSystem.pairs, or by Numba functions, "
             "HamiltonianSystem(V, ndof=…, gradient=…)"
         )
-    _check_brackets(text)
+    _check_characters(text)
     try:
         tree = ast.parse(_grouped(" ".join(text.replace("^", "**").split())), mode="eval").body
     except (SyntaxError, ValueError) as error:
         raise Unreadable(getattr(error, "msg", None) or str(error)) from None
     except (RecursionError, MemoryError):
         raise Unreadable("it is nested too deeply") from None
-    value, _ = _Reader(frozenset(names)).visit(tree, 0)
+    value, _ = _Reader(_spelled(names)).visit(tree, 0)
     return value
 
 
-def _check_brackets(text: str) -> None:
+def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
+    """A SymPy expression as `read` gives one of a text: a number, its symbols real; of a matrix with one entry that.
+
+    Raises
+    ------
+    Unreadable
+        If it is no number, or one that is not real or not finite wherever it is evaluated, or too long to be.
+    """
+    shape = getattr(expression, "shape", ())
+    if shape == (1, 1):
+        expression = expression[0, 0]
+    elif shape:
+        raise Unreadable(f"it is a matrix of shape {shape}, not a number: take one entry")
+    if not isinstance(expression, sp.Expr):
+        raise Unreadable(f"it is a {type(expression).__name__}, not a number")
+    spelled = _spelled(names)
+    f = expression.xreplace(
+        {s: sp.Symbol(spelled.get(_normal(s.name), s.name), real=True) for s in expression.free_symbols}
+    )
+    for extremum in f.atoms(sp.Max, sp.Min):
+        _check_compared(type(extremum).__name__, len(extremum.args))
+    return f
+
+
+def complex_part(f: sp.Expr) -> sp.Expr | None:
+    """A part of an expression that is no real number, whatever the values of its symbols; None without."""
+    if f.has(sp.I):
+        return sp.I
+    powers = (a for a in f.atoms(sp.Pow) if not a.exp.is_number and a.base.is_negative)
+    return min(powers, key=sp.default_sort_key, default=None)
+
+
+def _normal(name: str) -> str:
+    """The name as Python reads it in code: of the micro sign, for instance, the Greek letter."""
+    return unicodedata.normalize("NFKC", name)
+
+
+def _spelled(names: Collection[str]) -> dict[str, str]:
+    return {_normal(name): name for name in names}
+
+
+def _check_compared(name: str, count: int) -> None:
+    if count > MAX_COMPARED:
+        raise Unreadable(
+            f"its {name} has {count} arguments, more than {MAX_COMPARED}: each is compared with every other in all "
+            "derivatives, which takes minutes. Give H by functions, HamiltonianSystem(V, ndof=…)"
+        )
+
+
+def _check_characters(text: str) -> None:
     """Before Python's parser sees the text, which warns of calls of numbers and gives up on deep nesting."""
+    if "#" in text:
+        raise Unreadable("it holds a #, which would hide all that follows: leave comments out")
     depth = 0
     for character in text:
         depth += (character in "([{") - (character in ")]}")
@@ -96,7 +151,7 @@ def _check_brackets(text: str) -> None:
             raise Unreadable(f"it is nested more than {MAX_NESTING} deep")
 
 
-_TOKEN = re.compile(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?|[^\W\d]\w*|\*\*|.)")
+_TOKEN = re.compile(r"\s*(\.?\d[\w.]*(?:(?<=[eE])[+-]\d+)?|[^\W\d]\w*|\*\*|//|<<|>>|[<>=!]=|.)")
 
 
 def _grouped(text: str) -> str:
@@ -106,7 +161,7 @@ def _grouped(text: str) -> str:
     written: list[str] = []
     counts, opened, last = [0], [False], "("
     for token in _TOKEN.findall(text):
-        ends_sum = token in ")]},<>="
+        ends_sum = token in (*")]},<>", "<=", ">=", "==", "!=")
         if ends_sum and opened[-1]:
             written.append(")")
             opened[-1] = False
@@ -131,7 +186,7 @@ def _grouped(text: str) -> str:
 class _Reader:
     """Each method returns a value and the number of terms that it has when multiplied out."""
 
-    def __init__(self, names: frozenset[str]) -> None:
+    def __init__(self, names: dict[str, str]) -> None:
         self.names = names
 
     def visit(self, node: ast.AST, depth: int) -> tuple[Any, int]:
@@ -161,7 +216,7 @@ class _Reader:
     def _name(self, name: str) -> sp.Expr:
         if name in CONSTANTS and name not in self.names:
             return CONSTANTS[name]
-        return sp.Symbol(name, real=True)
+        return sp.Symbol(self.names.get(name, name), real=True)
 
     def _chain(self, node: ast.AST, operators: tuple[type, type]) -> list[tuple[ast.AST, bool]]:
         """The members of a + b − c … or a * b / c …, and whether each is the second kind; without recursion."""
@@ -219,6 +274,8 @@ class _Reader:
             return _checked(self._piecewise(node, depth)), 1
         if name not in FUNCTIONS:
             raise Unreadable(f"the function {name} is unknown: {', '.join(sorted(FUNCTIONS))} are known")
+        if name in EXTREMA:
+            _check_compared(name, len(node.args))
         values, counts = zip(*(self.visit(a, depth) for a in node.args), strict=True) if node.args else ((), ())
         numbers = all(v.is_number for v in values)
         if name == "Rational" and not (values and all(v.is_Rational for v in values) and not values[-1].is_zero):

@@ -11,7 +11,8 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arrays import Array, assemble, is_tensor
-from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
+from sympflow.hamiltonian.jumps import refuse_deltas
 from sympflow.hamiltonian.symbolic import checked_params, generate, printable
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ class SymbolicForce:
             if not any(sp.Symbol(name, real=True) in f.free_symbols for f in read_ones):
                 raise ValueError(f"`params` has {name!r}, which the force does not use: remove it.")
         self.expressions = [self._valued(f, values) for f in read_ones]
+        for f in self.expressions:
+            refuse_deltas("force", f)
 
     def _valued(self, f: sp.Expr, values: Mapping[str, float]) -> sp.Expr:
         """The expression in the system's coordinates, its parameters replaced by their values."""
@@ -137,19 +140,20 @@ def _number(x: float) -> sp.Expr:
 
 def _read(f: Any, names: Mapping[str, float]) -> sp.Expr:
     """One component in real symbols."""
-    if isinstance(f, str):
-        try:
-            return read(f, {*names, *(w for w in re.findall(r"[A-Za-z_]\w*", f) if _COORDINATE.fullmatch(w))})
-        except Unreadable as error:
-            raise ValueError(
-                f"`force` cannot be parsed: {f[:200]!r} ({error}). Write it with these, or pass a SymPy expression."
-            ) from None
     try:
-        value = sp.sympify(f, strict=True)
+        if isinstance(f, str):
+            coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", f) if _COORDINATE.fullmatch(w))
+            value = of_sympy(read(f, {*names, *coordinates}), names)
+        else:
+            value = of_sympy(sp.sympify(f, strict=True), names)
+    except Unreadable as error:
+        raise ValueError(
+            f"`force` cannot be parsed: {str(f)[:200]!r} ({error}). Write it with these, or pass a SymPy expression."
+        ) from None
     except sp.SympifyError:
-        value = None
-    if not isinstance(value, sp.Expr) or value.has(sp.I):
+        value = sp.I
+    if complex_part(value) is not None:
         raise TypeError(
             f"`force` must be real expressions, texts or SymPy's, or a function F(q, p); got {type(f).__name__}."
         )
-    return value.xreplace({s: sp.Symbol(s.name, real=True) for s in value.free_symbols})
+    return value

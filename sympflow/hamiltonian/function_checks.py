@@ -51,12 +51,15 @@ def probe_states(given: np.ndarray | None, domain: Domain | None, width: int) ->
     return np.concatenate(found)
 
 
-def reach(states: np.ndarray) -> np.ndarray:
-    """The least and the largest components (2, width) that a run may have without another test, by states tested."""
+def reach(states: np.ndarray, parts: int) -> np.ndarray:
+    """The least and the largest components (2, width) that a run may have without another test, by states tested.
+
+    They are `parts` halves of sizes of their own: q, or q and p.
+    """
     low, high = states.min(0), states.max(0)
     with np.errstate(over="ignore"):
-        lengths = high - low
-        margin = FARTHER * np.maximum(lengths, 0.1 * lengths.max())
+        lengths = (high - low).reshape(parts, -1)
+        margin = FARTHER * np.maximum(lengths, 0.1 * lengths.max(-1, keepdims=True)).ravel()
         return np.stack([low - margin, high + margin])
 
 

@@ -15,6 +15,7 @@ from sympflow.hamiltonian.times import checked_time
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.local import LocalHamiltonian
+    from sympflow.hamiltonian.poles import Poles
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
@@ -84,6 +85,7 @@ class Hamiltonian:
     friction: Friction | None = None
     autonomous: bool = True
     period: float | None = None
+    energy_scale: float | None = None
     external_force: ExternalForce | None = None
     """F of the physical limit of a doubled system, p' = −∂H/∂q + F; it is part of `vector_field`."""
 
@@ -218,6 +220,17 @@ class Hamiltonian:
             f"{tuple(y.shape)}."
         )
 
+    def identity_parts(self) -> Any:
+        """Return all that H and the equations of motion are made of, by which a store knows the system again."""
+        return [
+            self._definition,
+            self.inverse_mass,
+            self.stiffness_matrix,
+            self.damping,
+            self.external_force,
+            self.energy_scale,
+        ]
+
     @property
     def damping(self) -> np.ndarray | None:
         """Γ of the friction −Γp, to be read only: (), one rate γ for all momenta, (d,) or (d, d); None without."""
@@ -267,12 +280,37 @@ class Hamiltonian:
         return self._definition.shortest_piece
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
-        """The times (n,) between two others at which H jumps: of samples, of `Heaviside`, `sign` and pieces of t alone.
+        """The times (n,) between two others at which H jumps: of samples, and of functions of t that jump.
 
-        Of a function of t that is not linear, as in sign(cos(t)), zeros nearer to each other than `step` are not told
-        apart. In a long interval with many jumps the first ones alone are given.
+        These are `Heaviside`, `sign`, `floor`, `acot`, `atan2`, the absolute value in a quotient, the conditions of
+        pieces, and their like. Zeros of their arguments that are neither linear nor periodic are not told apart where
+        they are nearer to each other than `step`. In a long interval with many jumps the first ones alone are given.
         """
         return self._definition.jump_times(low, high, step)
+
+    @cached_property
+    def between_impulses(self) -> Self:
+        """The system without its impulses, which it follows between them: itself, where H has none."""
+        form = self._definition.between_impulses
+        if form is self._definition:
+            return self
+        between = copy.copy(self)
+        for name in ("fingerprint", "linear_part", "expression"):
+            vars(between).pop(name, None)
+        Hamiltonian.__init__(between, self.name, form, self.inverse_mass, self.quadratic_kinetic)
+        between.symbols, between.autonomous = form, not form.timed
+        return between
+
+    def check_impulses(self, what: str, remedy: str) -> None:
+        """Refuse a system with impulses, DiracDelta in t, where they would be left out.
+
+        Raises
+        ------
+        ValueError
+            With `what` is asked, as a clause that follows the reason, and the remedy.
+        """
+        if self.between_impulses is not self:
+            raise ValueError(f"`system` {self.name!r} has impulses, DiracDelta in H, {what}: {remedy}.")
 
     def check_times(self, t0: float, t1: float) -> None:
         """Refuse an interval that leaves the times of sampled parameters.
@@ -289,6 +327,12 @@ class Hamiltonian:
         """The time that functions of a driven system take after the states x (..., k), checked; () of another."""
         if self.autonomous:
             return ()
+        if self._definition.impulses:
+            self.check_impulses(
+                "so that H and its derivatives are no functions",
+                "solve it by sympflow.solve; or use system.between_impulses, and the kicks of p between by "
+                "system.kicks(t0, t1)",
+            )
         if t is None:
             raise TypeError(
                 f"`t` is missing, the time: `system` {self.name!r} is driven, H depends on t. Give it after the state, "
@@ -464,8 +508,13 @@ class Hamiltonian:
         return self._definition.instead
 
     @property
+    def poles(self) -> Poles | None:
+        """The places that a step may leap over at which H as it is written is infinite or no number, if it has some."""
+        return self._definition.poles
+
+    @property
     def leaps(self) -> bool:
-        """True if V is infinite in places that a step may leap over, such as of bodies that meet."""
+        """True if bodies may meet, over which a step may leap."""
         return self._definition.leaps
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int) -> np.ndarray:

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import check_kept, plain, real_number
 from sympflow.arrays import Array, concatenate, is_tensor, library
+from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
-from sympflow.hamiltonian.poles import Poles
+from sympflow.hamiltonian.poles import LatticePoles, Poles
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.normal_modes import SpectralPart
@@ -77,8 +78,12 @@ class LatticeHamiltonian(LocalHamiltonian):
         self.params = checked_params(params, self.shape)
         self._set_letters()
         self._read(onsite, bond, kinetic)
+        self._check_continuous()
         self._check_sizes()
         self._set_mass()
+
+    def identity_parts(self) -> Any:
+        return [self.shape, self.boundary, self.fields, self.U, self.T, self.bonds, list(self.params.items())]
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
@@ -86,6 +91,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         for name in ("_functions", "terms"):
             vars(other).pop(name, None)
         other.params = checked_params({**self.params, **values}, self.shape)
+        other._check_continuous()
         other._set_mass()
         return other
 
@@ -190,28 +196,15 @@ class LatticeHamiltonian(LocalHamiltonian):
                 kept.append(x)
         return kept
 
-    @cached_property
-    def leaps(self) -> bool:  # type: ignore[override]
-        return Poles(self).there_are
-
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
-        return Poles(self).passed(starts[:, : self.ndof], ends[:, : self.ndof])
-
-    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
-        poles, q0 = Poles(self), start[: self.ndof]
-        if beyond := poles.where(q0, q0):
-            return f"V of {beyond} is no number: take another `y0`"
-        passed = poles.where(q0, y[: self.ndof])
-        return (
-            f"{passed} passed a place where V is infinite between two steps, which saw nothing of it: take shorter ones"
-        )
+    @property
+    def poles(self) -> Poles | None:  # type: ignore[override]
+        return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:
-        if not self.leaps:
+        if self.poles is None:
             return ""
-        return (
-            f"{Poles(self).nearest(q)} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
-        )
+        nearest = LatticePoles(self).nearest(q)
+        return f"{nearest} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
 
     def written_out(self) -> sp.Expr:
         """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""
@@ -291,6 +284,14 @@ class LatticeHamiltonian(LocalHamiltonian):
         for name, s in values.items():
             if s not in used:
                 raise ValueError(f"`params` has {name!r}, which no expression uses: remove it.")
+
+    def _check_continuous(self) -> None:
+        """Refuse U, V and T that jump."""
+        values = dict(zip(self.c, self.params.values(), strict=True))
+        own = [(s, name) for kind, row in self.names.items() for s, name in zip(getattr(self, kind), row, strict=True)]
+        names = dict([*own, *zip(self.c, self.params, strict=True)])
+        for argument, f in (("onsite", self.U), ("kinetic", self.T), *(("bond", V) for V in self.bonds.values())):
+            check_continuous(argument, f, [s for s, _ in own], values, names)
 
     def _check_sizes(self, argument: str = "shape") -> None:
         reach = max(self.bonds, default=0)
@@ -688,6 +689,7 @@ def checked_params(params: Any, shape: tuple[int, ...]) -> dict[str, float | np.
     for name, given in (params or {}).items():
         if not isinstance(name, str) or not name.isidentifier():
             raise ValueError(f"`params` must have names as keys; got {name!r}.")
+        check_kept(f"params[{name!r}]", given)
         value = plain(given)
         if real_number(value):
             if not math.isfinite(value):

@@ -286,13 +286,20 @@ def read_off(
     quadratic, rest = quadratic_terms(H, (*q, *p))
     B, K = sp.hessian(quadratic, p), sp.hessian(quadratic, q)
     # a coordinate takes part if its momentum enters H by the quadratic terms alone
-    active = [i for i in range(d) if B[i, i] != 0 and not rest.has(p[i])]
+    active = [i for i in range(d) if any(b != 0 for b in B.row(i)) and not rest.has(p[i])]
     idle = [i for i in range(d) if i not in active]
     B_array, K_array = (np.array(A.tolist(), dtype=float) for A in (B, K))
     for A in (B_array, K_array):
         A[idle, :] = A[:, idle] = 0.0
     if not K_array.any():
         return None
+    unit = np.sqrt(np.abs(np.diag(B_array)))[active]
+    scaled = B_array[np.ix_(active, active)] / np.outer(unit, unit) if unit.all() else np.zeros((1, 1))
+    if not np.linalg.eigvalsh(scaled)[0] > ZERO:
+        raise ValueError(
+            "`system` has a kinetic energy ½ pᵀM⁻¹p whose M⁻¹ is not positive definite, so its quadratic part has no "
+            "normal modes: use a scheme on the splitting 'kinetic', such as 'kahan_li8', or an implicit method."
+        )
     at_zero = dict.fromkeys((*q, *p), sp.S.Zero)
     slope = np.array([float(sp.diff(quadratic, s).xreplace(at_zero)) for s in q])
     center = np.where(K_array.any(0), -np.linalg.pinv(K_array) @ slope, 0.0)
@@ -375,7 +382,10 @@ def turning(system: Scene, part: LinearPart | None) -> str | None:
     hessians = hessians[np.isfinite(hessians).all((-1, -2))]
     if len(hessians) < 2:
         return None
-    L = np.linalg.cholesky(inverse_mass(system))
+    try:
+        L = np.linalg.cholesky(inverse_mass(system))
+    except np.linalg.LinAlgError:  # of coordinates without a kinetic energy
+        return None
     curvature, directions = np.linalg.eigh(L.T @ hessians @ L)
     order = np.argsort(-np.abs(curvature), axis=-1)
     typical = np.median(np.abs(np.take_along_axis(curvature, order, -1)), axis=0)

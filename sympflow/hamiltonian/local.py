@@ -17,7 +17,7 @@ import sympy as sp
 
 from sympflow.arrays import Array, is_tensor, library
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
 from sympflow.hamiltonian.symbolic import generate, printable
 
 __all__ = ["LocalHamiltonian", "check_memory", "letters", "parsed"]
@@ -250,19 +250,17 @@ def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Sy
     TypeError, ValueError
         If it cannot be read, is not real, or has other names.
     """
-    if isinstance(expression, str):
-        try:
-            f = read(expression, set(symbols))
-        except Unreadable as error:
-            raise ValueError(
-                f"`{argument}` cannot be parsed: {expression[:200]!r} ({error}). Write it as {example!r}."
-            ) from None
-    elif isinstance(expression, sp.Expr | int | float) and not isinstance(expression, bool):
-        f = sp.sympify(expression)
-    else:
+    if isinstance(expression, bool) or not isinstance(expression, str | sp.Basic | sp.MatrixBase | int | float):
         raise TypeError(
             f"`{argument}` must be a string or a SymPy expression such as {example!r}; got {type(expression).__name__}."
         )
+    try:
+        f = read(expression, symbols) if isinstance(expression, str) else sp.sympify(expression)
+        f = of_sympy(f, symbols)
+    except Unreadable as error:
+        raise ValueError(
+            f"`{argument}` cannot be parsed: {str(expression)[:200]!r} ({error}). Write it as {example!r}."
+        ) from None
     unknown = sorted(s.name for s in f.free_symbols if s.name not in symbols)
     if "t" in unknown:
         raise ValueError(
@@ -274,7 +272,7 @@ def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Sy
             f"`{argument}` holds {', '.join(unknown)}, and its names are {', '.join(symbols)}: give other ones a value "
             "in `params`."
         )
-    if not isinstance(f, sp.Expr) or f.has(sp.I, sp.zoo, sp.nan, sp.oo):
+    if f.has(sp.zoo, sp.nan, sp.oo) or complex_part(f) is not None:
         raise ValueError(f"`{argument}` must be a real, finite expression such as {example!r}; got {f}.")
     return f.xreplace({s: symbols[s.name] for s in f.free_symbols})
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arrays import differentiable
+from sympflow.arguments import check_kept
 
 
 def inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
@@ -75,11 +78,7 @@ def damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
 
 def _real(name: str, values: ArrayLike) -> np.ndarray:
     """The values as an array of floats."""
-    if differentiable(values):
-        raise TypeError(
-            f"`{name}` is a tensor that torch differentiates or transforms, but it is kept as numbers: write H with "
-            "it, as HamiltonianSystem(hamiltonian=...), or pass `.detach()`."
-        )
+    check_kept(name, values)
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "biufO":
@@ -96,6 +95,14 @@ def _check_symmetric(name: str, matrix: np.ndarray) -> None:
             i, j = np.argwhere(wrong)[0].tolist()
             mirror = f", [{j}, {i}] is {matrix[j, i]:g}" if np.isfinite(matrix[i, j]) else ""
             raise ValueError(f"`{name}` must be finite, symmetric; its entry [{i}, {j}] is {matrix[i, j]:g}{mirror}.")
+
+
+def from_entries(shape: tuple[int, int], entries: Mapping[tuple[int, int], Any]) -> np.ndarray:
+    """The matrix with these entries, all others 0."""
+    matrix = np.zeros(shape)
+    for place, entry in entries.items():
+        matrix[place] = float(entry)
+    return matrix
 
 
 def simplest(inverse: np.ndarray) -> np.ndarray | None:

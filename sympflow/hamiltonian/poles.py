@@ -1,94 +1,180 @@
-"""Where the potential of a lattice is infinite, over which a step may leap without a trace."""
+"""Places where H is infinite or leaves its domain, over which a step may leap without a trace."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
-from typing import Any, Protocol
+from itertools import pairwise
+from typing import Any, NamedTuple, Protocol
 
+import mpmath
 import numpy as np
 import sympy as sp
 
-__all__ = ["Poles"]
+__all__ = ["LatticePoles", "Place", "Poles", "SymbolicPoles", "places"]
+
+FACTORED = 8  # letters of a polynomial, at most, that is split into factors
+DIGITS, HALVINGS = 50, 100  # of the arithmetic in which H is judged beside such a place, and of the way to it
+BESIDE = 1e-3, 1e-6, 1e-9
+"""Distances from a place, in parts of a step, at which H is compared: of a finite one the differences decrease."""
+DECREASES = 0.7  # by less, of the second difference to the first, where H is infinite: by 1 of a logarithm
+
+
+class Place(NamedTuple):
+    """An expression that vanishes where a function may be infinite, and one that is another whole number beyond."""
+
+    g: sp.Expr
+    cell: sp.Expr
+
+
+class Poles(Protocol):
+    """The places at which H of a system may be infinite, in columns."""
+
+    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Numbers (..., m) that differ on the two sides of a place, H and T: states (..., 2d), times (...).
+
+        Where these cost more than such a number, H is 0, or NaN where it is no number, and T None. Where H has no
+        part T there is one of its size.
+        """
+
+    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
+        """The values that vanish at the places: (..., m)."""
+
+    def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
+        """Return True if H is infinite, or no number, on the way between states y (2, 2d) in two cells."""
+
+    def name(self, column: int) -> str:
+        """The place, in words that go before "passed"."""
+
+
+class SymbolicPoles:
+    """The places of H, as it is written.
+
+    Parameters
+    ----------
+    symbols : SymbolicHamiltonian
+    """
+
+    def __init__(self, symbols: Any) -> None:
+        self._symbols = symbols
+        letters = (*symbols.q, *symbols.p, *((symbols.time,) if symbols.timed else ()))
+        parts = [symbols.V, symbols.T] if symbols.separable else [symbols.H]
+        self._letters, self._places = letters, [(place, f) for f in parts for place in places(f, letters)]
+        self._m = len(self._places)
+        if not self._places:
+            return
+        T = symbols.T if symbols.separable else sp.Add(*[sp.Abs(s * sp.diff(symbols.H, s)) for s in letters])
+        self._look = symbols.evaluated("cells", [*(place.cell for place, _ in self._places), symbols.H, T])
+        self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
+
+    def __bool__(self) -> bool:
+        return bool(self._places)
+
+    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        values = self._look(y, *self._time(y, t))
+        return values[..., : self._m], values[..., -2], values[..., -1]
+
+    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
+        return self._sizes(y, *self._time(y, t))
+
+    def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
+        place, f = self._places[column]
+        ends = np.column_stack([y, t]) if self._symbols.timed else y
+        return infinite_between(f, place.cell, self._letters, *ends.tolist())
+
+    def name(self, column: int) -> str:
+        return f"{_written(self._places[column][0].g)} = 0"
+
+    def _time(self, y: np.ndarray, t: Any) -> tuple[Any, ...]:
+        return (np.broadcast_to(t, y.shape[:-1]),) if self._symbols.timed else ()
 
 
 class _Lattice(Protocol):
     """The attributes of a `LatticeHamiltonian` that poles need."""
 
+    ndof: int
     shape: tuple[int, ...]
     boundary: tuple[str, ...]
     U: sp.Expr
     x: tuple[sp.Symbol, ...]
     r: tuple[sp.Symbol, ...]
+    c: tuple[sp.Symbol, ...]
     bonds: dict[int, sp.Expr]
+    params: Any
+
+    @property
+    def names(self) -> dict[str, tuple[str, ...]]: ...
 
     def of_terms(self, key: str, expressions: Any, q: Any) -> list[tuple[int | None, int, list[Any]]]: ...
 
 
-class Poles:
-    """The places at which a term of a lattice divides by 0, or takes the logarithm of 0.
-
-    No solution passes them. So what a term divides by has the same sign all along, at each site and bond, and what it
-    takes a logarithm of is positive.
+class LatticePoles:
+    """The places of the terms of a lattice, at each site and bond.
 
     Parameters
     ----------
     lattice : LatticeHamiltonian
-
-    Attributes
-    ----------
-    there_are : bool
     """
 
     def __init__(self, lattice: _Lattice) -> None:
         self._lattice = lattice
+
+    def __bool__(self) -> bool:
+        lattice = self._lattice
         terms = [(lattice.U, lattice.x), *((V, lattice.r) for V in lattice.bonds.values())]
-        self.there_are = any(_vanishing(f, x) for f, x in terms)
+        return any(places(f, x) for f, x in terms)
 
-    def passed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Return True for positions (n, d) on the other side of a pole than those of the start (n, d): (n,)."""
-        found = np.zeros(len(ends), dtype=bool)
-        for _, _, beyond in self._beyond(starts, ends):
-            found |= beyond.reshape(len(ends), -1).any(-1)
-        return found
+    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, None]:
+        cells = self._columns("cells", _cells, y)
+        ending = self._columns("endings", _endings, y)
+        return cells, np.where(np.isnan(ending).any(-1), np.nan, 0.0), None
 
-    def where(self, start: np.ndarray, q: np.ndarray) -> str:
-        """The first site or bond of positions (d,) that is on the other side, and how many more, in words."""
-        found = [(axis, k, beyond) for axis, k, beyond in self._beyond(start, q) if beyond.any()]
-        if not found:
-            return ""
-        axis, k, beyond = found[0]
-        more = sum(int(each.sum()) for _, _, each in found) - 1
-        return self._place(axis, k, int(np.argmax(beyond)), beyond.shape) + (f" and {more} more" if more else "")
+    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
+        raise NotImplementedError("LatticePoles has no sizes: its H is not looked at.")
+
+    def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
+        f, x, place, axis, k, i, _ = self._at(column, y)
+        letters = (*x, *self._lattice.c)
+        rows = self._lattice.of_terms("letters", lambda f, x: [*x, *self._lattice.c], self._positions(y))
+        (values,) = (found for found_axis, found_k, found in rows if (found_axis, found_k) == (axis, k))
+        ends = [[float(np.reshape(value, (2, -1))[end, i]) for value in values] for end in (0, 1)]
+        return infinite_between(f, place.cell, letters, *ends)
+
+    def name(self, column: int) -> str:
+        lattice = self._lattice
+        _, x, place, axis, k, i, shape = self._at(column, np.zeros(2 * lattice.ndof))
+        names = [*lattice.names["x" if axis is None else "r"], *lattice.params]
+        written = place.g.xreplace({s: sp.Symbol(name) for s, name in zip((*x, *lattice.c), names, strict=True)})
+        return f"{_written(written)} = 0 at {self._place(axis, k, i, shape)}"
 
     def nearest(self, q: np.ndarray) -> str:
-        """The site or bond of positions (d,) that is nearest to a pole, in words."""
-        places = []
-        for axis, k, values in self._lattice.of_terms("poles", _vanishing, q):
+        """The site or bond of positions (d,) that is nearest to a place, in words."""
+        found = []
+        for axis, k, values in self._lattice.of_terms("poles", lambda f, x: [g.g for g in places(f, x)], q):
             for value in values:
                 i = int(np.argmin(np.abs(value)))
-                places.append((abs(float(value.flat[i])), self._place(axis, k, i, value.shape)))
-        return min(places)[1]
+                found.append((abs(float(value.flat[i])), self._place(axis, k, i, value.shape)))
+        return min(found)[1]
 
-    def _beyond(self, starts: np.ndarray, ends: np.ndarray) -> list[tuple[int | None, int, np.ndarray]]:
-        lattice, found = self._lattice, []
-        with np.errstate(all="ignore"):
-            before, after = (lattice.of_terms("poles", _vanishing, q) for q in (starts, ends))
-            for (axis, k, olds), (_, _, news), of in zip(before, after, self._signed(), strict=True):
-                for old, new, positive in zip(olds, news, of, strict=True):
-                    found.append((axis, k, ~(new > 0) if positive else np.sign(new) != np.sign(old)))
-        return found
+    def _positions(self, y: np.ndarray) -> np.ndarray:
+        return y[..., : self._lattice.ndof]
 
-    def _signed(self) -> list[list[bool]]:
-        """True for each expression that has to be positive, in the order of `LatticeHamiltonian.of_terms`."""
+    def _columns(self, key: str, expressions: Any, y: np.ndarray) -> np.ndarray:
+        rows = self._lattice.of_terms(key, expressions, self._positions(y))
+        columns = [value.reshape(*y.shape[:-1], -1) for _, _, values in rows for value in values]
+        return np.concatenate([np.zeros((*y.shape[:-1], 0)), *columns], axis=-1)
 
-        def signed(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[bool]:
-            arguments = {log.args[0] for log in f.atoms(sp.log)}
-            return [g in arguments for g in _vanishing(f, x)]
-
-        lattice = self._lattice
-        onsite = [signed(lattice.U, lattice.x)] if lattice.U != 0 else []
-        return onsite + [signed(V, lattice.r) for _ in lattice.shape for V in lattice.bonds.values()]
+    def _at(self, column: int, y: np.ndarray) -> tuple[Any, ...]:
+        """The term, its letters, its place, the axis and the distance, which site or bond, the shape of these."""
+        lattice, lead = self._lattice, y.ndim - 1
+        for axis, k, values in lattice.of_terms("cells", _cells, self._positions(y)):
+            f, x = (lattice.U, lattice.x) if axis is None else (lattice.bonds[k], lattice.r)
+            for place, value in zip(places(f, x), values, strict=True):
+                shape = value.shape[lead:]
+                if column < (size := int(np.prod(shape))):
+                    return f, x, place, axis, k, column, shape
+                column -= size
+        raise IndexError(column)
 
     def _place(self, axis: int | None, k: int, i: int, shape: tuple[int, ...]) -> str:
         first = [int(n) for n in np.unravel_index(i, shape)]
@@ -105,28 +191,180 @@ class Poles:
         return f"the bond of {ends[0]} and {ends[1]}"
 
 
+def _cells(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+    return [place.cell for place in places(f, x)]
+
+
+def _endings(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
+    """The parts of f that are no number beyond some place."""
+    return [*f.atoms(*_ENDING), *(power for power in f.atoms(sp.Pow) if power.exp.is_integer is False)]
+
+
+def _written(g: sp.Expr) -> str:
+    return str(g.xreplace({a: sp.Float(a, 6) for a in g.atoms(sp.Float)}))
+
+
 def _name(site: Sequence[int]) -> str:
     return str(site[0]) if len(site) == 1 else f"({', '.join(map(str, site))})"
 
 
+# in an expression -----------------------------------------------------------------------------------------------------
+
+
+_SINGULAR: dict[Any, Callable[..., Sequence[sp.Expr]]] = {
+    sp.log: lambda a, *_: [a],
+    sp.tan: lambda a: [sp.cos(a)],
+    sp.sec: lambda a: [sp.cos(a)],
+    sp.cot: lambda a: [sp.sin(a)],
+    sp.csc: lambda a: [sp.sin(a)],
+    sp.coth: lambda a: [a],
+    sp.csch: lambda a: [a],
+    sp.asin: lambda a: [1 - a, 1 + a],
+    sp.acos: lambda a: [1 - a, 1 + a],
+    sp.acosh: lambda a: [a - 1],
+    sp.atanh: lambda a: [1 - a, 1 + a],
+    sp.gamma: lambda a: [1 / sp.gamma(a)],
+    sp.loggamma: lambda a: [1 / sp.gamma(a)],
+    sp.LambertW: lambda a, *_: [a + sp.exp(-1).evalf(17)],
+    sp.elliptic_k: lambda m: [1 - m],
+    sp.elliptic_e: lambda *a: [1 - a[-1]],
+    sp.bessely: lambda n, a: [a],
+    sp.besselk: lambda n, a: [a],
+}
+"""Expressions that vanish where a function is infinite, or ends."""
+
+_ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, sp.elliptic_k, sp.elliptic_e
+_ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
+
+
 @lru_cache(maxsize=64)
-def _vanishing(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
-    """Denominators and arguments of logarithms in f that depend on x and may be 0 for all that SymPy knows.
+def places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
+    """The places where f may be infinite or no number, for all that can be told from it, by letters of x.
 
     An exponent by a parameter counts as negative where it is written so.
     """
-    found = {power.base for power in f.atoms(sp.Pow) if power.exp.could_extract_minus_sign()}
-    found |= {sp.cos(g.args[0]) for g in f.atoms(sp.tan, sp.sec)} | {sp.sin(g.args[0]) for g in f.atoms(sp.cot, sp.csc)}
-    found = {g.args[0] if isinstance(g, sp.Abs) else g for g in found}
-    logarithms = {log.args[0] for log in f.atoms(sp.log)}
-    may_vanish = (g for g in found | logarithms if g.free_symbols & set(x) and g.is_positive is not True)
-    return sorted((g for g in may_vanish if g in logarithms or not _removable(f, g)), key=str)
+    found = [g for function in f.atoms(*_SINGULAR) for g in _SINGULAR[function.func](*function.args)]
+    for power in f.atoms(sp.Pow):
+        if power.exp.could_extract_minus_sign() or (
+            power.exp.is_integer is False and power.base.is_nonnegative is not True
+        ):
+            found.append(power.base)
+    by_cell = {place.cell: place for g in found for place in _split(g, x)}
+    kept = [place for place in by_cell.values() if not _is_removable(f, place)]
+    return tuple(sorted(kept, key=lambda place: sp.default_sort_key(place.cell)))
 
 
-def _removable(f: sp.Expr, g: sp.Expr) -> bool:
-    """Return True if f is finite where g vanishes, a polynomial in one letter of degree 1 or 2, as sin(r)/r at 0."""
-    if len(f.free_symbols) != 1 or not g.is_polynomial(*g.free_symbols) or sp.degree(g) > 2:
+def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
+    """Places by which g vanishes, each of them one that is crossed and not touched, where that can be told."""
+    if not g.free_symbols & set(x) or g.is_zero is False:
+        return
+    if g.is_Mul:
+        for factor in g.args:
+            yield from _split(factor, x)
+    elif isinstance(g, (sp.Abs, *_ODD)) or (g.is_Pow and g.exp.is_positive):
+        yield from _split(g.args[0], x)
+    elif g.is_Pow and g.base.func is sp.gamma:
+        yield Place(g, sp.Min(sp.floor(g.base.args[0]), 0))
+    elif g.is_Pow:  # what it divides by is looked for itself
+        return
+    elif isinstance(g, sp.sin | sp.tan):
+        yield Place(g, sp.floor(g.args[0] / sp.pi))
+    elif isinstance(g, sp.cos):
+        yield Place(g, sp.floor(g.args[0] / sp.pi + sp.Rational(1, 2)))
+    elif (touched := _touched(g)) is not None:
+        yield touched
+    elif len(g.free_symbols) <= FACTORED and _is_rational(g):
+        exact = g.xreplace({a: sp.nsimplify(a, rational=True) for a in g.atoms(sp.Number, sp.NumberSymbol)})
+        exact, _ = sp.fraction(sp.together(exact))
+        for factor, _ in sp.Poly(exact, *sorted(g.free_symbols, key=str), domain="QQ").factor_list()[1]:
+            yield from _of_polynomial(factor.as_expr(), x)
+    else:
+        yield Place(g, sp.sign(g))
+        if len(g.free_symbols) == 1 and g.subs(s := min(g.free_symbols, key=str), 0).is_zero:  # which it may touch
+            yield Place(g, sp.sign(s))
+
+
+def _touched(g: sp.Expr) -> Place | None:
+    """The place of c ± c·cos(a), c ± c·sin(a) and c·cosh(a) − c, whose sign does not change where they vanish."""
+    constant, term = g.as_independent(*g.free_symbols, as_Add=True)
+    factor, wave = term.as_coeff_Mul()
+    if not constant.is_number or not isinstance(wave, sp.cos | sp.sin | sp.cosh) or abs(constant) != abs(factor):
+        return None
+    a, opposite = wave.args[0], constant / factor < 0
+    if isinstance(wave, sp.cosh):
+        return Place(g, sp.sign(a)) if opposite else None
+    shift = {sp.cos: (sp.pi, 0), sp.sin: (sp.pi / 2, -sp.pi / 2)}[wave.func][bool(opposite)]
+    return Place(g, sp.floor((a + shift) / (2 * sp.pi)))
+
+
+def _of_polynomial(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
+    """The places of a factor; of one in one letter its real roots."""
+    if not g.free_symbols & set(x) or g.is_zero is False:
+        return
+    if len(g.free_symbols) > 1:
+        yield Place(_plain(g), sp.sign(_plain(g)))
+        return
+    (s,) = g.free_symbols
+    for root in sp.real_roots(sp.Poly(g, s)):
+        root = root if root.is_Integer else root.evalf(17)  # noqa: PLW2901
+        yield Place(s - root, sp.sign(s - root))
+
+
+def _is_rational(g: sp.Expr) -> bool:
+    """Return True for a ratio of polynomials of rational numbers and floats."""
+    return g.is_rational_function(*g.free_symbols) and all(a.exp.is_Integer for a in g.atoms(sp.Pow))
+
+
+def _plain(g: sp.Expr) -> sp.Expr:
+    """A polynomial with its fractions as floats, divided by the largest of them."""
+    g = g / max((abs(a) for a in sp.Poly(g, *sorted(g.free_symbols, key=str)).coeffs()), default=1)
+    return g.xreplace({a: sp.Float(a, 17) for a in g.atoms(sp.Rational) if not a.is_Integer})
+
+
+def _is_removable(f: sp.Expr, place: Place) -> bool:
+    """Return True if f, of one letter, is finite where a linear g vanishes, as sin(r)/r at 0."""
+    if len(f.free_symbols) != 1 or not isinstance(place.cell, sp.sign):
         return False
-    (x,) = f.free_symbols
-    values = [sp.limit(f, x, root) for root in sp.real_roots(sp.Poly(g, x))]
-    return all(value.is_finite for value in values)
+    (s,) = f.free_symbols
+    g = place.cell.args[0]
+    if not g.is_polynomial(s) or sp.degree(g, s) != 1:
+        return False
+    root = float(-g.subs(s, 0) / sp.diff(g, s))
+    width = abs(root) or 1.0
+    return not infinite_between(f, place.cell, (s,), [root - width], [root + width])
+
+
+def infinite_between(
+    f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...], a: Sequence[float], b: Sequence[float]
+) -> bool:
+    """Return True if f grows without bound, or is no real number, where the cell changes from a to b (k,)."""
+    function, number = _precise(f, cell, letters)
+    with mpmath.workdps(DIGITS):
+        start, way = [mpmath.mpf(x) for x in a], [mpmath.mpf(y) - mpmath.mpf(x) for x, y in zip(a, b, strict=True)]
+
+        def at(s: Any) -> list[Any]:
+            return [x + s * v for x, v in zip(start, way, strict=True)]
+
+        try:
+            low, high, first = mpmath.mpf(0), mpmath.mpf(1), number(*start)
+            for _ in range(HALVINGS):
+                middle = (low + high) / 2
+                low, high = (middle, high) if number(*at(middle)) == first else (low, middle)
+            for side in (-1, 1):
+                values = [function(*at(low + side * mpmath.mpf(d))) for d in BESIDE]
+                if any(mpmath.im(value) != 0 or not mpmath.isfinite(value) for value in values):
+                    return True
+                before, after = (abs(y - x) for x, y in pairwise(values))
+                if after > DECREASES * before:
+                    return True
+        except (ArithmeticError, ValueError, TypeError, NameError):  # no number there
+            return True
+    return False
+
+
+@lru_cache(maxsize=256)
+def _precise(f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...]) -> tuple[Any, Any]:
+    """f and the number of the cell, in the arithmetic of mpmath; samples, which are bounded, are left out."""
+    f = f.replace(lambda e: type(e).__name__ == "sampled", lambda _: sp.S.One)
+    function, number = (sp.lambdify(letters, e, "mpmath") for e in (f, cell))
+    return function, number

@@ -8,6 +8,7 @@ import re
 import reprlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import islice
 from operator import add
@@ -18,28 +19,64 @@ import numpy as np
 import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
-from sympflow.arguments import plain
+from sympflow.arguments import check_kept, plain
 from sympflow.arrays import Array, assemble, concatenate, is_tensor
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
-    JUMP,
-    MOST_POINTS,
     Samples,
     check_span,
     drift,
     is_spline,
     sampled,
     sampled_parameter,
-    switches,
     with_letters,
-    zeros,
 )
-from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, read
+from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, complex_part, of_sympy, read
+from sympflow.hamiltonian.jumps import (
+    MOST_IMPULSES,
+    MOST_POINTS,
+    Impulse,
+    Switch,
+    Zeros,
+    borders,
+    check_continuous,
+    has_period,
+    split_impulses,
+)
+from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 
 LARGEST = sys.float_info.max
+MOST_LEFT_OUT = 100
+"""Degrees of freedom up to the last one that a formula may do without."""
+LONGEST_NAME = 40  # in messages
+MOST_COORDINATES = 10_000
+"""Degrees of freedom of an H that is written out."""
 FAR = 1000.0
-"""The time before and after 0 in which it is looked if H jumps."""
+"""The time before and after 0 in which it is looked if H jumps, where that is at no zeros of linear functions."""
+
+
+@dataclass(frozen=True)
+class Kick:
+    """The impulses of H at a time: with terms δ(g(t))·W(q, t) the flow p −= Σ ∇W(q, t)/|g'(t)|.
+
+    Attributes
+    ----------
+    t : float
+    potentials : tuple of (float, SymbolicHamiltonian)
+        1/|g'(t)| and W of each.
+    """
+
+    t: float
+    potentials: tuple[tuple[float, SymbolicHamiltonian], ...]
+
+    def __call__(self, y: Array, sign: float = 1.0) -> Array:
+        """Return the states (..., 2d) after the kick, for those before; with a sign of −1 the reverse."""
+        d = y.shape[-1] // 2
+        q, p = y[..., :d], y[..., d:]
+        for strength, W in self.potentials:
+            p = p - (sign * strength) * W.gradient(y, self.t)[..., :d]
+        return concatenate([q, p])
 
 
 class SymbolicHamiltonian(Definition):
@@ -88,6 +125,10 @@ class SymbolicHamiltonian(Definition):
     named_time: sp.Symbol | None = None
     """The time as it was given; `time` is None where H, by the values of its parameters, does not depend on it."""
     samples: Mapping[str, Samples] = MappingProxyType({})
+    impulses: tuple[tuple[Zeros, SymbolicHamiltonian], ...] = ()
+    """The zeros of g, and W, of the terms δ(g(t))·W(q, t) of H."""
+    _rest: SymbolicHamiltonian | None = None
+    """H without its impulses, where it has some."""
 
     def __init__(
         self,
@@ -101,6 +142,8 @@ class SymbolicHamiltonian(Definition):
         H = _valued(written, values, self.time)
         if self.time is not None and self.time in written.free_symbols - H.free_symbols:
             self.time = None
+        if time is None and self.time is not None:
+            _check_samples(written, values)
         if self.time is not None:
             if self.time not in H.free_symbols:
                 raise ValueError(f"`time` is {self.time.name!r}, which H does not depend on: leave it out.")
@@ -109,9 +152,21 @@ class SymbolicHamiltonian(Definition):
                 for symbol, found in values.items()
                 if isinstance(found, sampled)
             }
-        ndof = max((_index(s) for s in H.free_symbols if _index(s)), default=0)
+        used = {_index(s) for s in H.free_symbols} - {0}
+        ndof = max(used, default=0)
         if ndof == 0:
             raise ValueError("`expression` must depend on q1 … qd and p1 … pd (or q and p).")
+        if ndof - len(used) > MOST_LEFT_OUT:
+            raise ValueError(
+                f"`expression` has coordinates of the number {str(ndof)[:20]}, and depends on {len(used)} degrees of "
+                "freedom: number them from 1, q1 … qd and p1 … pd."
+            )
+        if ndof > MOST_COORDINATES:
+            raise ValueError(
+                f"`expression` has {ndof:,} coordinates by its highest index, more than {MOST_COORDINATES:,}: give a "
+                "system that large by one site and one bond, HamiltonianSystem.lattice, or by one pair, "
+                "HamiltonianSystem.pairs."
+            )
         plain = {sp.Symbol("q", real=True), sp.Symbol("p", real=True)} & H.free_symbols
         if plain and ndof > 1:
             raise ValueError("`expression` mixes q, p with numbered coordinates: write q1, p1.")
@@ -122,7 +177,16 @@ class SymbolicHamiltonian(Definition):
         if values:
             _check_values(H, values)
             self._written = written.xreplace(numbered), values
-        self._set(H.xreplace(numbered))
+        H = H.xreplace(numbered)
+        if H.has(sp.DiracDelta):
+            rest, potentials = split_impulses("expression", H, self.time, self.q, self.p)
+            self._rest = self.like(rest)
+            self.impulses = tuple((Zeros(g, self.time), self.like(W)) for g, W in potentials.items())
+            if self.time not in rest.free_symbols:
+                self._rest.time = None
+            H = H.replace(sp.DiracDelta, lambda g, *_: Impulse(g))
+        self._set(H)
+        _check_real(self.H)
 
     def _set(self, H: sp.Expr) -> None:
         self.H: sp.Expr = _with_numeric_constants(H)
@@ -200,29 +264,58 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def jumps(self) -> bool:
-        """True if H jumps at some times, at those of samples or of a function of the time that jumps."""
-        if self.shortest_piece < math.inf or self.time is None:
-            return self.shortest_piece < math.inf
-        return self.Ht.has(sp.DiracDelta) or len(self.jump_times(-FAR, FAR, FAR / MOST_POINTS)) > 0
+        """True if H jumps at some times, at those of samples or of a function of the time that jumps, or has impulses.
+
+        In a time of `FAR` about 0 and about every zero of a linear function.
+        """
+        if self.impulses or self.shortest_piece < math.inf:
+            return True
+        return any(each.at_root or len(each.times(-FAR, FAR, FAR / MOST_POINTS)) for each in self._switches)
 
     @cached_property
-    def _switches(self) -> tuple[sp.Expr, ...]:
-        return () if self.time is None else switches(self.H, self.time)
+    def _switches(self) -> list[Switch]:
+        """Where H may jump in t alone."""
+        if self.time is None:
+            return []
+        own = [border for border in borders(self.H, [self.time]) if border.g.free_symbols == {self.time}]
+        return [Switch(border, self.time, self.samples) for border in own]
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
         found = [samples.jump_times(low, high) for samples in self.samples.values()]
-        for g in self._switches:
-            times = zeros(g, self.time, low, high, step)
-            found.append(times[self._differs_across(times)])
-        return np.unique(np.concatenate(found)) if found else np.zeros(0)
+        found += [each.times(low, high, step) for each in self._switches]
+        times = np.unique(np.concatenate(found)) if found else np.zeros(0)
+        return times[np.diff(times, prepend=-np.inf) > 8 * sys.float_info.epsilon * np.abs(times)]
 
-    def _differs_across(self, times: np.ndarray) -> np.ndarray:
-        """True for the times (n,) at which H jumps, by its values on both sides at a few states."""
-        y = np.random.default_rng(0).uniform(-1.0, 1.0, (len(times), 4, 2 * self.ndof))
-        aside = 1e-12 * np.maximum(1.0, np.abs(times))[:, None]
-        with np.errstate(all="ignore"):
-            before, after = (self.hamiltonian(y, times[:, None] + s * aside) for s in (-1, 1))
-            return (np.abs(after - before) > JUMP * (np.abs(after) + np.abs(before))).any(-1)
+    def check_continuous(self) -> None:
+        """Raise a ValueError where H jumps in q or p, at the borders of its pieces."""
+        check_continuous("expression", self.between_impulses.H, (*self.q, *self.p))
+
+    @property
+    def between_impulses(self) -> SymbolicHamiltonian:
+        """H without its impulses."""
+        return self if self._rest is None else self._rest
+
+    def kicks(self, low: float, high: float, step: float) -> list[Kick]:
+        found: dict[float, list[tuple[float, SymbolicHamiltonian]]] = {}
+        for zeros, W in self.impulses:
+            times = zeros.within(low, high, step, MOST_IMPULSES)
+            rates = zeros.slopes(times, step)
+            met = W.jump_times(low, high, step)
+            refused = {
+                f"more than {MOST_IMPULSES:,} of them: take a shorter one": len(times) > MOST_IMPULSES,
+                "one of infinite weight, a double zero: write it as DiracDelta(t - a)": not rates.all(),
+                "a factor that jumps at one: leave that out": np.isclose(times[:, None], met, rtol=1e-12, atol=0).any(),
+            }
+            for what in (what for what, is_so in refused.items() if is_so):
+                raise ValueError(f"`t_span` ({low:g}, {high:g}) has impulses DiracDelta({zeros.g}), and {what}.")
+            for t, rate in zip(times.tolist(), rates.tolist(), strict=True):
+                found.setdefault(t, []).append((1 / abs(rate), W))
+        return [Kick(t, tuple(found[t])) for t in sorted(found)]
+
+    def has_period(self, period: float) -> bool:
+        """Return True if H, up to a function of t alone, has a period in t."""
+        assert self.time is not None
+        return has_period(self.H, self.time, (*self.q, *self.p), self.samples, period)
 
     @cached_property
     def Ht(self) -> sp.Expr:
@@ -246,8 +339,8 @@ class SymbolicHamiltonian(Definition):
         if self.T is None or not self.T.is_polynomial(*self.p):
             return None
         M = hessian(self.T, self.p)
-        p = sp.Matrix(self.p)
-        if M.free_symbols & {*self.p, self.time} or sp.expand(self.T - (p.T * M * p)[0] / 2) != 0:
+        terms = [entry * self.p[i] * self.p[j] / 2 for (i, j), entry in M.todok().items()]
+        if M.free_symbols & {*self.p, self.time} or sp.expand(self.T - sp.Add(*terms)) != 0:
             return None
         return M
 
@@ -271,6 +364,10 @@ class SymbolicHamiltonian(Definition):
         v = self.inverse_mass * slope
         return (v.T * sp.hessian(self.V, self.q) * v)[0] / 2
 
+    @cached_property
+    def poles(self) -> Poles | None:  # type: ignore[override]
+        return SymbolicPoles(self) or None
+
     # array functions, state y = [q, p] on the last axis -------------------------------------------
 
     def hamiltonian(self, y: Array, *t: Array) -> Array:
@@ -288,6 +385,10 @@ class SymbolicHamiltonian(Definition):
     def time_derivative(self, y: Array, t: Array) -> Array:
         """∂H/∂t: (..., 2d) to (...)."""
         return self._scalar("Ht")(y, t)
+
+    def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
+        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
+        return self._function(name, lambda: expressions, assemble)
 
     def potential(self, q: Array, *t: Array) -> Array:
         return self._scalar("V")(q, *t)
@@ -335,6 +436,11 @@ class SymbolicHamiltonian(Definition):
     def check_times(self, t0: float, t1: float) -> None:
         """Raise a ValueError where an interval leaves the times of samples."""
         check_span({name.rpartition("_")[0]: samples for name, samples in self.samples.items()}, t0, t1)
+
+    def identity_parts(self) -> Any:
+        """H, and the samples in it; the time has one name."""
+        H = self.H if self.time is None else self.H.xreplace({self.time: sp.Symbol("t", real=True)})
+        return [self.ndof, H, {name: samples.digest for name, samples in self.samples.items()}]
 
     # generation -----------------------------------------------------------------------------------
 
@@ -396,7 +502,8 @@ class SymbolicHamiltonian(Definition):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the generated functions, which cannot be pickled and are generated again."""
-        return {name: value for name, value in vars(self).items() if name != "_functions"}
+        left_out = ("_functions", "_switches", "poles")
+        return {name: value for name, value in vars(self).items() if name not in left_out}
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
@@ -448,11 +555,12 @@ def gradient(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
 
 def hessian(f: sp.Expr, x: Sequence[sp.Symbol]) -> sp.Matrix:
     """∇²f, as `sympy.hessian`, by the terms that are not zero."""
-    rows = [[sp.S.Zero] * len(x) for _ in x]
+    place, entries = {s: i for i, s in enumerate(x)}, {}
     for i, slope in enumerate(gradient(f, x)):
-        for j, entry in enumerate(gradient(slope, x[i:]), i):
-            rows[i][j] = rows[j][i] = entry
-    return sp.Matrix(rows)
+        later = sorted(j for s in slope.free_symbols if (j := place.get(s, -1)) >= i)
+        for j, entry in zip(later, gradient(slope, [x[j] for j in later]), strict=True):
+            entries[i, j] = entries[j, i] = entry
+    return sp.SparseMatrix(len(x), len(x), entries)
 
 
 def parse(expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol | None = None) -> sp.Expr:
@@ -465,10 +573,11 @@ def _read(
 ) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
     """The expression in real symbols, and the numbers, or functions of t, for those that are parameters."""
     names = {name: sp.Symbol(name, real=True) for name in params}
+    meant = {*params, *(() if time is None else (time.name,))}
     if isinstance(expression, str):
         try:
             coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", expression) if _is_coordinate(w))
-            H = read(expression, {*params, *_AMBIGUOUS, *coordinates, *(() if time is None else (time.name,))})
+            H = read(expression, {*meant, *_AMBIGUOUS, *coordinates})
         except Unreadable as error:
             shown = expression if len(expression) <= 200 else expression[:200] + "..."
             raise ValueError(
@@ -482,11 +591,11 @@ def _read(
                 f"`expression` must be a scalar expression; got {type(expression).__name__}: pass a string or a SymPy "
                 "expression."
             ) from None
-    if not isinstance(H, sp.Expr):
-        raise ValueError(f"`expression` must be a scalar expression; got {type(H).__name__}.")
-    if H.has(sp.I):
-        raise ValueError("`expression` is complex: a Hamiltonian must be real, so leave the imaginary unit I out.")
-    H = H.xreplace({s: sp.Symbol(s.name, real=True) for s in H.free_symbols})
+    try:
+        H = of_sympy(H, meant)
+    except Unreadable as error:
+        raise ValueError(f"`expression` must be a scalar expression: {error}.") from None
+    _check_real(H)
     for name in params:
         if names[name] not in H.free_symbols:
             raise ValueError(f"`params` has {name!r}, which the expression does not use: remove it.")
@@ -514,16 +623,36 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
         raise TypeError('`expression` depends on the time t: name it by time="t", for a system that is driven.')
     if unknown:
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
-        raise ValueError(f"`expression` holds {', '.join(unknown)} without a value: give it in `params`.{meant}")
+        raise ValueError(
+            f"`expression` holds {', '.join(map(_short, unknown))} without a value: give it in `params`.{meant}"
+        )
     return H
+
+
+def _check_real(H: sp.Expr) -> None:
+    if (part := complex_part(H)) is not None:
+        remedy = "leave the imaginary unit I out" if part == sp.I else f"write {part} with a positive base"
+        raise ValueError(f"`expression` is complex: a Hamiltonian must be real, so {remedy}.")
 
 
 def _check_values(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
     """Refuse values with which H is not finite or not real, as a mass of 0 or the root of a negative number."""
     numbers = [abs(a) for a in H.atoms(sp.Number)]
-    if H.has(sp.I, sp.zoo, sp.nan, sp.oo) or any(a > LARGEST for a in numbers):
+    if H.has(sp.zoo, sp.nan, sp.oo) or complex_part(H) is not None or any(a > LARGEST for a in numbers):
         shown = ", ".join(f"{s} = {float(value):.9g}" for s, value in values.items() if value.is_number)
         raise ValueError(f"`params` has {shown}, with which the expression is not a finite real one: change them.")
+
+
+def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> None:
+    """Refuse samples that stand beside all coordinates, as those of a V(q) would, where no time is named."""
+    terms = sp.Add.make_args(sp.expand(written))
+    for symbol, value in values.items():
+        if isinstance(value, sampled) and all(term.free_symbols <= values.keys() for term in terms if term.has(symbol)):
+            raise ValueError(
+                f"`params` has {symbol.name}, a spline, which is a function of the time: in a term without q and p it "
+                "moves nothing. Give a potential by functions, HamiltonianSystem(V, ndof=…, gradient=…); where it is "
+                "the time that is meant, pass time='t'."
+            )
 
 
 class _Letters:
@@ -613,6 +742,7 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
         if is_spline(given):
             checked[name] = Samples.of(name, given)
             continue
+        check_kept(f"params[{name!r}]", given)
         value = plain(given)
         if isinstance(value, numbers.Rational | sp.Expr) and not isinstance(value, int):
             try:
@@ -625,13 +755,17 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
     return checked
 
 
+def _short(name: str) -> str:
+    return name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
+
+
 def _is_coordinate(name: str) -> bool:
-    return re.fullmatch(r"[qp]([1-9]\d*)?", name) is not None
+    return re.fullmatch(r"[qp]([1-9][0-9]{0,15})?", name) is not None
 
 
 def _index(symbol: sp.Symbol) -> int:
-    """1 for q1, p1, q and p; 2 for q2, p2; …"""
-    return int(symbol.name[1:] or 1) if _is_coordinate(symbol.name) else 0
+    """1 for q1, p1, q and p; 2 for q2, p2; …, of very long ones the beginning."""
+    return int(symbol.name[1:20] or 1) if _is_coordinate(symbol.name) else 0
 
 
 def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
@@ -669,6 +803,11 @@ _MAX_POWER = 16  # integer powers up to this are made of products
 _INTEGER_POWER = sp.Function("integer_power", real=True)
 
 
+def _of_machine_numbers(f: sp.Expr) -> sp.Expr:
+    """f with integers that no 64 bits hold, as of a system in SI units, as floating-point numbers."""
+    return f.xreplace({n: sp.Float(int(n)) for n in f.atoms(sp.Integer) if abs(n) >= 2**63})
+
+
 def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], library: str) -> Callable[..., list[Any]]:
     """The values of the expressions, as a function of the variables' arrays of "numpy" or "torch".
 
@@ -677,7 +816,7 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     TypeError
         If the library has no function for something in the expressions.
     """
-    code = [_by_products(f) if library == "numpy" else f for f in expressions]
+    code = [_by_products(f) if library == "numpy" else f for f in map(_of_machine_numbers, expressions)]
     sums = [_in_pieces(f) for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
@@ -721,6 +860,20 @@ def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
     return half * half * x if n % 2 else half * half
 
 
+def _special_functions() -> dict[str, Callable[..., Any]]:
+    """Functions that SciPy's printer does not know, or has complex: NaN where they are not real."""
+    from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc, lambertw
+
+    def real_lambertw(x: Any, k: Any = 0) -> Any:
+        w = lambertw(x, k)
+        return np.where(w.imag == 0, w.real, np.nan)
+
+    def elliptic_e(*x: Any) -> Any:
+        return (ellipe if len(x) == 1 else ellipeinc)(*x)
+
+    return {"elliptic_k": ellipk, "elliptic_f": ellipkinc, "elliptic_e": elliptic_e, "LambertW": real_lambertw}
+
+
 def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     """Modules of the functions in the generated code; SciPy is brought in for special functions only."""
     from sympy.printing.numpy import NumPyPrinter
@@ -731,8 +884,8 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
         n for n in names - known.keys() if n not in ("Max", "Min", "Abs", "Heaviside", "sign", "Piecewise")
     )
     if library == "numpy":
-        own = {"integer_power": _integer_power}
-        return [own, "scipy", "numpy"] if special else [own, "numpy"]
+        own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
+        return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]
     if special:
         raise TypeError(
             f"`expression` holds {', '.join(special)}, which torch has not: solve on NumPy states, with a method that "

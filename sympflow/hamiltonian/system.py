@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.linear_part import LinearPart
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.local_states import LocalStates
+    from sympflow.hamiltonian.symbolic import Kick
 
 MOST_DEGREES = 1_000_000
 MOST_WRITTEN_OUT = 400
@@ -126,6 +127,8 @@ class HamiltonianSystem(Hamiltonian):
 
     _period: float | None = None
     _former_period: float | None = None
+    _continuous = True
+    """False of systems that are made of others, whose H may jump where solutions do not feel it."""
     exact: Callable[[Any], Array] | None = None
 
     def __init__(
@@ -219,13 +222,16 @@ class HamiltonianSystem(Hamiltonian):
         ------
         ValueError, TypeError
             If the expression cannot be parsed, has symbols without a value, or a time that `time` does not name; if
-            H does not depend on that, or has another period; if `damping` is not symmetric, has negative rates, or
-            another shape.
+            H does not depend on that, or has another period; if H jumps in q or p, or holds delta functions other than
+            impulses DiracDelta(t − a)·W(q), which are kicks p −= ∇W(q) at the time a; if `damping` is not symmetric,
+            has negative rates, or another shape.
         """
         from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params
 
         params = checked_params(params)
         symbols = SymbolicHamiltonian(expression, params, time)
+        if cls._continuous:
+            symbols.check_continuous()
         if symbols.ndof > MOST_WRITTEN_OUT:
             warnings.warn(
                 f"`expression` has {symbols.ndof} coordinates: written out, H takes seconds to define, and a step ten "
@@ -235,7 +241,7 @@ class HamiltonianSystem(Hamiltonian):
             )
         self = cls.__new__(cls)
         M = symbols.inverse_mass
-        inverse_mass = None if M is None else matrices.simplest(np.array(M.tolist(), dtype=float))
+        inverse_mass = None if M is None else matrices.simplest(matrices.from_entries(M.shape, M.todok()))
         Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
         self._set_friction(damping)
@@ -550,7 +556,14 @@ class HamiltonianSystem(Hamiltonian):
             raise TypeError("`period` only goes with `time`, for H that depends on t: leave it out.")
         if not real_number(period) or not 0 < period < 1e100:
             raise ValueError(f"`period` must be positive and finite; got {period!r}.")
-        check_period(self.hamiltonian, self.ndof, self.y0, float(period))
+        known = self._definition.has_period(float(period))
+        if known is False:
+            raise ValueError(
+                f"`period` {period!r} is none of H, which differs a period later: give the period of the drive, such "
+                "as 2*pi/w."
+            )
+        if known is None:
+            check_period(self.hamiltonian, self.ndof, self.y0, float(period))
         self._period = float(period)
 
     @property
@@ -722,7 +735,7 @@ class HamiltonianSystem(Hamiltonian):
         probes = probe_states(given, self.domain, 2 * self.ndof)
         n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
         self._definition.check(probes, like, n_given, *self._probed_times())
-        self._tested = self._tested | {kind: reach(probes[:, : self._arguments])}
+        self._tested = self._tested | {kind: reach(probes[:, : self._arguments], self._arguments // self.ndof)}
 
     def check_functions_along(self, y: Array) -> None:
         """Test the functions of a user where a run went far beyond the states at which they were tested: `solve` does.
@@ -747,7 +760,8 @@ class HamiltonianSystem(Hamiltonian):
         except (ValueError, TypeError) as error:
             warnings.warn(f"On this run, far from its start: {error}", RuntimeWarning, stacklevel=3)
             return
-        self._tested = self._tested | {kind: reach(np.concatenate([reached, far[:, : self._arguments]]))}
+        seen = np.concatenate([reached, far[:, : self._arguments]])
+        self._tested = self._tested | {kind: reach(seen, self._arguments // self.ndof)}
 
     def _probed_times(self) -> tuple[np.ndarray, ...]:
         """The times at which functions of a driven system are tested."""
@@ -757,6 +771,19 @@ class HamiltonianSystem(Hamiltonian):
     def _arguments(self) -> int:
         """The number of components of a state that the given functions depend on: V is one of q alone."""
         return self.ndof if self.separable else 2 * self.ndof
+
+    def kicks(self, t0: float, t1: float) -> list[Kick]:
+        """Return the impulses of H between two times, in their order; each has its time `t`, and maps states.
+
+        A term DiracDelta(t − a)·W(q, t) of H is one at the time a: p −= ∇W(q, a).
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.from_sympy("p**2/2 - q*DiracDelta(t - 1)", time="t")
+        >>> [(kick.t, kick(np.array([0.0, 0.5]))) for kick in system.kicks(0, 2)]
+        [(1.0, array([0. , 1.5]))]
+        """
+        return self._definition.kicks(t0, t1, self.dt / 4)
 
     # structure --------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from sympflow.hamiltonian.function_checks import as_like
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
 
-LARGEST_SHIFT = 1e30
+LARGEST_SHIFT = 1e100
 _ENERGIES: WeakKeyDictionary[HamiltonianSystem, tuple[bytes, float]] = WeakKeyDictionary()
 
 

@@ -67,7 +67,9 @@ def _check_shape(t: Any, batch: tuple[int, ...]) -> None:
 PROBED = np.array([0.0, 0.1327, 0.3819, 0.7211])
 """Parts of a length of time at which functions of the time are probed: at the beginning, and none a simple fraction."""
 PERIOD_TOLERANCE = 1e-8
-"""Share of the largest change of H among probes by which it may differ a period later."""
+"""Share of the largest change of H in time at a state by which it may differ a period later."""
+PERIODS, LATEST = 24, 1000.0
+"""Times at which a period is tested: in the first one, and later up to so many periods."""
 
 
 def probe_times(t0: float, t1: float) -> np.ndarray:
@@ -76,7 +78,9 @@ def probe_times(t0: float, t1: float) -> np.ndarray:
 
 
 def check_period(H: Callable[[np.ndarray, float], Any], ndof: int, y0: np.ndarray | None, period: float) -> None:
-    """Test H(y, t), up to a function of t alone, at states near y0 or the origin, at times and a period later.
+    """Test H(y, t), up to a function of t alone, at states of all sizes, at times and a period later.
+
+    What it may differ by is measured by its change in time at the same state, whatever else H holds.
 
     Raises
     ------
@@ -84,20 +88,27 @@ def check_period(H: Callable[[np.ndarray, float], Any], ndof: int, y0: np.ndarra
         If it differs: the period is not one of H.
     """
     rng = np.random.Generator(np.random.PCG64(20260104))
-    states = rng.uniform(-1, 1, (5, 2 * ndof))
+    states = rng.uniform(-1, 1, (1, 5, 2 * ndof)) * 10.0 ** np.arange(-3, 4)[:, None, None]
+    states = states.reshape(-1, 2 * ndof)
     if y0 is not None:
-        states = np.concatenate([y0[None], y0 * (1 + 0.1 * states)])
+        states = np.concatenate([y0[None], y0 * (1 + 0.1 * states[15:20]), states])
+    first = rng.uniform(0, 1, PERIODS)
+    times = period * np.concatenate([first, first * LATEST ** rng.uniform(0, 1, PERIODS)])
     with np.errstate(all="ignore"):
         before, after = (
-            np.stack([to_numpy(H(states, float(t))).astype(float) for t in times])
-            for times in (PROBED * period, PROBED * period + period)
+            np.stack([to_numpy(H(states, float(t))).astype(float) for t in moments])
+            for moments in (times, times + period)
         )
+        size = np.maximum(np.abs(before), np.abs(after)).max(0)
+        size = np.maximum(size, size[0])
         before, after = before - before[:, :1], after - after[:, :1]
-        change = np.abs(after - before)
-    change = change[np.isfinite(change)]
-    size = np.abs(before[np.isfinite(before)]).max(initial=0.0)
-    if change.max(initial=0.0) > PERIOD_TOLERANCE * size:
+        width = np.maximum(before.max(0) - before.min(0), after.max(0) - after.min(0))
+        rounding = 64 * np.finfo(float).eps * (1 + np.abs(times[:, None]) / period) * width
+        allowed = PERIOD_TOLERANCE * width + 16 * np.finfo(float).eps * size + rounding
+        change = np.where(np.isfinite(allowed), np.abs(after - before) - allowed, 0.0)
+    if (change > 0).any():
+        i, j = np.unravel_index(change.argmax(), change.shape)
         raise ValueError(
-            f"`period` {period!r} is none of H, which differs by {change.max():.3g} a period later at states near "
-            f"{'y0' if y0 is not None else 'the origin'}: give the period of the drive, such as 2*pi/w."
+            f"`period` {period!r} is none of H, which differs by {abs(after - before)[i, j]:.3g} a period after t = "
+            f"{times[i]:.6g} at a state: give the period of the drive, such as 2*pi/w."
         )

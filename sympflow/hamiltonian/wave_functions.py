@@ -13,6 +13,7 @@ import sympy as sp
 
 from sympflow.arguments import real_number
 from sympflow.arrays import Array, concatenate, is_tensor, library, like
+from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.lattice import checked_params, checked_shape
 from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, letters, parsed
 from sympflow.hamiltonian.normal_modes import SpectralPart, Transform
@@ -66,6 +67,9 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         used = self.f.free_symbols | self.w.free_symbols
         if unused := [name for name, s in values.items() if s not in used]:
             raise ValueError(f"`params` has {unused[0]!r}, which no expression uses: remove it.")
+        given = dict(zip(self.c, self.params.values(), strict=True))
+        for argument, f in (("onsite", self.f), ("dispersion", self.w)):
+            check_continuous(argument, f, [self.rho], given, dict(zip(self.c, self.params, strict=True)))
         self._set_rates()
 
     def _set_rates(self) -> None:
@@ -86,6 +90,9 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         self.rates = np.ascontiguousarray(self.transform.total(waves))
         if not np.isfinite(self.rates).all():
             raise ValueError("`dispersion` must be finite at all wave numbers k of the grid, 0 among them; it is not.")
+
+    def identity_parts(self) -> Any:
+        return [self.grid, self.length, self.f, self.w, list(self.params.items())]
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)

@@ -7,6 +7,7 @@ walks the grid, finds what is not finite, places the outputs and looks for event
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt, check_not_followed
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, stack
+from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, join, lanes, stack
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import (
@@ -214,6 +215,9 @@ def _is_counted(cls: type[FixedStep]) -> bool:
 # one run of a method -------------------------------------------------------------------------------
 
 
+_ADVICE = re.compile(r"(, or use|: use|\. Use) backend='array'\.$")
+
+
 class Stepper:
     """One run of a fixed-step integrator: all that a run changes or counts is here.
 
@@ -233,8 +237,12 @@ class Stepper:
     saves_finite: bool = False
     counts_itself: ClassVar[bool] = False
     """True if `evaluations` tells those that were made so far, whatever the steps."""
+    remark: str = ""
+    """Why a run of a formula is not compiled, for its message."""
 
-    def __init__(self, integrator: FixedStep, problem: Problem) -> None:
+    def __init__(self, integrator: FixedStep, problem: Problem, told: Sequence[str] = ()) -> None:
+        if told and problem.system.symbols is not None:
+            self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
         self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.backend = "torch" if is_tensor(problem.y0) else "numpy"
 
@@ -341,7 +349,12 @@ class KernelStepper(Stepper):
 
 
 def compiled_loops(
-    make: Callable[[], Any], y0: Array, backend: str, compensated: bool = False, reason: str | None = None
+    make: Callable[[], Any],
+    y0: Array,
+    backend: str,
+    compensated: bool = False,
+    reason: str | None = None,
+    told: list[str] | None = None,
 ) -> Any:
     """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
 
@@ -357,6 +370,8 @@ def compiled_loops(
         Compiled loops are needed, for compensated sums.
     reason : str, optional
         Why the method has no compiled form at all.
+    told : list of str, optional
+        Takes the reason that `make` gives, where array operations step in for it.
 
     Raises
     ------
@@ -369,6 +384,7 @@ def compiled_loops(
         reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
     elif y0.dtype != np.float64:
         reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
+    asked = reason is None
     if reason is None:
         try:
             return make()
@@ -379,6 +395,8 @@ def compiled_loops(
     if compensated:
         needed = "" if reason.startswith("`compensated`") else "`compensated` sums need compiled loops. "
         raise ValueError(needed + reason) from None
+    if told is not None and backend == "auto" and asked:
+        told.append(reason)
     return None
 
 
@@ -499,7 +517,9 @@ class GridRun:
         if self.problem.store is not None:
             return self._stored(self.problem.store)
         search = self.problem.events
-        return self._whole() if search is None else self._streamed(search)
+        outcome = self._whole() if search is None else self._streamed(search)
+        outcome.message += self.stepper.remark
+        return outcome
 
     def _whole(self) -> Outcome:
         problem, grid, stepper = self.problem, self.grid, self.stepper
@@ -651,7 +671,7 @@ class GridRun:
             outputs, kept = outputs[:n_outputs], [*kept[:n_kept], y[None]]
             search.forget_after(grid.time(k), grid.h)
 
-        t, y_out = times[:delivered], _join(outputs)
+        t, y_out = times[:delivered], join(outputs)
         finite_outputs = finite_states(y_out)  # a shorter step may overflow too
         failed = failed or not finite_outputs.all()
         t_end = search.end[0] if search.end else grid.time(k) if failed or stopped else grid.t1
@@ -659,7 +679,7 @@ class GridRun:
         n_keep = len(t) if keep.all() else int(np.argmin(keep))
         t, y_out = t[:n_keep], y_out[:n_keep]
         if search.end and problem.t_eval is None and not (len(t) and t[-1] == t_end):
-            t, y_out = np.append(t, t_end), _join([y_out, search.end[1][None]])
+            t, y_out = np.append(t, t_end), join([y_out, search.end[1][None]])
 
         n_extra = search.n_dense + int(np.count_nonzero(remainder[:delivered]))
         stats = self.stats(k + shorter, k, k, n_extra)
@@ -669,7 +689,7 @@ class GridRun:
             outcome.stats["failed_at"] = t_end
             outcome.message = self._failure(t_end, k)
         if problem.dense_output:
-            outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), _join(kept))
+            outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), join(kept))
         if stopped:
             raise interrupted(outcome, t_end)
         return outcome
@@ -829,14 +849,6 @@ def _all_finite(y: Array, compiled: bool) -> bool:
     from sympflow.kernels.output_loops import all_finite
 
     return all_finite(y)
-
-
-def _join(parts: Sequence[Array]) -> Array:
-    if is_tensor(parts[0]):
-        import torch
-
-        return torch.cat(list(parts))
-    return np.concatenate(parts)
 
 
 # runs whose steps the method chooses -----------------------------------------------------------------

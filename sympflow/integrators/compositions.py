@@ -20,6 +20,7 @@ from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_st
 from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, linear_and_rest, map_evaluations
+from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import rollout
@@ -79,6 +80,10 @@ class Composition(ABC):
         """Raise a ValueError where the parts of a driven system have no exact flows."""
         raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
 
+    @abstractmethod
+    def force_times(self) -> list[float]:
+        """The times, in steps, at which a step takes the parts of H that depend on t."""
+
     def lift(self, y: Array) -> Array:
         """The states on which steps are made, of states y (..., 2d); y itself where the phase space is not extended."""
         return y
@@ -88,8 +93,8 @@ class Composition(ABC):
         return x
 
     def distance(self, x: Array) -> Array:
-        """Distance of those states from ones that `lift` gives: (...)."""
-        return 0 * x[..., 0]
+        """Distance of those states from ones that `lift` gives, and their size: (..., 2)."""
+        return 0 * x[..., :2]
 
     @abstractmethod
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -189,6 +194,10 @@ class KineticPotential(Composition):
     def check_driving(self) -> None:
         if self.system.kinetic_timed:
             self.system.drift(np.zeros(self.system.ndof), 0.0, 0.0)
+
+    def force_times(self) -> list[float]:
+        scheme = self.scheme
+        return [c for s, c in zip(scheme.substeps, scheme.substep_times, strict=True) if s.kind == "kick"]
 
     def _times(self, t: Any, h: Any) -> list[Any]:
         """The time at which each substep begins; that of a system that does not depend on it is left out."""
@@ -357,6 +366,9 @@ class ExactMaps(Composition):
 
     def _key(self) -> tuple[Any, ...]:
         return type(self), self.scheme, self.parts
+
+    def force_times(self) -> list[float]:
+        return [m.at for m in known_maps(self, 1.0) if self.parts.timed(m.part)]
 
     @abstractmethod
     def maps(self, h: Any) -> list[Map]:
@@ -588,7 +600,7 @@ class TwoCopies(SolvableParts):
         parts: tuple[str, ...] | None = None,
         omega: float | None = None,
     ) -> None:
-        self.omega, self.ndof = omega, system.ndof
+        self.omega, self.ndof, self.scale = omega, system.ndof, natural_scale(system)
         super().__init__(method, scheme, system, parts)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
@@ -605,8 +617,8 @@ class TwoCopies(SolvableParts):
         return mean(x, self.ndof)
 
     def distance(self, x: Array) -> Array:
-        """The largest difference of the copies: (..., 4d) to (...)."""
-        return distance(x, self.ndof)
+        """The largest difference of the copies, and the size of their states: (..., 4d) to (..., 2)."""
+        return distance(x, self.scale)
 
 
 SPLITTINGS: dict[str, type[Composition]] = {

@@ -19,7 +19,8 @@ Its duties:
    friction −Γp into account, as one that steps by `system.vector_field` does. `takes_forces` says the same of a force
    that is none of H, which only `vector_field` holds.
 11. `takes_driving` is False, and a driven system, H(t, q, p), is refused before the integrator sees it; or the method
-   takes H and its derivatives at the times of its stages, t + c·h, as `system.vector_field(y, t + c * h)` does.
+   takes H and its derivatives at the times of its stages, t + c·h, as `system.vector_field(y, t + c * h)` does. Where
+   c is 0 or 1, `forces_at_ends(system)` says so, and a jump of H that the steps meet is warned of.
 
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
 duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
@@ -223,8 +224,17 @@ class Integrator:
         return False
 
     @property
+    def absolute_tolerance(self) -> float:
+        """The default `atol`, in units of y, of a method that chooses its steps; 0 where it was given, or is none."""
+        return 0.0
+
+    @property
     def takes_forces(self) -> bool:
         """True if every step holds any force beside −∂H/∂q, as one by `system.vector_field` does."""
+        return False
+
+    def forces_at_ends(self, system: HamiltonianSystem) -> bool:
+        """Return True if a step takes a force at its end or beyond it, of first order where H jumps there in t."""
         return False
 
     def check(self, system: HamiltonianSystem) -> None:

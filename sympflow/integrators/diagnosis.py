@@ -1,13 +1,18 @@
-"""The time at which the solution of a run that could not go on becomes infinite, if it does."""
+"""After a run: over which poles of H it leapt, and when the solution of one that failed becomes infinite."""
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.integrate import DOP853
+import warnings
+from typing import TYPE_CHECKING, NamedTuple
 
-from sympflow.arrays import Array, to_numpy
+import numpy as np
+
+from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome, Problem
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.poles import Poles
 
 TAIL = 200  # steps before the end of a run, at least, from which the solution is followed
 AHEAD = 4  # steps beyond the end: an implicit method gives up before a singularity
@@ -18,8 +23,188 @@ SHORT = 1e-11  # of the way: steps below it go on no more
 NEAR, NEARER, GROWTH = 1e-3, 1e-8, 10.0
 """The state is infinite at the end if it grows by so much from this to that part of the way before it."""
 
+LOOKED_AT, LOOKED_AT_TOGETHER = 32, 4096  # outputs of one trajectory, states of all, at which H and signs are compared
+OFF, FAR_OFF = 0.01, 0.5  # of the kinetic energy: a change of H after which steps are looked at; where H may change
+MOST_WALKED, MOST_TESTED, MOST_NAMED = 4 * 10**6, 32, 64  # numbers of a run executed again; crossings; trajectories
+ACROSS, AROUND, PARTS = 0.25, 8, 9
+"""A step leaps if, at one of so many points on it, what vanishes is so small a part of what it is at another; around it
+H changes by more than a tenth of the kinetic energy within so many steps."""
+LOST_AROUND = 0.1
 
-def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
+
+class Passage(NamedTuple):
+    """The times between which a trajectory passed a pole, its column, and True if no solution does."""
+
+    begin: float
+    end: float
+    column: int
+    certain: bool
+
+
+def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stacklevel: int) -> bool:
+    """End a run where it passed a place at which H is infinite or no number, and warn where it seems to have done so.
+
+    No solution passes such a place, but a step of fixed length sees nothing of what lies between its ends. Compared are
+    first the signs of what vanishes there, and H, at the start and at some outputs, at the cost of as many evaluations.
+    Where one of them is off, the steps are looked at: those that are outputs, or the run is executed again.
+
+    Between two states with H infinite on the way the status becomes −1. Where the place is a point in more than one
+    dimension, no sign changes; there is a warning if a step was long beside its distance and H changed for good.
+
+    Returns True if the run, or a trajectory of it, was ended.
+    """
+    poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
+    if poles is None or not n:
+        return False
+    starts = to_numpy(problem.y0).reshape(-1, width)
+    outputs = to_numpy(outcome.y).reshape(n, -1, width)
+    every = slice(n - 1, None, -max(1, -(-n // LOOKED_AT), n * starts.size // LOOKED_AT_TOGETHER))  # the last of all
+    y = np.concatenate([starts[None], outputs[every][::-1]])
+    t = np.concatenate([[problem.t0], outcome.t[every][::-1]])
+    with np.errstate(all="ignore"):
+        try:
+            odd, scale = _look(problem.system, poles, t, y)
+        except TypeError:  # a function that takes no arrays
+            return False
+        if not odd.any():
+            return False
+        held = (np.atleast_1d(np.asarray(outcome.status)) >= 0).reshape(-1)
+        rows = np.flatnonzero(odd.any(0) & held)
+        found: dict[int, Passage] = {}
+        for row in rows[np.argsort(~odd[0, rows], kind="stable")][:MOST_NAMED].tolist():
+            if odd[0, row]:
+                found[row] = Passage(problem.t0, problem.t0, -1, True)
+                continue
+            ends = t[-1], t[int(np.argmax(odd[:, row]))]
+            passage = _passage(poles, *_steps_of(outcome, integrator, problem, row, ends), scale[row])
+            if passage is not None:
+                found[row] = passage
+    certain = [row for row, passage in found.items() if passage.certain]
+    if certain:
+        _end(outcome, integrator, problem, {row: found[row] for row in certain})
+    likely = [row for row in found if row not in certain]
+    if likely:
+        passage, which = found[likely[0]], _which(problem, likely)
+        warnings.warn(
+            f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
+            f"over a place at which it is infinite, {poles.name(passage.column)}: the run means nothing after that. "
+            f"{_remedy(integrator, problem)}.",
+            RuntimeWarning,
+            stacklevel=stacklevel + 1,
+        )
+    return bool(certain)
+
+
+def _look(system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """True for states y (n, N, 2d) with signs or H unlike the first ones, and for a start without H: (n, N).
+
+    Also the largest kinetic energy, or change of the potential one, beside which H is judged: (N,).
+    """
+    cells, H, T = poles.look(y, t[:, None])
+    odd = (cells != cells[0]).any(-1)
+    scale = np.full(y.shape[1], np.inf)
+    if T is not None:
+        V = H - T
+        scale = np.fmax.reduce(np.maximum(np.abs(T), np.abs(V - V[0])), axis=0)
+        odd |= ~(np.abs(H - H[0]) <= (OFF if system.conservative and system.autonomous else FAR_OFF) * scale)
+    odd[0] = ~np.isfinite(H[0])
+    return odd, scale
+
+
+def _steps_of(
+    outcome: Outcome, integrator: Integrator, problem: Problem, row: int, ends: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and states (n, 2d) of a trajectory at its steps up to an end, the first that is near; or outputs."""
+    width, length = 2 * problem.system.ndof, integrator.step_length(problem.system)
+    y0 = to_numpy(problem.y0).reshape(-1, width)[row]
+    known = problem.t_eval is None and problem.save_every == 1 and (length is not None or problem.y0.ndim == 1)
+    for end in () if known or is_tensor(problem.y0) else ends:
+        n_steps = abs(end - problem.t0) / length if length else outcome.stats.get("n_steps", 0)
+        if n_steps * width <= MOST_WALKED:
+            try:
+                again = integrator.run(Problem(problem.system, problem.t0, end, y0, backend=problem.backend))
+            except Exception:  # of a plug-in, whose outputs are all that is known
+                break
+            return again.t.astype(float), again.y.astype(float)
+    first = int(outcome.t[0] == problem.t0)
+    y = to_numpy(outcome.y).reshape(len(outcome.t), -1, width)[first:, row]
+    return np.append(problem.t0, outcome.t[first:]), np.concatenate([y0[None], y]).astype(float)
+
+
+def _passage(poles: Poles, t: np.ndarray, y: np.ndarray, scale: float) -> Passage | None:
+    """The first place that was passed between states y (n, 2d) at t (n,): surely, or else likely."""
+    cells, H, T = poles.look(y, t)
+    for k, column in np.argwhere(cells[1:] != cells[:-1])[:MOST_TESTED].tolist():
+        if poles.passed(column, t[k : k + 2].tolist(), y[k : k + 2]):
+            return Passage(float(t[k]), float(t[k + 1]), column, True)
+    if T is None:
+        return None
+    k = np.arange(len(y) - 1)
+    lost = np.abs(H[np.minimum(k + 1 + AROUND, len(k))] - H[np.maximum(k - AROUND, 0)])
+    k = np.flatnonzero(~(lost <= LOST_AROUND * scale))
+    if not len(k):
+        return None
+    s = np.linspace(0, 1, PARTS)[:, None]
+    along = y[k][:, None] * (1 - s) + y[k + 1][:, None] * s
+    size = np.abs(poles.sizes(along, t[k][:, None] * (1 - s[:, 0]) + t[k + 1][:, None] * s[:, 0]))
+    leapt = size.min(1) < ACROSS * size.max(1)
+    if not leapt.any():
+        return None
+    first, column = np.argwhere(leapt)[0].tolist()
+    return Passage(float(t[k[first]]), float(t[k[first] + 1]), column, False)
+
+
+def _remedy(integrator: Integrator, problem: Problem) -> str:
+    if integrator.step_length(problem.system) is None:
+        return "Reduce `rtol` and `atol`, or soften H there"
+    return "Reduce `dt`, soften H there, or take a method with a clock of its own, such as 'log_leapfrog'"
+
+
+def _which(problem: Problem, rows: list[int]) -> str:
+    """The trajectories of a batch, in words."""
+    if problem.y0.ndim == 1:
+        return ""
+    first = ", ".join(map(str, np.unravel_index(rows[0], problem.y0.shape[:-1])))
+    return f" of trajectory {first}" + (f", the first of {len(rows)}," if len(rows) > 1 else "")
+
+
+def _end(outcome: Outcome, integrator: Integrator, problem: Problem, found: dict[int, Passage]) -> None:
+    """Set status −1 and the message of trajectories that passed a pole; end them before."""
+    poles, sign = problem.system.poles, 1.0 if problem.t1 >= problem.t0 else -1.0
+    assert poles is not None
+    rows = sorted(found, key=lambda row: (found[row].end - problem.t0) * sign)
+    first, which = found[rows[0]], _which(problem, rows)
+    if first.column < 0:
+        outcome.message = f"H{which} is infinite, or no number, at `y0`: start elsewhere."
+    else:
+        outcome.message = (
+            f"Between t = {first.begin:.10g} and {first.end:.10g} the run{which} passed {poles.name(first.column)}, "
+            f"where H is infinite or no number: no solution does. {_remedy(integrator, problem)}, or end `t_span` "
+            "earlier."
+        )
+    if problem.y0.ndim == 1:
+        keep = (outcome.t - first.begin) * sign <= 0
+        outcome.t, outcome.y, outcome.status = outcome.t[keep], outcome.y[keep], -1
+        outcome.stats["failed_at"] = first.begin
+        return
+    failed_at = np.full(int(np.prod(problem.y0.shape[:-1])), np.nan)
+    failed_at[list(found)] = [passage.begin for passage in found.values()]
+    before = np.asarray(outcome.stats.get("failed_at", np.nan)).reshape(-1)
+    failed_at = np.where(np.isnan(failed_at), before, failed_at).reshape(problem.y0.shape[:-1])
+    after = ~((outcome.t.reshape(-1, *[1] * failed_at.ndim) - failed_at) * sign <= 0) & np.isin(
+        np.arange(failed_at.size), list(found)
+    ).reshape(failed_at.shape)
+    outcome.stats["failed_at"], outcome.finite = failed_at, False
+    outcome.status = np.where(after.any(0) | ~np.isnan(failed_at), -1, outcome.status)
+    if is_tensor(outcome.y):
+        import torch
+
+        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], np.nan)
+    else:
+        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)
+
+
+def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem, told: bool = False) -> None:
     """Add to the message, and as `stats["blow_up_time"]`, when the solution of a failed run becomes infinite.
 
     The method's own last states tell little of when: a step leaps over a singularity and is finite for a while beyond
@@ -31,8 +216,11 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
 
     `blow_up_time` is an estimate. In a batch it is an array, NaN for
     the trajectories that have none; without any it is left out.
+
+    `told` says that the message tells of a pole already.
     """
-    _note_last_state(outcome, problem)
+    if not told:
+        _note_last_state(outcome, problem)
     if not (problem.system.conservative and problem.system.autonomous):  # a state of the solution is told by its energy
         return
     y0 = to_numpy(problem.y0)
@@ -40,6 +228,9 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
     last = outcome.t[-1] if len(outcome.t) else problem.t0
     failed_at = np.broadcast_to(np.asarray(outcome.stats.get("failed_at", last), dtype=float), y0.shape[:-1])
     rows = np.flatnonzero(failed & np.isfinite(failed_at).reshape(-1))
+    if problem.system.poles is not None and len(rows):  # of a start without H there is no solution
+        with np.errstate(all="ignore"):
+            rows = rows[np.isfinite(problem.system.hamiltonian(y0.reshape(-1, y0.shape[-1])[rows]))]
     times, passed = np.full(len(failed), np.nan), np.zeros(len(failed), dtype=bool)
     with np.errstate(all="ignore"):
         try:
@@ -143,6 +334,8 @@ def _end_of_solution(
 
     Open are those whose steps are spent. By Dormand and Prince's method of order 8, each with steps of its own.
     """
+    from scipy.integrate import DOP853
+
     A, B, E3, E5 = DOP853.A, DOP853.B, DOP853.E3, DOP853.E5
     n, d, begin = len(t), system.ndof, t.copy()
     h = (end - t) / 100

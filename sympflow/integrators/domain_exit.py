@@ -12,6 +12,7 @@ import numpy as np
 
 from sympflow.arrays import Array, finite_states, has_values, is_tensor, one_lane, readable, to_numpy
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
+from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome
 
@@ -74,6 +75,32 @@ def check_system_along(outcome: Outcome, integrator: Integrator, system: Hamilto
         f"`system` {system.name!r} is not the one that the flow was trained for: at the state ({shown}) of this run "
         "its H is another. Pass the flow of this system, or train one with sympflow.train(system)."
     )
+
+
+NEXT_TO = 1e-3
+"""Of the larger of q and p, in comparable units: where the other one is smaller, a run is at rest or has none."""
+
+
+def warn_of_tolerance(outcome: Outcome, system: HamiltonianSystem, tolerance: float, stacklevel: int) -> None:
+    """Warn of a run of which all q, or all p, are below the absolute tolerance, which hides their errors."""
+    y = to_numpy(outcome.y).reshape(-1, 2, system.ndof)
+    with np.errstate(all="ignore"):
+        sizes = np.abs(y).max(0, initial=0.0)
+        small = (sizes.max(-1) > 0) & (sizes.max(-1) <= tolerance)
+    if not small.any():
+        return
+    scale = weights(system)
+    scaled = (sizes * scale.reshape(2, -1)).max(-1)
+    at_rest = system.y0 is not None and scaled.max() <= np.finfo(float).eps * np.abs(scale * system.y0).max()
+    small &= (scaled > NEXT_TO * scaled.max()) & (not at_rest)
+    if small.any():
+        k = int(np.argmax(small))
+        warnings.warn(
+            f"`atol`, by default {tolerance:g}, is larger than every {'qp'[k]} of the run, at most "
+            f"{sizes[k].max():.3g}, whose errors it hides. Pass an `atol`, such as {sizes[k].max() * 1e-9:.0e}.",
+            RuntimeWarning,
+            stacklevel=stacklevel + 1,
+        )
 
 
 def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stacklevel: int) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sympflow.storage.runs import RunStore
 
 APART = 0.1
-"""Distance of two copies, over the largest coordinate or momentum of the run, beyond which its states mean little."""
+"""Distance of two copies, over the size of the states of the run, beyond which these mean little."""
 
 
 class Extension(Protocol):
@@ -34,7 +34,7 @@ class Extension(Protocol):
         ...
 
     def distance(self, x: Array) -> Array:
-        """Distance of states of the extended space from those that `lift` gives: (...)."""
+        """Distance of states of the extended space from those that `lift` gives, and their size: (..., 2)."""
         ...
 
 
@@ -80,9 +80,9 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Extension, proble
     if outcome.sol is not None:
         outcome.sol = Projected(outcome.sol, extension)
     if store is not None and "copy_distance" in store.noted:
-        apart, size = store.noted["copy_distance"], store.noted["size"]
-        outcome.stats["copy_distance"] = apart
-        if apart > APART * size and np.all(np.asarray(outcome.status) >= 0):
+        noted = np.array([store.noted[name] for name in ("copy_distance", "size")])
+        outcome.stats["copy_distance"] = apart = float(_ratio(noted))
+        if apart > APART and np.all(np.asarray(outcome.status) >= 0):
             _warn(extension, apart, "")
     elif len(x):
         _warn_of_distance(extension, to_numpy(x), outcome)
@@ -101,27 +101,34 @@ def _of_projections(search: EventSearch, extension: Extension) -> Any:
 def _noted(store: RunStore, extension: Extension, x: np.ndarray) -> np.ndarray:
     """The states of those of the extended space; a store keeps how far these are from ones that stand for a state."""
     with np.errstate(all="ignore"):
-        apart, size = np.asarray(extension.distance(x)), np.abs(x)
-    if not np.isnan(apart).all():
-        store.note(copy_distance=float(np.nanmax(apart)), size=float(np.nanmax(size)))
+        found = np.asarray(extension.distance(x)).reshape(-1, 2)
+    if not np.isnan(found).all():
+        apart, size = np.nanmax(found, axis=0).tolist()
+        store.note(copy_distance=apart, size=size)
     return np.asarray(extension.project(x))
 
 
 def _warn_of_distance(extension: Extension, x: np.ndarray, outcome: Outcome) -> None:
     with np.errstate(all="ignore"):
-        apart, size = np.asarray(extension.distance(x)), np.abs(x).max(-1)
-        ratio = apart.max(0) / size.max(0)
-    outcome.stats["copy_distance"] = float(np.nanmax(apart)) if not np.isnan(apart).all() else float("nan")
+        ratio = _ratio(np.asarray(extension.distance(x)).max(0))
+    outcome.stats["copy_distance"] = float(np.nanmax(ratio)) if not np.isnan(ratio).all() else float("nan")
     lost = (ratio > APART) & (np.asarray(outcome.status) >= 0)  # what has failed says more
     if lost.any():
         which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
-        _warn(extension, float(np.nanmax(apart)), which)
+        _warn(extension, float(np.nanmax(ratio)), which)
+
+
+def _ratio(found: np.ndarray) -> np.ndarray:
+    """Distances in units of sizes, (..., 2) to (...); 0 where nothing is apart."""
+    apart, size = found[..., 0], found[..., 1]
+    return np.where(apart == 0, 0.0, apart / np.where(size == 0, 1.0, size))
 
 
 def _warn(extension: Extension, apart: float, which: str) -> None:
     warnings.warn(
-        f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g}: its states say "
-        "little about the system. Reduce `dt`, or change `omega`, the strength by which the copies are bound.",
+        f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g} of the size of "
+        "the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which the "
+        "copies are bound.",
         RuntimeWarning,
         stacklevel=5,
     )

@@ -29,21 +29,47 @@ def no_event(n_steps: int, t: float) -> str:
     )
 
 
-def warn_of_jumps(system: HamiltonianSystem, t0: float, t1: float, dt: float | None, stacklevel: int) -> None:
-    """Warn where H is known to jump within a step of length dt, which loses its order there; not without one."""
+def warn_of_jumps(
+    system: HamiltonianSystem, t0: float, t1: float, dt: float | None, method: str | None, stacklevel: int
+) -> bool:
+    """Warn where H is known to jump, and a method of fixed steps loses its order: within a step of length dt, or where
+    one ends if the `method`, by its name, takes a force there. Return True if it does.
+    """
     if dt is None or not math.isfinite(t1) or t0 == t1:
-        return
+        return False
     times = system.jump_times(min(t0, t1), max(t0, t1), dt / 4)
     x = (times - t0) / dt
     within = np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(times)) / dt)
     if within.any():
         first = times[within][0 if t1 > t0 else -1]
-        warnings.warn(
+        text = (
             f"`dt` {dt:g}: H of {system.name!r} jumps within a step, at t = {first:.6g}, where every method is of "
-            "first order. Choose a `dt` that divides all pieces between jumps from t0 on, or solve from jump to jump.",
-            RuntimeWarning,
-            stacklevel=stacklevel + 1,
+            "first order. Choose a `dt` that divides all pieces between jumps from t0 on, or solve from jump to jump."
         )
+    else:
+        known = [] if method is None else sorted({t0, *times.tolist(), t1})
+        met = [t for t in known if t0 != t != t1 or _jumps_into(system, t, t0, t1, dt)]
+        if not met:
+            return False
+        text = (
+            f"`method` {method!r} takes forces at the ends of its steps, and H of {system.name!r} jumps at one, at "
+            f"t = {met[0] if t1 > t0 else met[-1]:.6g}: it is of first order there. Use one that takes none, such as "
+            "'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
+        )
+    warnings.warn(text, RuntimeWarning, stacklevel=stacklevel + 1)
+    return True
+
+
+def _jumps_into(system: HamiltonianSystem, t: float, t0: float, t1: float, dt: float) -> bool:
+    """Return True if H jumps at an end t of a run, and its value there is not that within the run."""
+    near = 4 * EPS * abs(t) + 1e-9 * dt
+    if not len(system.jump_times(t - near, t + near, dt / 4)):
+        return False
+    y = np.random.default_rng(0).uniform(-1, 1, (16, 2 * system.ndof)) * 10.0 ** np.arange(-8, 8)[:, None]
+    inward = math.copysign(1e-6 * dt, (t0 + t1) / 2 - t)
+    with np.errstate(all="ignore"):
+        outside, at, inside = (system.hamiltonian(y, t + s * inward) for s in (-1, 0, 1))
+        return bool((np.abs(at - inside) > 0.01 * np.abs(outside - inside)).any())
 
 
 class Grid:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -85,7 +86,8 @@ class Gauss(OwnStepper):
         M, D = collocation.newton_matrix(system, y[..., None, :] + A @ K, h, times, A, scale)
         s, n = K.shape[-2:]
         slopes = (h[..., None, None] * scale[:, None, None] * D).reshape(*y.shape[:-1], s * n, n)
-        dK = collocation.solved(M, slopes).reshape(*y.shape[:-1], s, n, n)
+        sizes = collocation.variable_sizes(y, K, 0 * M[..., 0])
+        dK = collocation.solved(M, slopes, sizes).reshape(*y.shape[:-1], s, n, n)
         J = np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
         if system.friction is not None:
             E = collocation.decays(system, h[..., 0])
@@ -103,13 +105,15 @@ class Gauss(OwnStepper):
     def own_stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
         from sympflow.kernels.implicit_loops import implicit_kernel
 
+        told: list[str] = []
         kernel = compiled_loops(
             lambda: implicit_kernel(problem.system, self.tableau, bool(self.compensated)),
             problem.y0,
             problem.backend,
             self.compensated,
+            told=told,
         )
-        return ArrayGauss(self, problem) if kernel is None else CompiledGauss(self, problem, kernel)
+        return ArrayGauss(self, problem, told) if kernel is None else CompiledGauss(self, problem, kernel)
 
 
 class _Counts:
@@ -140,8 +144,8 @@ class ArrayGauss(_Counts, Stepper):
 
     takes_carry = True
 
-    def __init__(self, gauss: Gauss, problem: Problem) -> None:
-        super().__init__(gauss, problem)
+    def __init__(self, gauss: Gauss, problem: Problem, told: Sequence[str]) -> None:
+        super().__init__(gauss, problem, told)
         self.gauss, self.iterations = gauss, 0
 
     def rollout(

@@ -53,6 +53,9 @@ class Projected(FixedStep):
     def takes_driving(self) -> bool:
         return self.inner.takes_driving
 
+    def forces_at_ends(self, system: HamiltonianSystem) -> bool:
+        return self.inner.forces_at_ends(system)
+
     def check(self, system: HamiltonianSystem) -> None:
         system.as_doubled()
         check_applies(self.inner, system)

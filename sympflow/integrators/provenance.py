@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-import numpy as np
-
 from sympflow._version import __version__
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.registry import name_of
+from sympflow.storage.identity import Known
 from sympflow.storage.layout import UNITS
 
 LONGEST_EXPRESSION = 10_000
@@ -64,25 +62,28 @@ def provenance(
     return told | {"units": UNITS}
 
 
-def run_identity(problem: Problem, integrator: Integrator, dt: float | None) -> dict[str, str]:
-    """Return what a stored run is known by, each part as a text: all but its end and the times of `t_eval`."""
-    system, y0 = problem.system, problem.y0
-    return {
-        "version": __version__,
-        "system": f"{system.name} {digest([system.expression, dict(system.params), list(system.fingerprint)])}",
-        "method": f"{name_of(integrator)}, {option_text(integrator)}, flow={flow_checksum(integrator, system)}",
+def known_by(system: HamiltonianSystem, integrator: Integrator, backend: str) -> Known:
+    """Return what every store knows its call by: the version, the system and the method, by all that they are made of.
+
+    The domain of a system, and the name of its time, are no part of it.
+    """
+    known = Known({"version": __version__, "backend": backend})
+    known.add("system", system.name, system)
+    options = f"{name_of(integrator)}, {option_text(integrator)}, flow={flow_checksum(integrator, system)}"
+    known.add("method", options, integrator, integrator.flow_for(system))
+    return known
+
+
+def run_identity(problem: Problem, integrator: Integrator, dt: float | None) -> Known:
+    """Return what a stored run is known by: all but its end and the times of `t_eval`."""
+    known, y0 = known_by(problem.system, integrator, problem.backend), problem.y0
+    known.texts |= {
         "dt": f"{dt!r}{', backwards' if problem.t1 < problem.t0 else ''}",
         "t0": repr(problem.t0),
-        "y0": f"{y0.dtype} of shape {y0.shape} {digest(y0)}",
         "outputs": f"every {problem.save_every}-th step" if problem.t_eval is None else "t_eval",
-        "backend": problem.backend,
     }
-
-
-def digest(value: Any) -> str:
-    """Return a checksum of an array, or of what has a text."""
-    data = value.tobytes() if isinstance(value, np.ndarray) else json.dumps(value, default=repr).encode()
-    return hashlib.sha256(data).hexdigest()[:16]
+    known.add("y0", f"{y0.dtype} of shape {y0.shape}", y0)
+    return known
 
 
 def _plain(params: Mapping[str, Any]) -> dict[str, Any]:

@@ -240,6 +240,11 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
     The functions of a user's system are tested too, for states such as y0. Friction, forces that are none of H, and H
     that depends on t are refused here for every method that does not say that it takes them.
     """
+    system.check_impulses(
+        "which are kicks between the steps of a method",
+        "solve it by sympflow.solve or sympflow.ensemble; or use system.between_impulses from one of the times of "
+        "system.kicks(t0, t1) to the next",
+    )
     mro = type(integrator).__mro__
     own_words = system.conservative or _speaks_for_itself(mro, "takes_friction")
     if system.external_force is not None and not (integrator.takes_forces and own_words):

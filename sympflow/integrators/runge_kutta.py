@@ -23,6 +23,9 @@ class ExplicitStep(ByVectorField):
     A: ClassVar[Any]
     B: ClassVar[Any]
 
+    def forces_at_ends(self, system: HamiltonianSystem) -> bool:
+        return True
+
     def step(self, system: HamiltonianSystem, t: Any, y: Array, h: float | Array) -> Array:
         """One step without error control."""
         times, h = self._stage_times(system, t, h), per_state(h, y)
@@ -75,6 +78,10 @@ class RungeKutta(ExplicitStep):
                 raise ValueError(f"`{name}` must be a finite number, not negative; got {value!r}.")
         if self.rtol == 0 and self.atol == 0:
             raise ValueError("`rtol` and `atol` are both 0, which no step can meet: make one of them positive.")
+
+    @property
+    def absolute_tolerance(self) -> float:
+        return float(self.atol) if self.atol == type(self).atol else 0.0
 
 
 def weighted(weights: Any, K: list[Array]) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copyreg
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.tangent_loops import TangentKernel
+
+
+END = 1e-9
+"""Distance from its ends, in steps, within which a force counts as taken there."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +139,10 @@ class Splitting(OwnStepper):
         For the splitting "parts": expressions that add up to H, in their order, the last innermost. The default is
         found in the terms of H: as few as possible, potentials first and the linear part last.
     omega : float, optional
-        For the splitting "copies": ω. The default is the largest |λ| of J∇²H at the system's y0. Weaker, the copies may
-        drift apart, of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the
-        copies; a run keeps both, and is symplectic in their phase space [3]_.
+        For the splitting "copies": ω, a rate; the copies are bound by ω Σ (s²(q − x)² + (p − y)²/s²)/2, where s makes q
+        and p comparable. The default is the largest |λ| of J∇²H at the system's y0. Weaker, the copies may drift apart,
+        of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the copies; a run
+        keeps both, and is symplectic in their phase space [3]_.
     shift : float, optional
         For the logarithmic clock: c, above the energy; default E + |E|, which is 0 for a bound system.
 
@@ -303,6 +308,10 @@ class Splitting(OwnStepper):
                     "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
                 )
 
+    def forces_at_ends(self, system: HamiltonianSystem) -> bool:
+        times = [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
+        return any(not END < c < 1 - END for c in times)
+
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         clock = self.on_clock(system)
         if clock is not None:
@@ -380,9 +389,11 @@ class Splitting(OwnStepper):
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
         make = composition.cuda_kernel if problem.backend == "cuda" else composition.kernel
-        kernel = compiled_loops(lambda: make(bool(self.compensated)), problem.y0, problem.backend, self.compensated)
+        told: list[str] = []
+        compensated = bool(self.compensated)
+        kernel = compiled_loops(lambda: make(compensated), problem.y0, problem.backend, compensated, told=told)
         if kernel is None:
-            return ArrayComposition(self, problem, composition)
+            return ArrayComposition(self, problem, composition, told)
         if problem.letters is not None:
             kernel = kernel.varied(problem.letters)
         return CompiledComposition(self, problem, composition, kernel)
@@ -408,8 +419,10 @@ class ArrayComposition(Stepper):
 
     takes_carry = True
 
-    def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition) -> None:
-        super().__init__(integrator, problem)
+    def __init__(
+        self, integrator: FixedStep, problem: Problem, composition: Composition, told: Sequence[str] = ()
+    ) -> None:
+        super().__init__(integrator, problem, told)
         self.composition = composition
 
     def rollout(

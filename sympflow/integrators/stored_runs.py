@@ -216,6 +216,8 @@ class StoredRun:
                 f"`t_span` ends at t = {self.grid.t1:.17g}, and `store` {store.asked!r} has reached t = "
                 f"{self.grid.t0 + k * self.grid.h:.17g}: give an end at that or later."
             )
+        if n > outputs.n + 1:
+            raise store.store.damaged(f"it tells of {n:,} outputs, and its {k:,} steps have none such")
         if n and not (n <= outputs.n and store.times(n - 1)[0] == outputs.part(n - 1, n)[0][0]):
             n -= 1
             store.truncate(n)

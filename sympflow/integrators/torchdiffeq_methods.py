@@ -474,9 +474,13 @@ class Adams(Watched):
         assert isinstance(trace, _Nodes)
         nodes = torch.as_tensor(np.abs(np.array(trace.times) - trace.times[0]), device=y.device)
         options = {"grid_constructor": lambda f, y0, t: nodes, "max_order": self.max_order}
+        smallest = min(
+            (float(x) for x in abs(y.detach()).reshape(-1, 2, y.shape[-1] // 2).amax((0, 2)) if x > 0), default=1
+        )
+        how = {"method": self.name, "rtol": 1e-7, "atol": 1e-9 * smallest}  # of the functional iteration
         with warnings.catch_warnings(record=True) as raised:
             warnings.simplefilter("always")
-            states = odeint(trace, y, nodes[[0, -1]], method=self.name, rtol=1e-7, atol=1e-9, options=options)
+            states = odeint(trace, y, nodes[[0, -1]], options=options, **how)
         for warning in raised:
             if str(warning.message).startswith("Functional iteration did not converge"):
                 trace.note = " Its functional iteration did not converge in every step: reduce `dt`."

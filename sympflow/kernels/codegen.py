@@ -57,6 +57,9 @@ class _KernelPrinter(PythonCodePrinter):
     def _print_Heaviside(self, expr: sp.Heaviside) -> str:
         return "(1.0 if {0} > 0.0 else (0.5 if {0} == 0.0 else 0.0))".format(self._print(expr.args[0]))
 
+    def _print_Piecewise(self, expr: sp.Piecewise) -> str:
+        return super()._print_Piecewise(expr).replace(" else None)", " else math.nan)")
+
     def _print_sin(self, expr: sp.sin) -> str:
         return f"fast_sin({self._print(expr.args[0])})"
 

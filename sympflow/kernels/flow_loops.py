@@ -188,7 +188,7 @@ class PrimedFlowKernel(Kernel):
 
         def make() -> tuple[StageTable, np.ndarray]:
             table = tables.polynomials(back)
-            return table, loops.rows(table)
+            return table, loops.rows(table, ranges=self._ranges)
 
         table, rows = tables.kept(("rows", back, loops.values), make)
         return loops.step_rows(table, tables.variable(h), h, y, tables.monomials, t, ranges=self._ranges, rows=rows)
@@ -227,7 +227,7 @@ class PrimedFlowKernel(Kernel):
             return loops.rows(before, h, t0), loops.rows(kernel, abs(h), start), loops.rows(after, h, start)
 
         def make() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            before, kernel, after = map(loops.rows, stages())
+            before, kernel, after = (loops.rows(table, ranges=self._ranges) for table in stages())
             return before, kernel, after
 
         return self._tables.kept(("processed", h, loops.values), make)

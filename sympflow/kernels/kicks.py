@@ -324,7 +324,7 @@ def _tried(
 
 def _numbered(f: sp.Expr, states: set[sp.Symbol], numbers: dict[sp.Expr, sp.Symbol]) -> sp.Expr:
     """The expression with a symbol for the part of each product that depends on b, g and c, or b and e, alone."""
-    if not f.args or not f.free_symbols - states:
+    if not isinstance(f, sp.Expr) or not f.args or not f.free_symbols - states:
         return f
     if f.is_Mul:
         fixed = [a for a in f.args if not a.free_symbols & states]
@@ -453,7 +453,10 @@ def _by_products(symbols: SymbolicHamiltonian, terms: int, prefix: str) -> list[
     schedule = Schedule(known, printed, prefix, PRODUCT, few=True)
     for letter, f in zip(letters.functions, vectorised(list(letters.functions.values())), strict=True):
         schedule.define(letter, f)
-    forms = [printable(_by_common_factors(_expanded(f, x), x)) for f in functions]
+    expanded = [_expanded(f, x) for f in functions]
+    if any(len(f.args) > MOST_TERMS for f in expanded):
+        return []
+    forms = [printable(_by_common_factors(f, x)) for f in expanded]
     shared, forms = sp.cse(forms, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
     for symbol, f in shared:
         schedule.define(symbol, f)
@@ -747,7 +750,7 @@ def _collected(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
 def _by_common_factors(f: sp.Expr, q: Sequence[sp.Symbol]) -> sp.Expr:
     """Horner's form: of the factors of the terms that most of them share, one after the other taken out."""
     terms = sp.Add.make_args(f)
-    counts = {s: sum(term.has(s) and (term / s).is_polynomial(s) for term in terms) for s in q}
+    counts = {s: sum(bool(term.has(s) and (term / s).is_polynomial(s)) for term in terms) for s in q}
     symbol = max(q, key=counts.__getitem__)
     if counts[symbol] < 2:
         return f

@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -115,7 +116,8 @@ def load_module(source: str, shared: Sequence[str] = ()) -> ModuleType:
         Sources of what it has in common with others: modules of their own, so that their functions are compiled once
         for all. All names of theirs are known in `source`, and in those after them. Python calls none of them.
     """
-    return _loaded(source, tuple(shared))
+    with _loading:
+        return _loaded(source, tuple(shared))
 
 
 def load_around(source: str, shared: Sequence[str] = (), **given: Any) -> ModuleType:
@@ -134,7 +136,8 @@ def _loaded(source: str, shared: tuple[str, ...]) -> ModuleType:
 def imports_source(shared: Sequence[str]) -> str:
     """The beginning of a source that knows the names of `shared` ones: see `load_module`."""
     shared = tuple(shared)
-    modules = [_shared(text, shared[:i]) for i, text in enumerate(shared)]
+    with _loading:
+        modules = [_shared(text, shared[:i]) for i, text in enumerate(shared)]
     return "".join(f"from {module.__name__} import *\n" for module in modules)
 
 
@@ -178,7 +181,16 @@ class _Cache(FunctionCache):
 
     Numba reads the index of what is there, writes a file beside it, and then the index: two processes in between each
     other would give two files one name.
+    A file that cannot be read, such as one that was cut where the disk was full, is compiled again.
     """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # whatever a damaged pickle raises
+            with _locked(".index-lock"), suppress(OSError):
+                self.flush()
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with _locked(".index-lock"):
@@ -256,6 +268,8 @@ def _write_once(folder: Path, name: str, source: str) -> Path:
     return path
 
 
+_loading = threading.RLock()
+"""Held while modules are made: another thread would see one of which some names are there."""
 _most_threads: ContextVar[int | None] = ContextVar("most_threads", default=None)
 
 

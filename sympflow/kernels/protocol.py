@@ -68,6 +68,7 @@ def run_state(
     first, running = 0, NOTHING[0]
     if carry is not None:
         first, running = carry.steps, np.empty(width) if carry.running is None else carry.running.copy()
+        _check_running(running, (width,))
     n_finite = run_one(lambda stop: rollout(y0, n_steps, save, out, stop, first, running), (n_steps - first) * work)
     if carry is not None:
         carry.advance(n_steps, running)
@@ -95,6 +96,7 @@ def run_states(
         first, before, shape = carry.steps, carry.running, (len(y0), width)
         fits = carry.spare is not None and carry.spare.shape == shape
         running = carry.spare if fits else np.empty(shape)  # new memory of many orbits takes as long as some steps
+        _check_running(running if before is None else before, shape)
 
     def rows(i: slice, stop: np.ndarray) -> None:
         if before is not None:
@@ -105,6 +107,15 @@ def run_states(
     if carry is not None:
         carry.advance(n_steps, running)
     return Run(out, n_finite)
+
+
+def _check_running(running: np.ndarray, shape: tuple[int, ...]) -> None:
+    """Refuse what loops would read beyond, as a damaged store may hold."""
+    if running.shape != shape or running.dtype != np.float64:
+        raise ValueError(
+            f"`store` is damaged: its run goes on from {running.dtype} of shape {running.shape}, not {shape}. Name "
+            "another folder."
+        )
 
 
 class Steps(NamedTuple):

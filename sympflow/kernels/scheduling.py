@@ -168,7 +168,7 @@ class Schedule:
             return self._product([self.value(factor) for factor in _factors(f)])
         if f.is_Pow:
             return self._power(f.base, f.exp, f)
-        if isinstance(f, sp.Function) and len(f.args) == 1:
+        if isinstance(f, sp.Function) and len(f.args) == 1 and not isinstance(f, sp.Piecewise):
             time, name = self.value(f.args[0])
             text = self._printed(f.func(sp.Symbol(name, real=True), evaluate=False)) if f.args[0] != 0 else ""
             return self._line(text or self._printed(f), time, FUNCTION)

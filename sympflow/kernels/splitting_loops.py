@@ -84,13 +84,16 @@ class SplittingLoops:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
-        self._has_ranges = self.closes = False
+        self._has_ranges = self.closes = self.traced = False
+        self._symbols = system.symbols
+        self._codes: dict[tuple[int, bool, Monomials], LoopFunctions] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if system.symbols is not None:
-            from sympflow.kernels.codegen import algebra_source  # SymPy, which Numba functions do without
+            from sympflow.hamiltonian.recorded import can_be_recorded  # SymPy, which Numba functions do without
+            from sympflow.kernels.codegen import algebra_source
             from sympflow.kernels.terms import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
@@ -107,6 +110,7 @@ class SplittingLoops:
                 damped = damped_drift(system, False)
                 self._compile = partial(symbolic_loops, system.symbols, algebra_source(system.symbols), damped)
                 self._has_ranges = True
+                self.traced = all(map(can_be_recorded, (system.symbols.V, system.symbols.T)))
                 V = system.symbols.V
                 self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial(*system.symbols.q) else LANES
         elif system.numba_functions is not None:
@@ -148,16 +152,26 @@ class SplittingLoops:
             Sum with Kahan's compensation, which lowers the growth of round-off, in runs.
         ranges
             Of positions: see `functions`.
+
+        Raises
+        ------
+        ValueError
+            If a function in H has no compiled form.
         """
-        return SplittingKernel(self, scheme, compensated, ranges)
+        kernel = SplittingKernel(self, scheme, compensated, ranges)
+        kernel._functions()  # so that what has no compiled form is refused here, and not by a run
+        return kernel
 
     def damped_kernel(self, scheme: Scheme, step: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> DampedKernel:
         """The loops of one scheme on a system with friction; single steps are made by `step(y, h)` on arrays."""
-        return DampedKernel(self, scheme, step)
+        kernel = DampedKernel(self, scheme, step)
+        kernel._functions()
+        return kernel
 
-    def takes_values(self, level: int) -> bool:
+    def takes_values(self, level: int, ranges: Ranges | None = None) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
-        return bool(self.values) and self.friction is None and takes_values(level)
+        traced = self.traced and not ranges
+        return bool(self.values) and (traced or (self.friction is None and takes_values(level)))
 
     def functions(
         self,
@@ -189,8 +203,25 @@ class SplittingLoops:
                 raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
             more: dict[str, Any] = {"varied": True} if varied else {}
             more |= {} if ranges is None else {"ranges": ranges}
-            self._variants[variant] = self._compile(level, compensated, monomials, **more)
+            self._variants[variant] = (
+                self._traced(level, compensated, monomials)
+                if self.traced and not ranges
+                else self._compile(level, compensated, monomials, **more)
+            )
         return self._variants[variant]
+
+    def _traced(self, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
+        """The functions over traced numbers, which serve batches with own values too."""
+        from sympflow.kernels.splittings import Splitting, SplittingCode
+
+        key = level, compensated, monomials
+        if key not in self._codes:
+            assert self._symbols is not None
+            ndim = None if self.friction is None else self.friction.damping.ndim
+            code = SplittingCode(Splitting(self._symbols.parametric, level, monomials, compensated, ndim))
+            processed = code.rollout_processed, code.rollout_processed_batch
+            self._codes[key] = LoopFunctions(code.rollout, code.rollout_batch, *processed, code.step_rows)
+        return self._codes[key]
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""
@@ -207,7 +238,14 @@ class SplittingLoops:
 
         return position_ranges(system.symbols, system.domain)
 
-    def rows(self, table: StageTable, h: float = 1.0, t0: float = 0.0, varied: bool = False) -> np.ndarray:
+    def rows(
+        self,
+        table: StageTable,
+        h: float = 1.0,
+        t0: float = 0.0,
+        varied: bool = False,
+        ranges: Ranges | None = None,
+    ) -> np.ndarray:
         """The numbers of a table that the loops read, with the values of the system's parameters where they take these.
 
         With friction the maps of the drifts are among them, of numbers for one h. Those of a driven system read the
@@ -217,7 +255,7 @@ class SplittingLoops:
             table = _with_friction(table, self.friction)
         if self.driven:
             return table.timed_rows(self.values, h, t0)
-        return table.rows(self.values if varied or self.takes_values(table.level) else ())
+        return table.rows(self.values if varied or self.takes_values(table.level, ranges) else ())
 
     def step_rows(
         self,
@@ -257,7 +295,8 @@ class SplittingLoops:
         x, h = given(x), given(h)
         t = given(np.broadcast_to(t, h.shape)) if self.driven else h
         functions = self.functions(table.level, False, monomials, varied, ranges)
-        functions.step_rows(self.rows(table, varied=varied) if rows is None else rows, x, h, t, y, out)
+        rows = self.rows(table, varied=varied, ranges=ranges) if rows is None else rows
+        functions.step_rows(rows, x, h, t, y, out)
         return out
 
 
@@ -274,7 +313,7 @@ class SplittingKernel(Kernel):
 
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         """The numbers of a run whose steps are h, as the loops read them; of a driven system from a time t0 on."""
-        return self.loops.rows(run_table(self.scheme, h), h, t0)
+        return self.loops.rows(run_table(self.scheme, h), h, t0, ranges=self._ranges)
 
     def run(
         self,
@@ -400,7 +439,9 @@ class DampedKernel(SplittingKernel):
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         assert self.loops.friction is not None
         table = _damped_stages(self.scheme, h, self.loops.friction)
-        return table.timed_rows(self.loops.values, h, t0) if self.loops.driven else table.packed
+        if self.loops.driven:
+            return table.timed_rows(self.loops.values, h, t0)
+        return table.rows(self.loops.values if self.loops.takes_values(table.level) else ())
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         y, h = np.asarray(y, dtype=np.float64), np.asarray(h, dtype=np.float64)

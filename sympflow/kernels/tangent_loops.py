@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.loop_functions import damped_drift, shared_by_lanes
+from sympflow.kernels.loop_functions import damped_drift, shared_by_lanes, takes_values
 from sympflow.kernels.modules import load_algebra, run_rows
 from sympflow.kernels.splitting_loops import damped_table, splitting_loops
 from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source, two_stages_source
@@ -70,7 +70,7 @@ class TangentKernel:
         self._scheme, self._friction = scheme, system.friction
         drift = damped_drift(system, False)
         damped = None if drift is None else replace(drift, copies=1 + vectors)
-        if loops.takes_values(scheme.level):
+        if loops.values and loops.friction is None and takes_values(scheme.level):
             symbols, self._values = symbols.parametric, loops.values
         self._make = partial(_rollout, symbols, scheme.level, scheme.monomials, vectors, damped)
 
@@ -91,6 +91,7 @@ class TangentKernel:
         limit: float = 0.0,
         single: bool = False,
         threads: int | None = None,
+        scale: np.ndarray | None = None,
     ) -> TangentRun:
         """`n_steps` steps of length h of every row of `y0`.
 
@@ -113,6 +114,8 @@ class TangentKernel:
             True to run each orbit by itself, which is faster for one, not in vector lanes.
         threads : int, optional
             The default is as many as pay.
+        scale : ndarray of shape (2d,), optional
+            Lengths are those of scale·w; 1 by default.
         """
         d, table, rollout = self.ndof, self._table(h), self._make(single)
         parts = np.empty((len(y0), 2, 1 + self.vectors, d))
@@ -123,9 +126,10 @@ class TangentKernel:
         spread = np.full((len(y0), len(save) + 1), np.nan)
         reached = np.zeros(len(y0), dtype=np.int64)
         save = np.ascontiguousarray(save, dtype=np.int64)
+        squares = np.ones(2 * d) if scale is None else scale**2
 
         def rows(i: slice, stop: np.ndarray) -> None:
-            rollout(table, x0[i], n_steps, every, save, kind, limit, growth[i], spread[i], reached[i], stop)
+            rollout(table, x0[i], squares, n_steps, every, save, kind, limit, growth[i], spread[i], reached[i], stop)
 
         run_rows(rows, len(y0), n_steps * table.shape[1] * x0.shape[1], threads)
         whole = reached >= 0

@@ -1,4 +1,4 @@
-"""Hints where no Hamiltonian explains the data: friction, velocities, another order of columns, no Hamiltonian at all.
+"""Hints where no Hamiltonian explains the data: friction, a drive, velocities, columns in another order, none at all.
 
 Each is a regression of the smoothed slopes with more freedom, or with rows in another order, against the same without.
 """
@@ -8,49 +8,77 @@ from __future__ import annotations
 import numpy as np
 
 from sympflow.learning.library import Library, library_for, polynomials
+from sympflow.learning.models import drags, turns
 from sympflow.learning.smoothing import Smooth
 from sympflow.learning.trajectories import Trajectories
 
 BETTER = 0.5
 """Share of the misfit that another reading of the data must leave at most, to be worth a word."""
+ALIKE = 1.2
+"""Factor by which a reading may leave more than the best, and is named if it stands before it."""
+TURNED = (
+    "The second half looks like velocities in a uniform magnetic field, by which p_i' = B p_j, p_j' = -B p_i with "
+    "B = {} for i < j: these are no momenta; with a mass m these are p_i - m B q_j/2 and p_j + m B q_i/2."
+)
+DRAG = (
+    "Quadratic drag p' = -c|p|p with c = {} would leave much less: it is no friction -γp, which alone can be learned; "
+    "give data in which it is small."
+)
+DRIVEN = (
+    "A force of angular frequency {} that depends on the time alone would leave much less: the data look driven, and "
+    "an H(t) is not learned; give data without the drive."
+)
+FREQUENCIES = 1000
+"""Halves of the angular frequency π over the longest time, up to which that of a drive is looked for."""
 
 
-def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str) -> str:
-    """The likeliest reason why the terms do not explain the data, with the remedy; else what is said otherwise."""
+def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str, damped: bool = False) -> str:
+    """The likeliest reason why the terms do not explain the data, with the remedy; else what is said otherwise.
+
+    Of a model that was `damped` friction is no reason.
+    """
     d, scales = data.ndof, data.scales
     x, v = smooth.points, smooth.slopes
-    X = library.fields(x)
+    friction = np.zeros((*x.shape, d))
+    for i in range(d):
+        friction[:, d + i, i] = -x[:, d + i]
+    of_terms = library.fields(x)
+    X = np.concatenate([of_terms, friction], 2) if damped else of_terms
     left = _left(X, v, scales)[0]
     found: list[tuple[float, str]] = []
     whole = library_for(None, d, 4, x)[0]
     widest = _left(whole.fields(x), v, scales)[0]
     if not {*whole.expressions} <= {*library.expressions}:
         found.append((widest, "Terms outside of the library fit much better: leave `terms` out, or give others."))
+    if not damped:
+        rest, theta = _left(np.concatenate([X, friction], 2), v, scales)
+        found.append(
+            (
+                rest,
+                f"Friction p' = -γp with γ = {_said(theta[-d:])} would leave much less: the data are dissipative, "
+                "areas of phase space shrink as exp(-γt), and no symplectic map explains them. Learn a flow with "
+                "damping.",
+            )
+        )
+    if d > 1:
+        turned = np.moveaxis(turns(x.T)[0], -1, 0)
+        rest, theta = _left(np.concatenate([X, turned], 2), v, scales)
+        found.append((rest, TURNED.format(_said(theta[-turned.shape[2] :]))))
+    rest, theta = _left(np.concatenate([X, np.moveaxis(drags(x.T)[0], -1, 0)], 2), v, scales)
+    found.append((rest, DRAG.format(_said(theta[-d:]))))
+    rest, frequency = _driven(X, smooth, scales)
+    found.append((rest * left, DRIVEN.format(f"{frequency:.4g}")))
     if d > 1:
         pairs = [*range(0, 2 * d, 2), *range(1, 2 * d, 2)]
         with np.errstate(all="ignore"):
-            turned = library.fields(x[:, pairs])
-        if np.isfinite(turned).all():
+            other = library.fields(x[:, pairs])
+        if np.isfinite(other).all():
             found.append(
                 (
-                    _left(turned, v[:, pairs], scales[pairs])[0],
+                    _left(other, v[:, pairs], scales[pairs])[0],
                     'The columns look like q1, p1, q2, p2, …: pass order="pairs".',
                 )
             )
-    friction = np.zeros((*x.shape, d))
-    for i in range(d):
-        friction[:, d + i, i] = -x[:, d + i]
-    rest, theta = _left(np.concatenate([X, friction], 2), v, scales)
-    rates = theta[len(library) :]
-    found.append(
-        (
-            rest,
-            f"Friction p' = -γp with γ = {', '.join(f'{g:.3g}' for g in rates)} would leave much less: the data are "
-            "dissipative, areas of phase space shrink as exp(-γt), and no symplectic map explains them. Learn a flow "
-            "with damping.",
-        )
-    )
-    if d > 1:
         rest, masses = _masses(library, x, v, scales, d)
         said = " : ".join(f"{m:.3g}" for m in masses)
         found.append(
@@ -59,7 +87,8 @@ def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str) -
                 f"The second half looks like velocities, of masses {said}: pass velocity_mass=[…], by which p = M v.",
             )
         )
-    best = min(found)
+    least = min(found)[0]
+    best = next(one for one in found if one[0] <= ALIKE * least)
     if best[0] < BETTER * left:
         return best[1]
     free = Library(polynomials(d, 3), d)
@@ -75,6 +104,35 @@ def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str) -
                 "of a Hamiltonian in these coordinates, or these are not canonical."
             )
     return otherwise
+
+
+def _said(numbers: np.ndarray) -> str:
+    return ", ".join(f"{number:.3g}" for number in numbers)
+
+
+def _driven(X: np.ndarray, smooth: Smooth, scales: np.ndarray) -> tuple[float, float]:
+    """The share of squares that a force a cos ωt + b sin ωt leaves, and ω; of other trajectories than those of a and b.
+
+    One trajectory cannot tell a drive from its own motion: infinite.
+    """
+    first = smooth.owner % 2 == 0
+    if first.all() or 2 * first.sum() < X.shape[2]:
+        return np.inf, 0.0
+    v, t, d = smooth.slopes, smooth.times, X.shape[1] // 2
+    theta = _left(X, v, scales)[1]
+    u = ((v - X @ theta) / scales)[:, d:]
+    longest = max(np.ptp(t[smooth.owner == i]) for i in np.unique(smooth.owner))
+    steps = np.diff(t)
+    most = min(int(2 * longest / np.median(steps[steps > 0])), FREQUENCIES)
+    frequencies = np.pi / longest * np.arange(0.5, max(most, 2) / 2, 0.25)
+    best = max(frequencies, key=lambda w: float(np.abs(np.exp(-1j * w * t) @ u).sum()))
+    forces = np.zeros((*v.shape, 2 * d))
+    for i in range(d):
+        forces[:, d + i, 2 * i], forces[:, d + i, 2 * i + 1] = np.cos(best * t), np.sin(best * t)
+    whole = np.concatenate([X, forces], 2)
+    fits = [(A, _left(A[first], v[first], scales)[1]) for A in (whole, X)]
+    theirs, mine = (float(((((v - A @ c) / scales)[~first]) ** 2).sum()) for A, c in fits)
+    return theirs / mine if mine > 0 else np.inf, float(best)
 
 
 def _left(X: np.ndarray, v: np.ndarray, scales: np.ndarray) -> tuple[float, np.ndarray]:

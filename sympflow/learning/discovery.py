@@ -435,7 +435,7 @@ class _Search:
         regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
         most = min(most, self.most_terms)
         found = [way(most, part) for part in self._parts() for way in (regression.forward, regression.backward)]
-        different = [*map(list, {tuple(sorted(active)) for active in found})]
+        different = [[*way] for way in {tuple(sorted(active)) for active in found}]
         ways = sorted(different, key=regression.criterion)[:STARTS]
         for _ in range(8):
             starts = []

@@ -21,6 +21,7 @@ from sympflow.learning.shooting import (
     first_states,
     matched,
     minimized,
+    rho,
     steppers,
 )
 from sympflow.learning.smoothing import smoothed
@@ -45,6 +46,10 @@ SILENT = 0.5  # of the spread of the data, that noise leaves at most where a mod
 HUBER = 1.5  # σ
 LOSSES = {"squares": None, "huber": HUBER}
 CORRELATED = 0.1  # correlation of one residual with the next that chance is allowed to make, beside 3/√n
+LAG = 0.6  # of the time in which states move by their spread, after which noise of smoothed data is another
+SMOOTHED = 0.5  # correlation of neighbours from which the noise is that of data that were smoothed
+FORGOTTEN = 0.25  # correlation with residuals a lag later, up to which they are such noise
+FEWEST_PAIRS = 30  # of residuals that count as independent, to tell such noise from what a model leaves
 
 
 def limit_of(loss: str) -> float | None:
@@ -74,6 +79,9 @@ class Setting:
         Asked between steps.
     seen : ndarray of shape (2d,) or None
         The noise as it is seen without a model, at most: 0 where it is not.
+    lag : float
+        The time after which residuals are compared, if points are closer: what a model leaves is there still, while the
+        noise of data that were smoothed is another.
     rival : ndarray of shape (2d,) or None
         The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is given
         up.
@@ -83,6 +91,7 @@ class Setting:
     huber: float | None = None
     stop: Stop = lambda: False
     seen: np.ndarray | None = None
+    lag: float = 0.0
     rival: np.ndarray | None = None
 
     def plausible(self, noise: np.ndarray) -> bool:
@@ -130,7 +139,7 @@ class Fitted:
     def loss(self, sigma: np.ndarray) -> float:
         """Minus the log-likelihood of what it was fitted to, but for a constant, for noise σ (2d,)."""
         r = np.concatenate(self.fit.residuals, axis=1)
-        return float(0.5 * np.nansum((r / sigma[:, None]) ** 2))
+        return float(0.5 * np.nansum(rho(r / sigma[:, None], self.fit.problem.huber)))
 
     @property
     def states(self) -> np.ndarray:
@@ -139,16 +148,17 @@ class Fitted:
 
 
 def fitted(
-    model: Field, data: Trajectories, setting: Setting, theta: np.ndarray | None = None, seed: int = 0
+    model: Field, data: Trajectories, setting: Setting, theta: np.ndarray | Fitted | None = None, seed: int = 0
 ) -> Fitted:
     """Fit a model: to increments, to orbits of a few points, and to orbits as long as their errors stay small.
 
     Parameters
     ----------
-    theta : ndarray, optional
-        A start; else one is made.
+    theta : ndarray or Fitted, optional
+        A start, or the fit of the same model to other trajectories, whose orbits are as long at once; else one is made.
     """
-    scales = data.scales
+    scales, former = data.scales, theta if isinstance(theta, Fitted) else None
+    theta = theta.theta if isinstance(theta, Fitted) else theta
     if theta is None:
         theta = model.start(np.random.default_rng(seed))
         if model.lagrangian:
@@ -159,10 +169,12 @@ def fitted(
             steps = 1 if model.linear else MATCHED_STEPS
             theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, steps)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
-    sigma = 1e-2 * scales if given is None else given
-    span = 0.0 if model.stepper is None else model.stepper.longest  # a map of its own is fitted over all of a step
+    sigma = given if given is not None else 1e-2 * scales if former is None else former.sigma
+    span = (
+        former.span if former is not None else 0.0 if model.stepper is None else model.stepper.longest
+    )  # a map of its own is fitted over all of a step
     pieces = data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
-    states = first_states(pieces)
+    states = first_states(pieces) if former is None or not span else _states(former, data, pieces, sigma, setting)
     costs: list[float] = []
     finer = 1.0
     for attempt in range(1 + ROUNDS):
@@ -170,7 +182,7 @@ def fitted(
         tolerance = np.clip(0.02 * finer * sigma, 1e-12 * scales, 1e-4 * scales)
         method = chosen_method(model, theta, pieces, tolerance, HALVINGS if attempt else FIRST_HALVINGS)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
-        gain = FINE if attempt and setting.plausible(sigma) else COARSE
+        gain = FINE if (attempt or former is not None) and setting.plausible(sigma) else COARSE
         most = STEPS if model.stepper is None else OWN_STEPS
         fit = minimized(problem, theta, states, iterations=most, gain=gain, stop=setting.stop)
         theta, before = fit.theta, sigma
@@ -211,6 +223,14 @@ def restored(model: Field, data: Trajectories, numbers: dict[str, Any], setting:
     return Fitted(model, theta, sigma, fit, span, list(numbers["costs"]))
 
 
+def _states(found: Fitted, data: Trajectories, pieces: Trajectories, sigma: np.ndarray, setting: Setting) -> np.ndarray:
+    """The initial states (N, 2d) of pieces, by a few points each: the first observation alone leads far astray."""
+    few = data.pieces(FIRST_POINTS)
+    short = Problem(found.model, few, found.method, sigma, frozen=True, huber=setting.huber)
+    orbits = minimized(short, found.theta, first_states(few), iterations=20, patience=1).orbits
+    return np.concatenate(orbits, axis=1)[:, _starts(pieces.runs)].T
+
+
 def _starts(runs: Sequence[Run]) -> np.ndarray:
     """The places of the first points of runs among all points."""
     return np.concatenate([[0], np.cumsum([run.n_points for run in runs])[:-1]])
@@ -245,15 +265,15 @@ class Held:
     pieces : tuple of Run
         The pieces of trajectories, each followed as one orbit.
     residuals : tuple of ndarray
-        Of each piece, (2d, k).
+        Of each piece, (2d, k); where the loss is robust outliers are limited.
     losses : ndarray of shape (N,)
         Minus the log-likelihood of each trajectory.
     values : int
         Numbers observed.
     correlation : float
-        Of one residual with the next; NaN where there are none.
+        Of one residual with the next, or with one a lag later; NaN where there are none.
     pairs : int
-        How many of them.
+        How many of them count as independent.
     exact : bool
         True if residuals are no more than rounding and the scheme leave.
     loudness : float
@@ -272,6 +292,12 @@ class Held:
     exact: bool
     loudness: float
     excess: float = 0.0
+    lag: float = 0.0
+
+    @property
+    def later(self) -> str:
+        """The residual that one is compared with."""
+        return f"another {self.lag:.2g} later" if self.lag else "the next"
 
     @property
     def loss(self) -> float:
@@ -288,7 +314,7 @@ class Held:
                 f"they are {self.loudness:.1f} times the noise, as it was given or as the trajectories that the model "
                 "was fitted to show it"
             )
-        return f"the correlation of one with the next is {self.correlation:.2f}"
+        return f"the correlation of one with {self.later} is {self.correlation:.2f}"
 
     def squares(self, scales: np.ndarray) -> float:
         """The mean square of the residuals in units of the scales (2d,)."""
@@ -307,42 +333,57 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     pieces = held.pieces(span=found.span) if found.span else held.pieces(FIRST_POINTS)
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
-    # the first observation alone leads astray along a whole orbit: a few points give the start
-    few = held.pieces(FIRST_POINTS)
-    short = replace(problem, data=few)
-    orbits = minimized(short, found.theta, first_states(few), iterations=20).orbits
-    states = np.concatenate(orbits, axis=1)[:, _starts(pieces.runs)].T
-    fit = minimized(problem, found.theta, states, iterations=20)
+    states = _states(found, held, pieces, sigma, setting)
+    fit = minimized(problem, found.theta, states, iterations=20, patience=1)
     residuals = fit.residuals
     ends = np.cumsum([run.n_points for run in held.runs])
     owner = np.searchsorted(ends, _starts(pieces.runs), side="right")
     losses = np.zeros(len(held.runs))
-    same = size = 0.0
-    values = pairs = 0
+    values = int(sum(np.isfinite(left).sum() for left in residuals))
     for i, left in zip(owner, residuals, strict=True):
         r = left / sigma[:, None]
-        seen = np.isfinite(r)
-        losses[i] += 0.5 * np.nansum(r * r) + (seen * np.log(sigma * math.sqrt(2 * math.pi))[:, None]).sum()
-        values += int(seen.sum())
-        both = seen[:, 1:] & seen[:, :-1]
-        same += float(np.nansum(r[:, 1:] * r[:, :-1]))
-        size += float(np.nansum(r * r) * both.sum() / max(seen.sum(), 1))
-        pairs += int(both.sum())
+        losses[i] += 0.5 * np.nansum(rho(r, setting.huber))
+        losses[i] += (np.isfinite(r) * np.log(sigma * math.sqrt(2 * math.pi))[:, None]).sum()
     exact = bool(all((np.abs(r)[np.isfinite(r)] < 100 * EXACT * scales.max()).all() for r in residuals))
+    limits = None if setting.huber is None else setting.huber * sigma[:, None]
+    residuals = [left if limits is None else np.clip(left, -limits, limits) for left in residuals]
+    near, beside = _correlation(pieces.runs, residuals, sigma, 0.0)
+    far, pairs = _correlation(pieces.runs, residuals, sigma, setting.lag)
+    some = int(pairs * (1 - near) / (1 + near)) if near > SMOOTHED else 0
+    lagged = setting.lag > held.time_scale and some >= FEWEST_PAIRS and abs(far) < FORGOTTEN
+    correlation, pairs = (far, some) if lagged else (near, beside)
     losses = np.where(np.isfinite(losses), losses, np.inf)
-    correlation = same / size if size > 0 else math.nan
     loudness = math.sqrt(fit.cost / values)
     excess = 0.0
-    if setting.seen is not None and (setting.seen > 0).any():
+    if setting.seen is not None and (setting.seen > 0).any() and not lagged:  # else it is not seen
         excess = float(np.max(found.sigma[setting.seen > 0] / setting.seen[setting.seen > 0]))
-    return Held(pieces.runs, tuple(residuals), losses, values, correlation, pairs, exact, loudness, excess)
+    lag = setting.lag if lagged else 0.0
+    return Held(pieces.runs, tuple(residuals), losses, values, correlation, pairs, exact, loudness, excess, lag)
+
+
+def _correlation(
+    runs: Sequence[Run], residuals: Sequence[np.ndarray], sigma: np.ndarray, lag: float
+) -> tuple[float, int]:
+    """The correlation of residuals with those a lag later, the next at least, NaN without any; and their number."""
+    same = size = 0.0
+    pairs = 0
+    for run, left in zip(runs, residuals, strict=True):
+        r = left / sigma[:, None]
+        later = np.maximum(np.searchsorted(run.t, run.t + lag), np.arange(1, run.n_points + 1))
+        first = np.flatnonzero(later < run.n_points)
+        product = r[:, later[first]] * r[:, first]
+        both = int(np.isfinite(product).sum())
+        same += float(np.nansum(product))
+        size += float(np.nansum(r * r) * both / max(np.isfinite(r).sum(), 1))
+        pairs += both
+    return (same / size if size > 0 else math.nan), pairs
 
 
 def left_out(found: Fitted, folds: Sequence[tuple[Trajectories, Trajectories]], setting: Setting) -> Held:
     """The likelihood of held-out trajectories; of several divisions, each by a fit to the others from this one."""
     if len(folds) == 1:
         return judged(found, folds[0][1], setting)
-    parts = [judged(fitted(found.model, data, setting, found.theta), held, setting) for data, held in folds]
+    parts = [judged(fitted(found.model, data, setting, found), held, setting) for data, held in folds]
     values, pairs = np.array([part.values for part in parts]), np.array([part.pairs for part in parts])
     share = np.average([part.correlation if part.pairs else 0.0 for part in parts], weights=pairs + 1e-300)
     loudness = math.sqrt(np.average([part.loudness**2 for part in parts], weights=values))
@@ -356,6 +397,7 @@ def left_out(found: Fitted, folds: Sequence[tuple[Trajectories, Trajectories]], 
         all(part.exact for part in parts),
         loudness,
         max(part.excess for part in parts),
+        max(part.lag for part in parts),
     )
 
 

@@ -25,6 +25,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
 from sympflow.learning.fitting import (
+    LAG,
     SILENT,
     Fitted,
     Held,
@@ -41,8 +42,8 @@ from sympflow.learning.library import library_for
 from sympflow.learning.models import Formula, FreeField, Model, Pairs, Part, Polynomial
 from sympflow.learning.shooting import Field, Method
 from sympflow.learning.smoothing import smoothed
-from sympflow.learning.symplecticity import Reading, best_by_increments, free_reading
-from sympflow.learning.trajectories import Trajectories, periods_of
+from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
+from sympflow.learning.trajectories import FEW, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
@@ -51,6 +52,11 @@ from sympflow.training.trainer import train
 from sympflow.workers import Crew
 
 HELD_OUT = 0.2  # of the trajectories
+TIME_BUDGET = 60.0  # seconds
+WIDE = 32  # trajectories from which orbits side by side cost no more than their steps; of fewer long ones are cut
+LONG_POINTS, LONG = 100, 12.0  # points, and times in which states move by their spread, that the pieces have at least
+ALONE = 24  # points of the pieces of a trajectory that is the only one, at least
+HOPELESS = 4.0  # squares of increments, over those of the best model, from which a model is one of the last
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
 DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
@@ -61,6 +67,7 @@ POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, tha
 LEAST_SECONDS = 1.0  # for the flow, however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
+CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
 ROUGH = 60  # points from which the roughness of the data tells their noise to a fifth
 GROWS = 4.0  # standard errors below 0, from which a negative friction is no chance
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
@@ -85,7 +92,7 @@ def learn(
     name: str = "learned",
     checkpoint: Path | None = None,
     resume: Path | None = None,
-    time_budget: float | None = None,
+    time_budget: float | None = TIME_BUDGET,
     progress: bool | None = None,
     callback: Callable[[int, dict[str, float]], None] | None = None,
     workers: Any = 1,
@@ -101,8 +108,9 @@ def learn(
     ----------
     trajectories
         A list of (t, y), t (n,) and y (2d, n), each with its own times; a pair of arrays t (n,) and y (N, 2d, n); or
-        any data that `sympflow.learning.trajectories.Trajectories.read` takes. NaN is what is missing. At least two
-        trajectories: a fifth of them is held out, three at least; of fewer than eight each is left out in turn.
+        any data that `sympflow.learning.trajectories.Trajectories.read` takes. NaN is what is missing. A fifth of the
+        trajectories is held out, three at least; of fewer than eight each is left out in turn, or in one of three
+        parts. A trajectory that is the only one is cut into pieces, of which some are held out.
     ndof : int, optional
         Degrees of freedom d.
     dt : float, optional
@@ -132,7 +140,8 @@ def learn(
     name : str
         Of the learned system.
     checkpoint, resume, time_budget, progress, callback, workers
-        As for `sympflow.train`. A checkpoint is written after each model; `workers` share the replicas.
+        As for `sympflow.train`; None for a search that ends by itself. A checkpoint is written after each model;
+        `workers` share the replicas.
     **reading
         Options of `Trajectories.read`, such as `units`, `order` and `velocity_mass`.
 
@@ -146,8 +155,8 @@ def learn(
     Raises
     ------
     ValueError, TypeError
-        If the trajectories are not as they should be, there is only one, they hold fewer numbers than the simplest
-        model has, or an argument is not admissible.
+        If the trajectories are not as they should be, the only one is too short to be cut, they hold fewer numbers than
+        the simplest model has, or an argument is not admissible.
 
     Warns
     -----
@@ -173,16 +182,19 @@ def learn(
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
     smooth = smoothed(data)
-    setting = Setting(_noise(noise, data), huber, seen=smooth.sigma if data.n_points >= ROUGH else None)
-    said = replace(said, flow_scaling=data.scaling._replace(t=_step(data, smooth.slopes) if dt is None else float(dt)))
+    rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
+    seen = smooth.sigma if data.n_points >= ROUGH else None
+    setting = Setting(_noise(noise, data), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
+    said = replace(said, flow_scaling=data.scaling._replace(t=_step(data, rate) if dt is None else float(dt)))
     chosen = families(said, family)
-    folds = data.folds(HELD_OUT, seed)
+    folds = [(_cut(one, rate), _cut(others, rate)) for one, others in _divided(data, seed)]
     if len(folds) == 1:
         folds = [(_few(folds[0][0], seed), _few(folds[0][1], seed))]
     if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0 or replicas == 1:
         raise ValueError(f"`replicas` must be an integer, 0, or 2 or more; got {replicas!r}: 20 give useful bands.")
     options = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
-    search = Search(data, folds, said, setting, seed, identity=_identity(data, said, setting, options))
+    identity = _identity(data, said, setting, options)
+    search = Search(_cut(data, rate), folds, said, setting, seed, identity=identity, whole=data)
     if resume is not None:
         search.resume(resume)
     with session.interruption, session.crew:
@@ -194,12 +206,25 @@ def learn(
         return flow
 
 
-def _step(data: Trajectories, slopes: np.ndarray) -> float:
+def _step(data: Trajectories, rate: float) -> float:
     """Δt of a flow that is fitted itself: in which states move by about their spread, but no longer than the data."""
-    rate = float(np.sqrt(np.mean((slopes / data.scales) ** 2))) if len(slopes) else 0.0
     longest = max(run.span for run in data.runs)
     step = min(1 / rate, longest) if rate > 0 else longest
     return float(f"{step:.1g}")
+
+
+def _divided(data: Trajectories, seed: int) -> list[tuple[Trajectories, Trajectories]]:
+    """Divisions of the trajectories, or of pieces of the only one."""
+    pieces = min(FEW, data.n_points // ALONE)
+    if len(data.runs) > 1 or pieces < 2:
+        return data.folds(HELD_OUT, seed)
+    return data.pieces(math.ceil(data.n_points / pieces)).folds(HELD_OUT, seed)
+
+
+def _cut(data: Trajectories, rate: float) -> Trajectories:
+    """The same where there are many trajectories; of few, long ones in pieces, which are followed side by side."""
+    points = LONG_POINTS if rate == 0 else max(LONG_POINTS, math.ceil(LONG / rate / data.time_scale))
+    return data if len(data.runs) >= WIDE else data.pieces(points)
 
 
 def _few(data: Trajectories, seed: int) -> Trajectories:
@@ -391,6 +416,13 @@ class Freedom:
     rate: float
 
 
+def _certain(forces: int, fit: Fitted, held: Held) -> bool:
+    """True if the factor of one of the forces is more than chance, which noise that is correlated makes larger."""
+    repeated = min(max(held.correlation, 0.0), 0.99) if math.isfinite(held.correlation) else 0.99
+    errors = np.sqrt(np.diag(fit.fit.covariance())[-forces:] * (1 + repeated) / (1 - repeated))
+    return bool((np.abs(fit.theta[-forces:]) > CERTAIN * max(held.loudness, 1.0) * errors).any())
+
+
 @dataclass
 class Search:
     """The models that were fitted so far, and the best of them."""
@@ -413,6 +445,8 @@ class Search:
     """Another explanation of the data, where increments make any H doubtful."""
     tested: list[Freedom | None] = field(default_factory=list)
     """The comparison with a vector field that need not be Hamiltonian, once it was made; None where H does as well."""
+    whole: Trajectories | None = None
+    """The trajectories as they were before they were cut; None if they were not."""
     final: Fitted = field(init=False)
     """The chosen model, fitted to all trajectories."""
 
@@ -445,7 +479,8 @@ class Search:
         because = (
             "its residuals on held-out trajectories are no more than rounding"
             if held.exact
-            else "it explains held-out trajectories best, and its residuals are noise: one tells nothing of the next"
+            else "it explains held-out trajectories best, and its residuals are noise: one tells nothing of "
+            f"{held.later}"
             if held.explained
             else f"it explains held-out trajectories best; but its residuals are not noise: {held.complaint}"
         )
@@ -458,16 +493,17 @@ class Search:
         setting = replace(self.setting, stop=deadline.over)
         total = sum(1 for name in names for _ in FAMILIES[name].models(self.said))
         with session.bar(total, "Models") as self.bar:
-            self._ask(names, setting, session)
+            queue = self._ask(names, setting, session)
             if self.best is not None:
                 self.final, self.cut = self.winner[1], deadline.over()
                 return
-            for name in names:
+            for place, (linear, candidates) in enumerate(queue):
                 if self.best is not None and (self.best[2].explained or deadline.over()):
                     break
-                if self.best is not None and not FAMILIES[name].linear and self.freedom(setting) is not None:
+                if self.best is not None and not linear and self.freedom(setting) is not None:
                     break
-                self._climb(name, setting, session)
+                own = deadline.part(min(2 / (len(queue) - place), 1.0))
+                self._climb(candidates, replace(setting, stop=own.over), session)
         if self.best is None:
             raise ValueError(
                 f"`trajectories` have {self.data.n_values} numbers, fewer than the simplest model and the initial "
@@ -481,27 +517,44 @@ class Search:
             self._simplify(with_unit_mass(self.winner[0], self.said), setting, session)
         candidate, self.final, _ = self.winner
         if not deadline.over():
-            self.final = fitted(candidate.model, self.all, setting, self.final.theta)
+            smooth = replace(setting, seen=None) if self.winner[2].lag else setting
+            found = fitted(candidate.model, self.whole or self.all, smooth, self.final)
+            self.final = self.final if setting.stop() and found.span < self.final.span else found
         self.final = without_growth(self.final)
         self.cut = deadline.over()
 
-    def _ask(self, names: list[str], setting: Setting, session: Session) -> None:
+    def _ask(self, names: list[str], setting: Setting, session: Session) -> list[tuple[bool, list[Candidate]]]:
         """Keep the best of the simple models if no H explains the data, which is known before any other is fitted.
 
-        Where increments say so, orbits of that model are compared with those of another reading.
+        Where increments say so, orbits of that model are compared with those of another reading. The models of the
+        families are returned in the order in which they are to be tried, with True for those that are linear: those
+        that leave much more of increments than the best of all are the last.
         """
-        linear = [c for name in names if FAMILIES[name].linear for c in FAMILIES[name].models(self.said)]
+        queue = [(FAMILIES[name].linear, [*FAMILIES[name].models(self.said)]) for name in names]
+        linear = [c for is_linear, candidates in queue if is_linear for c in candidates]
         found = best_by_increments(*self.folds[0], [candidate.model for candidate in linear])
-        if found is None or found[1] is None:
-            return
-        place, self.reading = found
-        chosen = linear[place], *self._first_fold(linear[place].model, setting)
-        self.best = chosen
-        if chosen[2].explained or self.freedom(setting) is None:
+        if found is None:
+            return queue
+        place, self.reading, squares = found
+        if self.reading is not None:
+            chosen = linear[place], *self._first_fold(linear[place].model, setting)
+            self.best = chosen
+            if not chosen[2].explained and self.freedom(setting) is not None:
+                self._note(chosen, session)
+                return []
             self.best = self.reading = None
             self.tested.clear()
-            return
-        self._note(chosen, session)
+        hopeless = [id(linear[k]) for k in squares if squares[k] > HOPELESS * squares[place]]
+        kept = [(kind, [c for c in some if id(c) not in hopeless]) for kind, some in queue]
+        # H = T(p) + V(q) is tried first, unless functions H(q, p) alone explain increments
+        separable = [name for name in names if FAMILIES[name].separable]
+        promising = any(
+            of for (_, of), name in zip(kept, names, strict=True) if name in separable and FAMILIES[name].linear
+        )
+        apart = bool(squares) and not promising
+        order = sorted(range(len(names)), key=lambda i: apart and names[i] in separable)
+        late = [(True, [c for c in some if id(c) in hopeless]) for kind, some in queue if kind]
+        return [group for group in [*(kept[i] for i in order), *late] if group[1]]
 
     def _first_fold(self, model: Model, setting: Setting) -> tuple[Fitted, Held]:
         """A model that is fitted to the first division of the trajectories, and what it leaves of the others there."""
@@ -511,14 +564,16 @@ class Search:
         found = fitted(model, data, setting, seed=self.seed)
         return found, judged(found, held, self.setting)
 
-    def _climb(self, name: str, setting: Setting, session: Session) -> None:
-        """Fit the models of a family, until two that follow each other are no better than one before."""
-        worse = 0
-        for candidate in FAMILIES[name].models(self.said):
+    def _climb(self, candidates: list[Candidate], setting: Setting, session: Session) -> None:
+        """Fit the models of a family, until two that follow each other are no better than one of it before."""
+        worse, best = 0, None
+        for candidate in candidates:
             over = self.best is not None and (self.best[2].exact or setting.stop())
             if over or worse == 2 or not self._affords(candidate):
                 return
-            worse = 0 if self._try(candidate, setting, session) else worse + 1
+            made = self._try(candidate, setting, session)
+            better = best is None or gains(best[2], made[2])
+            worse, best = (0, made) if better else (worse + 1, best)
 
     def _affords(self, candidate: Candidate) -> bool:
         """True if there are more numbers than the model and the initial states have."""
@@ -552,14 +607,13 @@ class Search:
         if session.callback is not None:
             session.callback(len(self.history), figures)
 
-    def _try(self, candidate: Candidate, setting: Setting, session: Session) -> bool:
-        """Fit a model; True if it is the best so far."""
+    def _try(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
+        """Fit a model, and keep it if it is the best so far."""
         rival = None if self.best is None else self.best[1].sigma
         made = self._fit(candidate, replace(setting, rival=rival), session)
         if self.best is None or gains(self.best[2], made[2]):
             self.best = made
-            return True
-        return False
+        return made
 
     def _simplify(self, candidate: Candidate | None, setting: Setting, session: Session) -> None:
         """Fit the best model with fewer numbers, and take that unless what it explains less is worth them."""
@@ -594,8 +648,6 @@ class Search:
     def diagnose(self, session: Session) -> None:
         """Warn where the residuals of the best model are no noise, with what may be the reason."""
         candidate, _, held = self.winner
-        if self.unseen:
-            warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
         if held.explained:
             share = float(np.min(self.winner[1].sigma / self.data.scales))
             if share > SILENT:
@@ -606,6 +658,8 @@ class Search:
                     UserWarning,
                     stacklevel=4,
                 )
+            elif self.unseen:
+                warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
             return
         said = (
             f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: "
@@ -626,7 +680,8 @@ class Search:
                 return
         smooth = smoothed(self.data)
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
-        said += " " + hint(library_for(None, self.data.ndof, 4, smooth.points)[0], smooth, self.data, otherwise)
+        library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.said.rates > 0
+        said += " " + hint(library, smooth, self.data, otherwise, damped)
         warnings.warn(said, UserWarning, stacklevel=4)
 
     def freedom(self, setting: Setting) -> Freedom | None:
@@ -641,24 +696,29 @@ class Search:
 
     def _freedom(self, setting: Setting) -> Freedom | None:
         """The same by one division of the trajectories: a difference as large as is asked for needs no more."""
+        if self.reading is not None:
+            return self._beside(self.reading, setting)
+        best, scales = self.winner[0].model, self.data.scales
+        damped = [] if best.rates or not isinstance(best, Model) else forced(best)[:1]
+        free = next((r for r in map(partial(free_reading, scales), (3, 2)) if self._affords_field(r.field)), None)
+        found = (self._beside(r, setting) for r in (*damped, free) if r is not None and self._affords_field(r.field))
+        return next((one for one in found if one is not None), None)
+
+    def _beside(self, reading: Reading, setting: Setting) -> Freedom | None:
+        """A reading beside the best H; None if it does not explain much more."""
         data, others = self.folds[0]
         scales, rivals = data.scales, [self.winner[0].model]
-        reading = self.reading
-        if reading is None:
-            reading = next(
-                (r for r in map(partial(free_reading, scales), (3, 2)) if self._affords_field(r.field)), None
-            )
-        if reading is None:
-            return None
         if isinstance(reading.field, FreeField):
             rivals.append(self.said.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
         fit = fitted(reading.field, reading.of(data), setting.turned(reading.rows))
         theirs = judged(fit, reading.of(others), self.setting.turned(reading.rows))
         left, share = theirs.squares(scales[[*reading.rows]]), 0.0
+        if reading.forces and not _certain(reading.forces, fit, theirs):
+            return None
         for model in rivals:
             _, held = self._first_fold(model, setting)
             share = max(share, left / held.squares(scales))
-            if not gains(held, theirs) or not share < FREER:
+            if not gains(held, theirs) or not share < (DAMPED if reading.forces else FREER):
                 return None
         return Freedom(reading.said, reading.remedy(fit.theta), share, *reading.test(fit.theta, fit.states.T, scales))
 

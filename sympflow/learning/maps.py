@@ -76,6 +76,7 @@ class NetworkFlow:
         self.ndof, self.dt = len(scaling.q), scaling.t
         self.of_layer = width * (self.ndof + 3)
         self.n = 2 * pairs * self.of_layer
+        self.prior = np.zeros(self.n)
         self.stepper = OwnSteps(scaling.t)
 
     def start(self, rng: np.random.Generator) -> np.ndarray:

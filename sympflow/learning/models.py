@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     import sympy
 
 
+STEEP = 5.0
+"""Size of the weights and biases of neurons, in the spread of the coordinates, beyond which they would be steps."""
+
+
 class Linear(NamedTuple):
     """A function f(θ, x) of columns x (m, N) with its derivatives; None for those that were not asked for.
 
@@ -66,6 +70,11 @@ class Part(ABC):
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """θ before anything is known."""
+        return np.zeros(self.n)
+
+    @property
+    def prior(self) -> np.ndarray:
+        """One over the size (n,) that each number is expected to have, 0 for any."""
         return np.zeros(self.n)
 
     def subset(self, kept: np.ndarray) -> Part:
@@ -388,6 +397,10 @@ class Network(Part):
         w = 0.1 * rng.normal(size=self.width)
         return np.concatenate([w, a.ravel(), rng.uniform(-1.5, 1.5, self.width)])
 
+    @property
+    def prior(self) -> np.ndarray:
+        return np.concatenate([np.zeros(self.width), np.full(self.n - self.width, 1 / STEEP)])
+
     def _split(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         K, e = self.width, len(self.inputs)
         return theta[:K], theta[K : K + K * e].reshape(K, e), theta[K + K * e :]
@@ -625,6 +638,11 @@ class Model:
         """True if T is quadratic."""
         return self.separable and all(part.quadratic for part in self.parts if part.of == "p")
 
+    @property
+    def prior(self) -> np.ndarray:
+        """One over the size (n,) that each number is expected to have, 0 for any."""
+        return np.concatenate([part.prior for part in self.parts] + [np.zeros(self.rates)])
+
     def _columns(self, of: str) -> slice:
         return {"q": slice(0, self.ndof), "p": slice(self.ndof, None), "y": slice(None)}[of]
 
@@ -736,6 +754,62 @@ class Model:
         return np.concatenate([part.start(rng) for part in self.parts] + [np.zeros(self.rates)])
 
 
+def drags(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quadratic drag −|p_i|p_i of each p at states (2d, N): the fields (2d, d, N) and their slopes (2d, d, 2d, N)."""
+    m, N = y.shape
+    d = m // 2
+    fields, slopes = np.zeros((m, d, N)), np.zeros((m, d, m, N))
+    for i in range(d, m):
+        fields[i, i - d], slopes[i, i - d, i] = -np.abs(y[i]) * y[i], -2 * np.abs(y[i])
+    return fields, slopes
+
+
+def turns(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform magnetic fields that turn p_i to p_j, i < j: the fields (2d, d(d − 1)/2, N) and their slopes."""
+    m, N = y.shape
+    pairs = [*combinations(range(m // 2, m), 2)]
+    fields, slopes = np.zeros((m, len(pairs), N)), np.zeros((m, len(pairs), m, N))
+    for k, (i, j) in enumerate(pairs):
+        fields[i, k], fields[j, k] = y[j], -y[i]
+        slopes[i, k, j], slopes[j, k, i] = 1.0, -1.0
+    return fields, slopes
+
+
+class Forced:
+    """The field of a model with forces that no H(q, p) gives, whose factors are its last numbers.
+
+    Parameters
+    ----------
+    model : Model
+    forces : callable
+        Such as `drags`.
+    """
+
+    separable = nystrom = lagrangian = False
+    stepper = None
+    parts = places = ()
+
+    def __init__(self, model: Model, forces: Any) -> None:
+        self.model, self.forces, self.ndof, self.linear = model, forces, model.ndof, model.linear
+        self.n = model.n + forces(np.zeros((2 * model.ndof, 1)))[0].shape[1]
+
+    @property
+    def prior(self) -> np.ndarray:
+        return np.concatenate([self.model.prior, np.zeros(self.n - self.model.n)])
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        return np.concatenate([self.model.start(rng), np.zeros(self.n - self.model.n)])
+
+    def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        """The vector field."""
+        k = self.model.n
+        found, (fields, slopes) = self.model.field(theta[:k], y, slope, by_parameters), self.forces(y)
+        value = found.value + np.einsum("mkn,k->mn", fields, theta[k:])
+        moved = None if found.slope is None else found.slope + np.einsum("mkjn,k->mjn", slopes, theta[k:])
+        columns = None if found.by_parameters is None else np.concatenate([found.by_parameters, fields], axis=1)
+        return Linear(value, moved, columns)
+
+
 class FreeField:
     """A vector field of polynomials that need not be Hamiltonian, to be compared with those that are.
 
@@ -754,6 +828,7 @@ class FreeField:
         self.ndof, self.degree = m // 2, degree
         self.polynomial = Polynomial("y", [(0,) * m, *Polynomial.up_to(degree, "y", scales).exponents.tolist()], scales)
         self.n = m * self.polynomial.n
+        self.prior = np.zeros(self.n)
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
         return np.zeros(self.n)

@@ -27,12 +27,12 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from sympflow.learning.models import FreeField, Linear, Model
+from sympflow.learning.models import Forced, FreeField, Linear, Model
 from sympflow.learning.trajectories import Run, Trajectories
 from sympflow.schemes import Scheme, scheme_named
 from sympflow.training.least_squares import Damping
 
-Field = Model | FreeField
+Field = Model | Forced | FreeField
 """A vector field with numbers θ."""
 
 MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the cache
@@ -360,6 +360,12 @@ class Normal:
         return np.where(usable, slope**2 / np.where(usable, curvature, 1.0), 0.0)
 
 
+def rho(r: np.ndarray, huber: float | None) -> np.ndarray:
+    """Huber's ρ of residuals in σ; their squares without a limit."""
+    inside = r if huber is None else np.clip(r, -huber, huber)
+    return inside * (2 * r - inside)
+
+
 @dataclass(frozen=True)
 class Problem:
     """Least squares of θ and the initial states of pieces of trajectories.
@@ -410,15 +416,15 @@ class Problem:
         return r, batch.seen[k] * np.minimum(1.0, self.huber / np.maximum(np.abs(r), self.huber))
 
     def _cost(self, r: np.ndarray) -> float:
-        if self.huber is None:
-            return float(np.sum(r * r))
-        size = np.abs(r)
-        return float(np.sum(np.where(size <= self.huber, r * r, self.huber * (2 * size - self.huber))))
+        return float(np.sum(rho(r, self.huber)))
+
+    def _unlikely(self, theta: np.ndarray) -> float:
+        return 0.0 if self.frozen else float(np.sum((self.model.prior * theta) ** 2))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def cost(self, theta: np.ndarray, states: np.ndarray) -> float:
-        """Σ ρ(r); not finite where an orbit is not."""
-        total = 0.0
+        """Σ ρ(r), and what numbers of an unlikely size cost; not finite where an orbit is not."""
+        total = self._unlikely(theta)
         for batch in self.batches:
             for k, x, _ in self._orbits(batch, theta, states, False):
                 total += self._cost(self._weighted(batch, k, x)[0])
@@ -475,6 +481,10 @@ class Problem:
                         made.c += by_theta @ rest
             made.A[batch.index], made.B[batch.index] = A.transpose(2, 0, 1), B.transpose(2, 0, 1)
             made.a[batch.index] = a.T
+        if n:
+            made.cost += self._unlikely(theta)
+            made.C[np.diag_indices(n)] += self.model.prior**2
+            made.c -= self.model.prior**2 * theta
         return made
 
 
@@ -713,14 +723,15 @@ def matched(model: Field, theta: np.ndarray, data: Trajectories, weights: np.nda
         return theta
     level = Damping(1e-10 if steps == 1 else 1e-3)
     r, J = _increments(model, theta, pieces, weights)
+    prior = model.prior * np.sqrt(r @ r / len(r))
     for _ in range(steps):
         scale = np.sqrt(np.sum(J * J, axis=0))
         D = np.where(scale > 0, scale, 1.0)
-        normal = (J / D).T @ (J / D)
+        normal = (J / D).T @ (J / D) + np.diag((prior / D) ** 2)
         for _ in range(TRIES):
-            step = np.linalg.solve(normal + level.value * np.eye(len(D)), (J / D).T @ r) / D
+            step = np.linalg.solve(normal + level.value * np.eye(len(D)), ((J / D).T @ r - prior**2 * theta / D)) / D
             after, K = _increments(model, theta + step, pieces, weights)
-            if after @ after < r @ r:
+            if after @ after + np.sum((prior * (theta + step)) ** 2) < r @ r + np.sum((prior * theta) ** 2):
                 level.accepted(0.9)
                 theta, r, J = theta + step, after, K
                 break

@@ -26,6 +26,8 @@ class Smooth:
         The curve of each trajectory at its times.
     points, slopes : ndarray, shape (m, 2d)
         States and their derivatives where both are known well.
+    times, owner : ndarray, shape (m,)
+        Their times, and the places of their trajectories.
     sigma : ndarray, shape (2d,)
         The noise of each coordinate, 0 if the trajectories are too short to tell it.
     """
@@ -33,6 +35,8 @@ class Smooth:
     states: tuple[np.ndarray, ...]
     points: np.ndarray
     slopes: np.ndarray
+    times: np.ndarray
+    owner: np.ndarray
     sigma: np.ndarray
 
 
@@ -45,14 +49,16 @@ def smoothed(data: Trajectories) -> Smooth:
     middle = np.nanmean(np.concatenate([run.y for run in data.runs], axis=1), axis=1)
     states = tuple(np.where(np.isfinite(one[0]), one[0], middle[:, None]) for one in made)
     points, slopes = np.concatenate([one[1].T for one in made]), np.concatenate([one[2].T for one in made])
+    times = np.concatenate([one[3] for one in made])
+    owner = np.repeat(np.arange(len(made)), [len(one[3]) for one in made])
     known = np.isfinite(points).all(1) & np.isfinite(slopes).all(1)
     noise = np.concatenate([_roughness(run) for run in data.runs], axis=1)
     sigma = np.zeros(2 * data.ndof) if noise.shape[1] == 0 else np.sqrt(_middle(noise))
-    return Smooth(states, points[known], slopes[known], sigma)
+    return Smooth(states, points[known], slopes[known], times[known], owner[known], sigma)
 
 
-def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The states of a trajectory, smooth; points and slopes there or between."""
+def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The states of a trajectory, smooth; points and slopes there or between, and their times."""
     seen = np.isfinite(run.y)
     if seen.sum(1).min() < FEWEST:
         states = np.full(run.y.shape, np.nan)
@@ -61,7 +67,7 @@ def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
                 states[i] = np.interp(run.t, run.t[has], y[has])
         whole = seen.all(0)
         t, y = run.t[whole], run.y[:, whole]
-        return states, (y[:, 1:] + y[:, :-1]) / 2, np.diff(y) / np.diff(t)
+        return states, (y[:, 1:] + y[:, :-1]) / 2, np.diff(y) / np.diff(t), (t[1:] + t[:-1]) / 2
     best = np.full(len(run.y), np.inf)
     states, slopes = np.zeros(run.y.shape), np.zeros(run.y.shape)
     for width in [w for w in WIDTHS if w <= run.n_points] or [run.n_points]:
@@ -72,7 +78,7 @@ def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for i, has in enumerate(seen):
         outside = (run.t < run.t[has][0]) | (run.t > run.t[has][-1])
         slopes[i, outside] = np.nan
-    return states, states[:, 1:-1], slopes[:, 1:-1]
+    return states, states[:, 1:-1], slopes[:, 1:-1], run.t[1:-1]
 
 
 def _windows(t: np.ndarray, y: np.ndarray, seen: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

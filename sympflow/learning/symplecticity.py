@@ -17,17 +17,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sympflow.learning.models import FreeField, Model
+from sympflow.learning.diagnosis import DRAG, TURNED
+from sympflow.learning.models import Forced, FreeField, Model, drags, turns
 from sympflow.learning.shooting import Field, increments_left, matched
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
 DEGREES = (1, 2, 3)
 """Degrees of the polynomial fields that need not be Hamiltonian."""
-DOUBTFUL = 0.6
-"""Share of the squares of increments, left by another reading of the data, below which orbits are to decide."""
+DOUBTFUL, DAMPED = 0.6, 0.9
+"""Share of the squares of increments, left by another reading of the data, or by forces beside those of H, below which
+orbits are to decide."""
 PLAINER = 1.5
-"""Factor by which friction or another order of columns may leave more than a field without any structure."""
+"""Factor by which friction or another order of columns may leave more than a field without any structure, and one that
+stands before another in the list may leave more."""
 POINTS = 24
 """Number of points of a piece whose increments are compared."""
 LONG = 10
@@ -53,7 +56,9 @@ class Reading:
     said : str
         The explanation in words.
     advice : str
-        What to do then, with a place for the rates of friction.
+        What to do then, with a place for the numbers of the forces.
+    forces : int
+        How many forces there are beside those of H; their factors are the last numbers of the field.
     """
 
     field: Field
@@ -61,6 +66,7 @@ class Reading:
     share: float
     said: str
     advice: str = ""
+    forces: int = 0
 
     def of(self, data: Trajectories) -> Trajectories:
         """The data with the coordinates in this order."""
@@ -68,9 +74,9 @@ class Reading:
         return replace(data, runs=tuple(Run(run.t, run.y[[*self.rows]]) for run in data.runs), names=names)
 
     def remedy(self, theta: np.ndarray) -> str:
-        """Advice, with the rates of friction that were found."""
-        rates = theta[-self.field.ndof :]
-        return self.advice.format(", ".join(f"{rate:.3g}" for rate in rates))
+        """Advice, with the factors of the forces that were found."""
+        factors = theta[len(theta) - self.forces :]
+        return self.advice.format(", ".join(f"{factor:.3g}" for factor in factors))
 
     def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
         """The defect of symplecticity in the coordinates as they are, and the rate at which volumes grow.
@@ -105,7 +111,18 @@ FRICTION = (
     "the best H with friction p' = -γp",
     "There is friction, γ = {}: areas of phase space shrink as exp(-γt). Pass damping=True to `learn`.",
 )
+DRAG_SAID = "the best H with a drag p' = -c|p|p", DRAG
+TURNED_SAID = "the best H with a force that turns p", TURNED
 PAIRS = ("the same in the order q1, p1, q2, p2, … of columns", 'The columns look like that: pass order="pairs".')
+
+
+def forced(model: Model) -> list[Reading]:
+    """The model with forces that are none of H: friction, what turns p, quadratic drag; from plain to rich."""
+    d = model.ndof
+    rows = tuple(range(2 * d))
+    made = [] if model.rates else [Reading(replace(model, rates=d), rows, math.inf, *FRICTION, d)]
+    made += [Reading(Forced(model, turns), rows, math.inf, *TURNED_SAID, d * (d - 1) // 2)] if d > 1 else []
+    return [*made, Reading(Forced(model, drags), rows, math.inf, *DRAG_SAID, d)]
 
 
 def free_reading(scales: np.ndarray, degree: int) -> Reading:
@@ -116,25 +133,24 @@ def free_reading(scales: np.ndarray, degree: int) -> Reading:
 
 def best_by_increments(
     data: Trajectories, held: Trajectories, models: Sequence[Model]
-) -> tuple[int, Reading | None] | None:
+) -> tuple[int, Reading | None, dict[int, float]] | None:
     """The place of the model, linear in its numbers, that explains held-out increments best, and a doubt, if any.
 
     Returns
     -------
-    tuple of int and (Reading or None), or None
-        The reading of the data that leaves much less than all models, None if there is none; None in place of the pair
-        if there are too few points to tell.
+    tuple of int, (Reading or None) and dict, or None
+        The reading of the data that leaves much less than all models, None if there is none; the squares that the
+        models leave, by their places; None in place of all if there are too few points to tell.
     """
     scales, d = data.scales, data.ndof
     fitted, others = _smooth(data), _smooth(held)
-    rows = tuple(range(2 * d))
     affordable = [k for k, model in enumerate(models) if _affords(fitted, model)]
     if not affordable or not others.runs:
         return None
     squares = {k: _left(models[k], fitted, others, scales) for k in affordable}
     best = min(affordable, key=lambda k: squares[k])
     if not 0 < squares[best] < math.inf:
-        return best, None
+        return best, None, squares
 
     def compared(reading: Reading) -> Reading:
         a, b = reading.of(fitted), reading.of(others)
@@ -142,17 +158,19 @@ def best_by_increments(
 
     free = [free_reading(scales, degree) for degree in DEGREES]
     found = [compared(reading) for reading in free if _affords(fitted, reading.field)]
-    rated = [replace(models[k], rates=d) for k in affordable if not models[k].rates]
-    plain = [Reading(model, rows, math.inf, *FRICTION) for model in rated if _affords(fitted, model)]
+    plain = [reading for k in affordable for reading in forced(models[k]) if _affords(fitted, reading.field)]
     if d > 1:
         turned = (*range(0, 2 * d, 2), *range(1, 2 * d, 2))
         plain += [Reading(models[k], turned, math.inf, *PAIRS) for k in affordable]
     plain = [compared(reading) for reading in plain]
-    likeliest = min(plain, key=lambda reading: reading.share, default=None)
-    freest = min(found, key=lambda reading: reading.share, default=None)
-    if likeliest is None or (freest is not None and likeliest.share > PLAINER * freest.share):
-        likeliest = freest
-    return best, (likeliest if likeliest is not None and likeliest.share < DOUBTFUL else None)
+    least, freest = (min((reading.share for reading in some), default=math.inf) for some in (plain, found))
+    kinds = {kind: [r for r in plain if r.said == kind] for kind, _ in (FRICTION, TURNED_SAID, DRAG_SAID, PAIRS)}
+    for some in kinds.values():  # the plainest that is about as good as the best
+        likeliest = min(some, key=lambda reading: reading.share, default=None)
+        if likeliest is not None and likeliest.share <= min(PLAINER * least, PLAINER * freest):
+            return best, (likeliest if likeliest.share < (DAMPED if likeliest.forces else DOUBTFUL) else None), squares
+    likeliest = min(found, key=lambda reading: reading.share, default=None)
+    return best, (likeliest if likeliest is not None and likeliest.share < DOUBTFUL else None), squares
 
 
 def _affords(data: Trajectories, model: Field) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import floats, plain
+from sympflow.arguments import MAX_ASKED_VALUES, floats, plain
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.flow.scaling import Scaling
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
@@ -33,8 +34,8 @@ BESIDE = ("energy", "status")
 """Columns of tables of sympflow that are no states."""
 ORDERS = ("halves", "pairs")
 FEW = 8
-"""Trajectories from which some are held out for good; of fewer each is left out in turn."""
-HELD_LEAST = 3
+"""Trajectories from which some are held out for good; of fewer each is left out in turn, or in one of three parts."""
+HELD_LEAST = PARTS = 3
 JUMP, STEP = 0.75, 0.3
 """Shares of a period: steps of an angle that was wrapped are longer than the first, or shorter than the second."""
 ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}
@@ -96,8 +97,10 @@ class Trajectories:
         ----------
         data : Trajectories, sequence, DataFrame, Dataset, Solution or path
             - A list of (t, y), t (n,) and y (2d, n), each with its own times and length.
-            - A pair of arrays: t (n,) and y (N, 2d, n), or (2d, n).
+            - A pair of arrays: t (n,) or (N, n) and y (N, 2d, n), or (2d, n).
             - Three arrays, x (N, 2d), t (N,) or a number, y (N, 2d): the states y a time t after x.
+            - A dictionary of arrays, or an .npz file of one: t with y as above, or with q and p, each (d, n) or
+              (N, d, n); or columns (n,) as of a table.
             - An object with `t` and `y`: a solution, an ensemble, the result of `scipy.integrate.solve_ivp`; a list
               of these.
             - A table of pandas with a row for each time, or a CSV or Parquet file of one: columns for the trajectory,
@@ -140,8 +143,12 @@ class Trajectories:
         >>> Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]))).ndof
         1
         """
+        given: dict[str, Any] = {"order": order, "time": time, "run": run, "q": q, "p": p}
+        converted: dict[str, Any] = {"units": units, "velocity_mass": velocity_mass, "period": period}
         if isinstance(data, Trajectories):
             found, names = list(_labelled(data.runs)), data.names
+        elif isinstance(data, Mapping) and not _is_a("xarray", "Dataset", data):
+            return cls.read(_of_mapping(data, ndof, time, q, p), ndof, **given, **converted)
         elif _is_a("pandas", "DataFrame", data):
             found, names = _of_table(data, ndof, order, time, run, q, p, velocity_mass is not None)
             order = "halves"
@@ -149,9 +156,7 @@ class Trajectories:
             found, names = _of_dataset(data), ()
             order = "halves"
         elif isinstance(data, str | Path):
-            given = {"order": order, "time": time, "run": run, "q": q, "p": p}
-            converted = {"units": units, "velocity_mass": velocity_mass, "period": period}
-            return cls.read(_opened(Path(data)), ndof, **given, **converted)  # type: ignore[arg-type]
+            return cls.read(_opened(Path(data)), ndof, **given, **converted)
         else:
             found, names = list(_of_arrays(data)), ()
         if not found:
@@ -279,7 +284,8 @@ class Trajectories:
         return self.subset(i for i in range(len(self.runs)) if i not in drawn), self.subset(sorted(drawn))
 
     def folds(self, share: float = 0.2, seed: int = 0) -> list[tuple[Trajectories, Trajectories]]:
-        """Divisions as by `split`: one, of three held-out trajectories at least; of few trajectories each in turn.
+        """Divisions as by `split`: one, of three held-out trajectories at least; of few trajectories each is left out
+        in one of three, or in turn.
 
         Raises
         ------
@@ -290,7 +296,8 @@ class Trajectories:
         if n >= FEW:
             return [self.split(max(share, HELD_LEAST / n), seed)]
         self.split(share, seed)  # of one trajectory that is refused
-        return [(self.subset(j for j in range(n) if j != i), self.subset([i])) for i in range(n)]
+        parts = [range(i, n, PARTS) for i in range(min(n, PARTS))]
+        return [(self.subset(j for j in range(n) if j not in part), self.subset(part)) for part in parts]
 
     def subset(self, index: Any) -> Trajectories:
         """The trajectories of some places, which may repeat, as a bootstrap draws them."""
@@ -407,9 +414,9 @@ def _of_arrays(data: Any) -> Iterator[Found]:
     if not isinstance(data, Sequence) or isinstance(data, str | bytes):
         raise TypeError(
             f"`data` is of the type {type(data).__name__}: give a list of (t, y), a pair of arrays t (n,) and "
-            "y (N, 2d, n), three arrays (x, t, y), a solution, a table or a Dataset."
+            "y (N, 2d, n), three arrays (x, t, y), a dictionary of arrays, a solution, a table or a Dataset."
         )
-    if len(data) == 2 and _is_array(data[0], 1):
+    if len(data) == 2 and (_is_array(data[0], 1) or (_is_array(data[0], 2) and _is_array(data[1], 3))):
         yield from _of_pair(*data)
     elif len(data) == 3 and _is_array(data[0], 2):
         yield from _of_ends(*data)
@@ -443,19 +450,55 @@ def _of_pair(t: Any, y: Any) -> Iterator[Found]:
     if y.ndim == 2:
         yield "the trajectory", t, y
         return
-    for i, one in enumerate(y.reshape(math.prod(y.shape[:-2]), *y.shape[-2:])):
-        yield f"trajectory {i}", t, one
+    states = y.reshape(math.prod(y.shape[:-2]), *y.shape[-2:])
+    if t.ndim == 1:
+        yield from ((f"trajectory {i}", t, one) for i, one in enumerate(states))
+        return
+    times = t.reshape(-1, t.shape[-1]) if t.ndim else t
+    if t.shape != (*y.shape[:-2], y.shape[-1]):
+        raise ValueError(
+            f"`data` has times of shape {t.shape} and states of shape {y.shape}: give t (n,) for all, or (N, n)."
+        )
+    for i, (own, one) in enumerate(zip(times, states, strict=True)):
+        yield f"trajectory {i}", own[kept := np.isfinite(own)], one[:, kept]  # ragged trajectories are padded
 
 
 def _of_ends(x: Any, t: Any, y: Any) -> Iterator[Found]:
     x, y = _numbers(x, "states"), _numbers(y, "states")
     t = _numbers(t, "times")
+    t = t[:, 0] if t.ndim == 2 and t.shape[1] == 1 else t
     if x.shape != y.shape or t.shape not in ((), (1,), (len(x),)):
         raise ValueError(
             f"`data` is (x, t, y) of shapes {x.shape}, {t.shape}, {y.shape}: give x (N, 2d), t (N,) and y (N, 2d)."
         )
     for i, (start, later, end) in enumerate(zip(x, np.broadcast_to(t, len(x)), y, strict=True)):
         yield f"pair {i}", np.array([0.0, later]), np.stack([start, end], 1)
+
+
+def _of_mapping(data: Mapping[str, Any], ndof: int | None, time: str | None, q: Any, p: Any) -> Any:
+    """The pair (t, y) of a dictionary of arrays; of one of columns the table."""
+    arrays = {str(name): _numbers(values, f"values of {name}") for name, values in data.items() if np.ndim(values)}
+    of_time = _column([*arrays], time, TIMES, "time")
+    said = f"`data` has {', '.join(f'{name} {a.shape}' for name, a in arrays.items()) or 'no arrays'}"
+    if of_time is None:
+        raise ValueError(f"{said}, and no times: give them as t, or name them by `time`.")
+    t, several = arrays[of_time], isinstance(q, Sequence) and not isinstance(q, str)
+    if "y" in arrays and q is None:
+        return t, arrays["y"]
+    halves = [arrays.get(name) for name in ("q" if q is None else str(q), "p" if p is None else str(p))]
+    if several or all(a.ndim == 1 for a in arrays.values()):
+        if len({a.shape for a in arrays.values()}) > 1:
+            raise ValueError(f"{said}: columns must be of one length.")
+        return imported("pandas", "Reading columns").DataFrame(arrays)
+    if halves[0] is None or halves[1] is None or halves[0].shape != halves[1].shape:
+        raise ValueError(f"{said}: give t with y (N, 2d, n), or with q and p of one shape, (N, d, n) or (d, n).")
+    runs = t.ndim == 2 or ndof == 1  # q (N, n) of one degree of freedom
+    made = [a[:, None] if a.ndim == 2 and runs else a for a in halves if a is not None]
+    if made[0].ndim == 2 and ndof is None:
+        raise ValueError(
+            f"{said}: of q (k, n) it cannot be told whether these are k coordinates or k trajectories: pass `ndof`."
+        )
+    return t, np.concatenate(made, axis=-2)
 
 
 def _of_dataset(data: Any) -> list[Found]:
@@ -492,7 +535,13 @@ def _opened(path: Path) -> Any:
         pandas = imported("pandas", "Reading a table")
         if ending == ".csv":
             _check_commas(path)
-        return pandas.read_csv(path, sep=None if ending == ".txt" else "\t" if ending == ".tsv" else ",", comment="#")
+        sep = None if ending == ".txt" else "\t" if ending == ".tsv" else ","
+        with warnings.catch_warnings():  # of another engine for separators that are found
+            warnings.simplefilter("ignore")
+            return pandas.read_csv(path, sep=sep, comment="#", **_header(path))
+    if ending == ".npz":
+        with np.load(path, allow_pickle=False) as arrays:
+            return dict(arrays)
     if ending in (".parquet", ".pq"):
         pandas = imported("pandas", "Reading a table")
         try:
@@ -503,10 +552,52 @@ def _opened(path: Path) -> Any:
             ) from error
     xarray = imported("xarray", "Reading a Dataset")
     if ending == ".zarr":
-        return xarray.open_zarr(path, consolidated=False).load()
+        return _loaded(xarray.open_zarr(path, consolidated=False, chunks=None))
     if ending in (".nc", ".netcdf"):
-        return xarray.load_dataset(path)
-    raise ValueError(f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .nc and .zarr are read.")
+        with xarray.open_dataset(path) as data:
+            return _loaded(data)
+    raise ValueError(
+        f"`data` names a file {ending or 'without an ending'}: .csv, .parquet, .npz, .nc and .zarr are read."
+    )
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """Options of pandas for a file whose names stand in a comment before its numbers; none where a row has them."""
+    comment: list[str] = []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            words = re.split(r"[,;\s]+", line.strip().lstrip("#").strip())
+            if line.startswith("#"):
+                comment = words
+            elif line.strip():
+                break
+        else:
+            return {}
+    if not all(_is_number(word) for word in words) or words == [str(i) for i in range(len(words))]:
+        return {}
+    if len(comment) == len(words) and not any(_is_number(word) for word in comment):
+        return {"names": comment}
+    raise ValueError(
+        f"`data` names the file {str(path)!r}, whose first row has numbers in place of the names of its columns: write "
+        "them above, as t,q1,p1 and so on."
+    )
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _loaded(data: Any) -> Any:
+    """The Dataset in memory, unless what its file tells of would not fit there."""
+    if data.nbytes > 8 * MAX_ASKED_VALUES:
+        raise ValueError(
+            f"`data` tells of {data.nbytes / 2**30:.3g} GiB, more than {MAX_ASKED_VALUES:.0e} numbers: give a part."
+        )
+    return data.load()
 
 
 def _check_commas(path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import failed
 from sympflow.metrics.reference import Reference
@@ -67,7 +68,8 @@ def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: n
             )
         start = to_numpy(reference.y0)
         eps = max(1e-12, *(4 * float(np.finfo(y.dtype).eps) for y in (start, y0)))
-        same = start.shape == y0.shape and np.allclose(start, y0, rtol=eps, atol=eps * np.abs(y0).max(initial=0.0))
+        scale = weights(system)
+        same = start.shape == y0.shape and np.abs(scale * (start - y0)).max() <= eps * np.abs(scale * y0).max()
         if reference.t_span[0] == t0 and not same:
             raise ValueError("`reference` is a solution from another `y0`: solve from the one that is compared.")
         return
@@ -94,6 +96,8 @@ def _same_field(sol: Solution, system: HamiltonianSystem) -> bool:
     states = states[::every]
     with np.errstate(all="ignore"):
         mine, other = (to_numpy(s.vector_field(states, t)) for s in (system, sol.system))
+    scale = weights(system)
+    mine, other = scale * mine, scale * other
     size = np.abs(other[np.isfinite(other)]).max(initial=0.0)
     return np.allclose(mine, other, rtol=0, atol=1e-9 * size, equal_nan=True)
 

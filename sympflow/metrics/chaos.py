@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import as_float, check_counts, check_t_eval, floats
+from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import compiled_loops
 from sympflow.integrators.contract import FINISHED
@@ -81,6 +82,9 @@ def lyapunov(
 ) -> Indicator:
     """The largest Lyapunov exponent of each orbit: ln(|w(t)|/|w(0)|)/|t − t0|, of a deviation vector w.
 
+    Lengths are those of (s δq, δp/s), where s = √(mω) makes q and p comparable in any units; it is 1 where masses and
+    frequencies are, as in the Hénon–Heiles system.
+
     As t grows it tends to the exponent of the orbit, for almost all initial vectors [1]_ [2]_: to a positive number on
     a chaotic one, and like ln(t)/t to 0 on a regular one, so that a value of that size at the end of the run does not
     tell the two apart (`sali` does). With friction the exponent of an orbit that comes to rest is negative.
@@ -97,7 +101,7 @@ def lyapunov(
     t_eval : array_like of shape (n,), optional
         Times at which to report the average so far too: `history`.
     deviations : array_like of shape (2d,), optional
-        w(0). The default is a random direction, the same for all orbits.
+        w(0). The default is a random direction of (s δq, δp/s), the same for all orbits.
     seed : int
         Of this direction.
     backend : "auto", "compiled" or "array"
@@ -300,7 +304,8 @@ def indicator(
         raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
     t0, t1 = orbits.t_span
     times = np.empty(0) if t_eval is None else check_t_eval(t_eval, t0, t1)
-    w0 = _deviations(deviations, vectors, 2 * system.ndof, seed)
+    scale = weights(system)
+    w0 = _deviations(deviations, vectors, scale, seed)
     length = integrator.step_length(system) if integrator.on_grid else None
     if length is not None:
         grid = Grid(t0, t1, length)
@@ -309,39 +314,53 @@ def indicator(
         orbits = orbits._replace(t_span=(t0, grid.time(grid.n_steps)))
         kernel = compiled_loops(lambda: integrator.tangent_kernel(system, vectors), orbits.y0, backend)
         if kernel is not None:
-            run = _compiled(kernel, grid, orbits, w0, times, kind, below)
+            run = _compiled(kernel, grid, orbits, w0, scale, times, kind, below)
             return _reported(run, orbits, times, kind, below)
     elif backend == "compiled":
         raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
     with naming_plugin(integrator):
-        run = _by_arrays(orbits, w0, times, kind, below)
+        run = _by_arrays(orbits, w0, scale, times, kind, below)
     return _reported(run, orbits, times, kind, below)
 
 
-def _deviations(given: ArrayLike | None, vectors: int, width: int, seed: int) -> np.ndarray:
-    """The vectors at the start, (k, 2d)."""
+def _deviations(given: ArrayLike | None, vectors: int, scale: np.ndarray, seed: int) -> np.ndarray:
+    """The vectors at the start, (k, 2d), of length 1 in the variables scale·y."""
+    width = len(scale)
     if given is None:
         random = np.random.default_rng(seed).standard_normal((width, vectors))
-        return np.ascontiguousarray(np.linalg.qr(random)[0].T)
+        return np.ascontiguousarray(np.linalg.qr(random)[0].T) / scale
     shape = (width,) if vectors == 1 else (vectors, width)
     w0 = floats("deviations", given)
     if w0.shape != shape:
         raise ValueError(f"`deviations` must have shape {shape}; got {w0.shape}.")
-    lengths = np.linalg.norm(w0.reshape(vectors, width), axis=-1)
+    lengths = np.linalg.norm(scale * w0.reshape(vectors, width), axis=-1)
     if not (np.isfinite(lengths) & (lengths > 0)).all():
         raise ValueError("`deviations` must be finite and not 0: remove NaN and infinity.")
     return w0.reshape(vectors, width) / lengths[:, None]
 
 
 def _compiled(
-    kernel: Any, grid: Grid, orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, below: float
+    kernel: Any,
+    grid: Grid,
+    orbits: Orbits,
+    w0: np.ndarray,
+    scale: np.ndarray,
+    times: np.ndarray,
+    kind: int,
+    below: float,
 ) -> _Run:
     counts = np.array([grid.place(t)[0] for t in times], dtype=np.int64)
     save, where = np.unique(counts[counts > 0], return_inverse=True)
-    found = kernel.run(grid.h, orbits.rows, w0, grid.n_steps, save, EVERY, kind, below, single=not orbits.batch)
+    how = {"scale": scale, "single": not orbits.batch}
+    found = kernel.run(grid.h, orbits.rows, w0, grid.n_steps, save, EVERY, kind, below, **how)
+    if not found.whole.all():  # looked at after every step, to tell the last one at which all was finite
+        failed = np.flatnonzero(~found.whole)
+        last = min(grid.n_steps, int(found.n_steps[failed].max()) + EVERY)
+        again = kernel.run(grid.h, orbits.rows[failed], w0, last, save[:0], 1, **how)
+        found.n_steps[failed] = again.n_steps
     start, N = int((counts == 0).sum()), len(orbits.rows)
     growth, spread = np.zeros((N, len(w0), len(times) + 1)), np.empty((N, len(times) + 1))
-    spread[:] = _spread(w0.T[None], kind)[0]
+    spread[:] = _spread((scale * w0).T[None], kind)[0]
     growth[..., start:-1], growth[..., -1] = found.growth[..., where], found.growth[..., -1]
     spread[..., start:-1], spread[..., -1] = found.spread[..., where], found.spread[..., -1]
     elapsed = np.empty((N, len(times) + 1))
@@ -350,7 +369,7 @@ def _compiled(
     return _Run(growth, spread, elapsed, status)
 
 
-def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, below: float) -> _Run:
+def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndarray, kind: int, below: float) -> _Run:
     """The same by the differentiated steps of the run, executed as a stream."""
     t0, t1 = orbits.t_span
     N, n = len(orbits.rows), len(times)
@@ -363,9 +382,12 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, bel
     running = np.ones(N, dtype=bool)
     elapsed = np.zeros(N)
 
+    def scaled(vectors: np.ndarray) -> np.ndarray:
+        return scale[:, None] * vectors
+
     def note(rows: np.ndarray, column: np.ndarray) -> None:
-        run.growth[rows, :, column] = LOG_2 * exponents[rows] + np.log(np.linalg.norm(W[rows], axis=1))
-        run.spread[rows, column] = _spread(W[rows], kind)
+        run.growth[rows, :, column] = LOG_2 * exponents[rows] + np.log(np.linalg.norm(scaled(W[rows]), axis=1))
+        run.spread[rows, column] = _spread(scaled(W[rows]), kind)
         run.elapsed[rows, column] = elapsed[rows]
 
     for t, h, move in orbits.integrator.pushing(orbits.system, orbits.t_span, orbits.rows):
@@ -379,16 +401,16 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, times: np.ndarray, kind: int, bel
                 due &= position < n
         with np.errstate(all="ignore"):
             moved = move(W)
-            finite = np.isfinite(np.square(moved).sum(axis=1)).all(axis=-1)
+            finite = np.isfinite(np.square(scaled(moved)).sum(axis=1)).all(axis=-1)
         run.status[running & ~finite] = -1
         running &= finite
         W = np.where(running[:, None, None], moved, W)
         elapsed = np.where(running, ends, elapsed)
-        lengths = np.linalg.norm(W, axis=1)
+        lengths = np.linalg.norm(scaled(W), axis=1)
         powers = np.where(running[:, None] & (lengths > 0), np.frexp(lengths)[1], 0)
         W, exponents = np.ldexp(W, -powers[:, None, :]), exponents + powers
         if below > 0:
-            aligned = running & (_spread(W, kind) < below)
+            aligned = running & (_spread(scaled(W), kind) < below)
             run.status[aligned] = 1
             running &= ~aligned
         if not running.any():

@@ -44,7 +44,8 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
 def energy_scale(sol: Solution) -> np.ndarray:
     """Return the scale of the energy errors of each trajectory, (...): `system.energy_scale`, else |H(y0)|.
 
-    It is NaN where |H(y0)| < 1e-12: there `energy_error` is absolute, and warns.
+    It is NaN where H(y0) is 0 but for rounding, |H| ≤ 1e-12 Σ|y_i ∂H/∂y_i|: there `energy_error` is absolute, and
+    warns.
     """
     check_solution(sol)
     return sol.energy_scale()

@@ -59,6 +59,7 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     sol.system.check_conservative(
         "so that its energy is also lost to friction", "use sympflow.reference_error(sol), or solve it without damping"
     )
+    sol.system.check_impulses("at which its energy jumps", "use sympflow.reference_error(sol)")
     if jumps_in_time(sol.system):
         raise ValueError(
             f"`sol` is of {sol.system.name!r}, of which H jumps at some times, where ∂H/∂t is not finite: use "

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import real_number
 from sympflow.arrays import is_tensor, to_numpy
+from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build, check_applies
 from sympflow.metrics.crossings import dividing_step
@@ -31,7 +32,9 @@ GROWS = 1e-5
 UNPAIRED = 1e-3
 """A worse pairing of the multipliers than this is warned of."""
 CLOSED = 1e-6
-"""Distance of the end of a period from its start, over 1 + |y0|, up to which an orbit is periodic."""
+"""Distance of the end of a period from its start, over the size of y0, up to which an orbit is periodic.
+
+Of q and p in comparable units; the size is at least that of the system's own y0, as an equilibrium may be at 0."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,8 @@ class FloquetMultipliers:
     mismatch : float
         |y(t0 + T) − y0|: 0 of an orbit that is periodic.
     pairing : float
-        ‖MᵀJM − e^{−γT}J‖₂/‖M‖₂², 0 where the multipliers are in pairs λ, e^{−γT}/λ; NaN where friction is no single
-        rate, or there is a force that is none of H.
+        ‖MᵀJM − e^{−γT}J‖₂/‖M‖₂², in comparable units of q and p; 0 where the multipliers are in pairs λ, e^{−γT}/λ. NaN
+        where friction is no single rate, or there is a force that is none of H.
     """
 
     multipliers: np.ndarray
@@ -100,13 +103,14 @@ def floquet_multipliers(
     Raises
     ------
     ValueError, TypeError
-        For bad arguments; if no period is known; if y0 is a batch; if the run of a period fails.
+        For bad arguments; if no period is known; if y0 is a batch; if the run of a period fails; if the method chooses
+        its steps, by the error of the orbit and not of deviations from it.
 
     Warns
     -----
     RuntimeWarning
-        If the orbit is not periodic: its end is farther than 1e-6 from y0; and if the multipliers are not in pairs, to
-        1e-3, as by an adaptive method on an equilibrium. The eigenvalues then mean little.
+        If the orbit is not periodic: its end is farther than 1e-6 of its size from y0; and if the multipliers are not
+        in pairs, to 1e-3, as by an explicit Runge–Kutta method of long steps. The eigenvalues then mean little.
 
     Examples
     --------
@@ -134,6 +138,11 @@ def floquet_multipliers(
         integrator = build(method, {**options, "dt": dividing_step(T, system.dt)})
     integrator = integrator.resolved(system, start, float(T))
     check_applies(integrator, system, start)
+    if not (integrator.on_grid or integrator.keeps):
+        raise ValueError(
+            f"`method` {integrator.name!r} chooses its steps by the error of the orbit, which says nothing of that of "
+            "deviations from it: use a method of fixed steps such as 'kahan_li8', or 'rk4' where forces depend on p."
+        )
     if integrator.keeps:
         raise ValueError(
             f"`method` {integrator.name!r} keeps {integrator.keeps}, so that its Jacobians are not those of states: "
@@ -142,7 +151,9 @@ def floquet_multipliers(
     t_span = (float(t0), float(t0 + T))
     end = solve(system, integrator, t_span, start, t_eval=[t_span[1]]).raise_for_status().y[:, -1]
     mismatch = float(np.linalg.norm(to_numpy(end) - start))
-    if not mismatch <= CLOSED * (1 + float(np.abs(start).max())):
+    scale = weights(system)
+    sizes = [float(np.abs(scale * y).max()) for y in (start, system.y0) if y is not None]
+    if not np.linalg.norm(scale * (to_numpy(end) - start)) <= CLOSED * (max(sizes) or 1.0):
         warnings.warn(
             f"The orbit is not periodic: after {T:g} it is {mismatch:.3g} from `y0`. Take a state of a periodic orbit, "
             "its period, or a smaller `dt`.",
@@ -155,12 +166,11 @@ def floquet_multipliers(
             M = A @ M
     found = np.linalg.eigvals(M)
     found = found[np.argsort(-np.abs(found), kind="stable")].astype(complex)
-    pairing = _pairing(system, M, float(T))
+    pairing = _pairing(system, scale[:, None] * M / scale, float(T))
     if pairing > UNPAIRED:
         warnings.warn(
             f"The multipliers are not in pairs, to {pairing:.2g}: steps of {integrator.name!r} are too long for "
-            "deviations from the orbit, of which adaptive steps know nothing. Use a splitting method such as "
-            "'kahan_li8', or a smaller `dt`.",
+            "deviations from the orbit. Use a splitting method such as 'kahan_li8', or a smaller `dt`.",
             RuntimeWarning,
             stacklevel=2,
         )

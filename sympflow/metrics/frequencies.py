@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_counts
+from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.grid import Grid
 from sympflow.metrics.orbits import Orbits, checked_orbits
@@ -87,7 +88,8 @@ def frequencies(
         Lines of each signal.
     signal : callable, optional
         Of states (..., 2d, m) at m times: complex or real signals (..., m), or (..., c, m). The default is
-        z_i = q_i − i p_i of each degree of freedom, for which a rotation as of an oscillator is positive.
+        z_i = s_i q_i − i p_i/s_i of each degree of freedom, for which a rotation as of an oscillator is positive; the s
+        make q and p comparable: √(mω) of an oscillator of frequency ω and mass m, 1 in natural units.
     samples : int, optional
         The default is one after each step, or after every few, so that there are at most 65536. Frequencies above
         π·samples/|t1 − t0| are taken for others.
@@ -124,7 +126,7 @@ def frequencies(
     orbits = checked_orbits(system, method, t_span, y0, options, "frequencies are found on")
     check_counts(n=n)
     times = _sample_times(orbits, samples)
-    taken = rotations if signal is None else signal
+    taken = rotations(system) if signal is None else signal
     if not callable(taken):
         raise TypeError(f"`signal` must be a function of states (..., 2d, m); got {type(signal).__name__}.")
     rows, parts, status, message = orbits.rows, [], [], ""
@@ -163,7 +165,7 @@ def _sample_times(orbits: Orbits, samples: int | None) -> np.ndarray:
         assert length is not None
         grid = Grid(t0, t1, length)
         stride = max(1, math.ceil(grid.n_steps / MOST_SAMPLES))
-        times = t0 + np.arange(0, grid.n_steps + 1, stride) * grid.h
+        times = np.array([grid.time(k) for k in range(0, grid.n_steps + 1, stride)])
     else:
         times = np.linspace(t0, t1, samples)
     if len(times) < FEWEST_SAMPLES:
@@ -174,10 +176,10 @@ def _sample_times(orbits: Orbits, samples: int | None) -> np.ndarray:
     return times
 
 
-def rotations(y: np.ndarray) -> np.ndarray:
-    """q − ip: (..., 2d, m) to (..., d, m)."""
-    d = y.shape[-2] // 2
-    return y[..., :d, :] - 1j * y[..., d:, :]
+def rotations(system: HamiltonianSystem) -> Signal:
+    """The signals s q − ip/s of states, (..., 2d, m) to (..., d, m), with the factors s of `natural_scale`."""
+    d, s = system.ndof, natural_scale(system)[:, None]
+    return lambda y: s * y[..., :d, :] - 1j * (y[..., d:, :] / s)
 
 
 def signals(signal: Signal, y: np.ndarray, m: int) -> np.ndarray:

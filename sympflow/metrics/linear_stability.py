@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.registry import build
@@ -340,24 +341,34 @@ def small_oscillations(
 
 
 def _equilibrium(system: HamiltonianSystem, y0: np.ndarray) -> np.ndarray | None:
-    """A minimum of H, of no higher energy than y0, by Newton's method."""
+    """A minimum of H, of no higher energy than y0, by Newton's method in the variables (s q, p/s)."""
+    scale = weights(system)
+    of_y0 = float(np.linalg.norm(scale * y0))
+
+    def derivatives(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.asarray(system.gradient(y)) / scale, np.asarray(system.hessian(y)) / np.outer(scale, scale)
+
+    def size_of(y: np.ndarray) -> float:
+        return of_y0 + float(np.linalg.norm(scale * y))
+
     for start in (np.zeros_like(y0), y0):
         y, size = start.astype(float), math.inf
         for _ in range(NEWTON_STEPS):
-            slope, S = np.asarray(system.gradient(y)), np.asarray(system.hessian(y))
+            slope, S = derivatives(y)
             if not (np.isfinite(slope).all() and np.isfinite(S).all()):
                 break
             change = np.linalg.lstsq(S, slope, rcond=1e-12)[0]
-            y, size = y - change, float(np.linalg.norm(change))
-            if size <= 1e-12 * (1 + np.linalg.norm(y)):
+            y, size = y - change / scale, float(np.linalg.norm(change))
+            if size <= 1e-12 * size_of(y):
                 break
-        if not size <= 1e-9 * (1 + np.linalg.norm(y)):
+        if not size <= 1e-9 * size_of(y):
             continue
-        slope, S = np.asarray(system.gradient(y)), np.asarray(system.hessian(y))
+        slope, S = derivatives(y)
         curvatures = np.linalg.eigvalsh((S + S.T) / 2)
-        at_rest = np.linalg.norm(slope) <= 1e-8 * max(1.0, np.abs(S).max()) * (1 + np.linalg.norm(y))
+        at_rest = np.linalg.norm(slope) <= 1e-8 * np.abs(S).max() * size_of(y)
         higher = system.hamiltonian(y) - system.hamiltonian(y0)
-        if at_rest and curvatures[0] >= -1e-9 * curvatures[-1] and not higher > 1e-9 * (1 + abs(higher)):
+        rounding = 1e-9 * (np.abs(S).max() * of_y0**2 + abs(higher))
+        if at_rest and curvatures[0] >= -1e-9 * curvatures[-1] and not higher > rounding:
             return y
     return None
 
@@ -376,9 +387,10 @@ def _frequencies(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
 def _quadratic(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     """True if the Hessian of H is the same at states of all sizes."""
     rng = np.random.default_rng(0)
-    size = max(1e-3, float(np.abs(y0).max()))
-    states = np.concatenate([size * s * rng.standard_normal((8, y0.size)) for s in SCALES])
-    hessians = np.asarray(system.hessian(states))
+    scale = weights(system)
+    size = float(np.abs(scale * y0).max()) or 1.0
+    states = np.concatenate([size * s * rng.standard_normal((8, y0.size)) / scale for s in SCALES])
+    hessians = np.asarray(system.hessian(states)) / np.outer(scale, scale)
     spread = np.abs(hessians - hessians[0]).max()
     return bool(spread <= 1e-12 * np.abs(hessians[0]).max())
 

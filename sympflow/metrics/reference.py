@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.scales import smallest_size, weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import solve
 
@@ -27,7 +28,8 @@ class Reference:
     method : str
         In words.
     accuracy : float or None
-        Estimate of the largest error ‖y − y(t)‖; of a batch the median over its trajectories. None if it is unknown.
+        Estimate of the largest error ‖y − y(t)‖, in the units of y; of a batch the median over its trajectories. None
+        if it is unknown.
     """
 
     t: np.ndarray
@@ -51,8 +53,9 @@ def reference(
     """The solution from y0 (..., 2d) at the times t (n,), as accurately as is cheap.
 
     A quadratic H is solved exactly. A separable one by Kahan–Li 8 with a step that is halved until the last two runs
-    agree to `target`, or to rounding, or no better than the two before; their difference is the accuracy. Any other by
-    DOP853 at rtol 1e-13, whose accuracy is the difference from a run at 1e-12; so is one with friction, or driven.
+    agree to `target`, or to rounding, or no better than the two before, in comparable units of q and p; their
+    difference is the accuracy. Any other by DOP853 at rtol 1e-13, whose accuracy is the difference from a run at 1e-12;
+    so is one with friction, or driven.
 
     Parameters
     ----------
@@ -65,7 +68,9 @@ def reference(
     exact = _linear_flow(system, t - t_span[0], y0)
     if exact is not None:
         phase = np.abs(t - t_span[0]).max(initial=0.0) * np.abs(np.linalg.eigvals(_linear_part(system))).max()
-        return Reference(t, exact, "exact (linear flow)", float(np.finfo(float).eps * _size(exact) * (4 + phase)))
+        return Reference(
+            t, exact, "exact (linear flow)", float(np.finfo(float).eps * np.abs(exact).max(initial=0.0) * (4 + phase))
+        )
     run = _kahan_li if system.separable else _dop853
     return run(system, t_span, y0, t, target)
 
@@ -73,22 +78,22 @@ def reference(
 def _kahan_li(
     system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
 ) -> Reference:
-    dt = 4 * system.dt
-    previous, best, accuracy = None, None, math.inf
+    dt, scale = 4 * system.dt, weights(system)[:, None]
+    previous, best, apart = None, None, math.inf
     for _ in range(_HALVINGS):
         sol = solve(system, "kahan_li8", t_span, y0, t_eval=t, dt=dt)
         y = to_numpy(sol.y) if sol.y.shape[-1] == len(t) else None
         if y is not None and previous is not None:
-            before, accuracy = accuracy, _distance(y, previous)
-            if best is not None and not accuracy < before:
-                accuracy = before
+            before, apart = apart, _distance(scale * y, scale * previous) / (_size(scale * y) or 1.0)
+            if best is not None and not apart < before:
+                apart = before
                 break
-            best = Reference(t, y, f"Kahan–Li 8, dt = {dt:.3g}", accuracy)
-            if accuracy <= max(target, _ROUNDING * _size(y)):
+            best = Reference(t, y, f"Kahan–Li 8, dt = {dt:.3g}", accuracy := _distance(y, previous))
+            if accuracy <= target or apart <= _ROUNDING:
                 break
         previous = y
         dt /= 2
-    if best is None or not accuracy < _USELESS * _size(best.y):
+    if best is None or not apart < _USELESS:
         raise ValueError(
             f"`t_span` reaches beyond where {system.name!r} can be solved from `y0` (a singularity or chaos), and "
             "no reference converges there. End it earlier, or pass your own `reference`."
@@ -99,16 +104,16 @@ def _kahan_li(
 def _dop853(
     system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
 ) -> Reference:
-    scale = max(1e-3, float(np.abs(y0).max(initial=0.0)))
+    smallest = smallest_size(system, y0)
     fine, coarse = (
-        solve(system, "dop853", t_span, y0, t_eval=t, rtol=rtol, atol=rtol * scale).raise_for_status()
+        solve(system, "dop853", t_span, y0, t_eval=t, rtol=rtol, atol=rtol * smallest).raise_for_status()
         for rtol in (1e-13, 1e-12)
     )
     return Reference(t, to_numpy(fine.y), "DOP853, rtol = 1e-13", _distance(fine.y, coarse.y))
 
 
 def _size(y: np.ndarray) -> float:
-    return float(np.max(np.abs(y), where=np.isfinite(y), initial=1.0))
+    return float(np.max(np.abs(y), where=np.isfinite(y), initial=0.0))
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:

@@ -16,12 +16,9 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_counts
 from sympflow.arrays import jvp, to_numpy
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.scales import MOST_DENSE, natural_scale
 from sympflow.metrics.energy import failed
 from sympflow.solution import Solution, check_solution, gathered
-
-MOST_DENSE = 200
-"""Degrees of freedom of lattices and pairs whose steps have Jacobians as matrices."""
 
 
 def step_tangents(sol: Solution) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -118,16 +115,17 @@ def symplecticity_defect(
 
     A symplectic step has defect 0 up to the rounding of A, in the precision of the run, which is proportional to ‖A‖².
     The Jacobian A is taken in the variables (s q, p/s), which keep the form J and remove the imbalance of a stiff
-    oscillator. The defect is inf for a trajectory that became non-finite or could not be continued. Of lattices and
-    pairs of more than 200 degrees of freedom it is the value of `symplecticity_estimate`, which says the error too,
-    unless it is to be `relative` or a `scale` is given.
+    oscillator, or of units. The defect is inf for a trajectory that became non-finite or could not be continued. Of
+    lattices and pairs of more than 200 degrees of freedom it is the value of `symplecticity_estimate`, which says the
+    error too, unless it is to be `relative` or a `scale` is given.
 
     Parameters
     ----------
     sol : Solution
     relative : bool
     scale : array_like (d,) or float, optional
-        The factors s > 0. The default is `natural_scale(system)`, √ω for an oscillator of frequency ω.
+        The factors s > 0. The default is √(mω) for an oscillator of frequency ω and mass m, of another system that of
+        its second derivatives at q = p = 0, or else at y0.
 
     Raises
     ------
@@ -298,23 +296,6 @@ def _factors(scale: ArrayLike, d: int) -> np.ndarray:
     return np.broadcast_to(s, (d,))
 
 
-def natural_scale(system: HamiltonianSystem) -> np.ndarray:
-    """Factors s (d,) such that (s q, p/s) are balanced near q = p = 0: s_i⁴ = ∂²H/∂q_i² / ∂²H/∂p_i², or 1.
-
-    For an oscillator of frequency ω and unit mass s = √ω. Where the two second derivatives at the origin are not both
-    positive and finite, there is no natural scale and s_i = 1. Of a driven system they are those at `t_span[0]`.
-    """
-    d = system.ndof
-    try:
-        with np.errstate(all="ignore"):
-            diagonal = np.diagonal(np.asarray(system.hessian(np.zeros(2 * d), system.t_span[0])))
-            s = (diagonal[:d] / diagonal[d:]) ** 0.25
-    except (ZeroDivisionError, OverflowError):  # a Hamiltonian that is singular at the origin
-        return np.ones(d)
-    good = np.isfinite(s) & (s > 0) & (diagonal[d:] > 0)
-    return np.where(good, s, 1.0)
-
-
 def loop_area(loop: ArrayLike) -> np.floating | np.ndarray:
     """∮ p dq of closed loops (..., n, 2) in the phase plane, given at n equidistant values of a parameter.
 
@@ -363,7 +344,7 @@ def loop_area_error(sol: Solution) -> np.ndarray:
         raise ValueError("`sol` must start from a loop: pass a `y0` of shape (m, 2) with at least 8 points of it.")
     loops = np.moveaxis(to_numpy(sol.y).astype(float), -1, -3)  # (..., n, m, 2)
     start = loop_area(y0)
-    if (np.abs(start) < 1e-300).any():
+    if (start == 0).any():
         raise ValueError("`sol` starts from a loop without area: pass the points of a closed curve in order.")
     spectrum = np.abs(np.fft.rfft(loops, axis=-2))[..., 1:, :]
     tail = spectrum[..., 2 * spectrum.shape[-2] // 3 :, :].max((-2, -1))

@@ -18,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import check_flag
+from sympflow.storage.identity import Known
 from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, dofs, halves
 from sympflow.storage.store import Appender, Field, Store
 
@@ -60,10 +62,23 @@ class Place:
         return own | {"counts": np.array(json.dumps(self.counts, default=np.ndarray.tolist))}
 
     @classmethod
-    def read(cls, arrays: Mapping[str, np.ndarray]) -> Place:
-        """Return the place that arrays stand for."""
+    def read(cls, arrays: Mapping[str, np.ndarray], batch: tuple[int, ...]) -> Place:
+        """Return the place that arrays stand for, of trajectories of a batch.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError
+            If they stand for none.
+        """
         steps, counts = int(arrays["steps"]), json.loads(str(arrays["counts"]))
-        return cls(steps, arrays["running"], arrays["finite"], arrays["state"], arrays["failed"], counts)
+        place = cls(steps, arrays["running"], arrays["finite"], arrays["state"], arrays["failed"], counts)
+        kinds = place.running.dtype.kind + place.finite.dtype.kind + place.state.dtype.kind + place.failed.dtype.kind
+        shapes = [place.running.shape[:-1], place.finite.shape, place.state.shape[:-1], place.failed.shape]
+        if steps < 0 or kinds != "fifb" or any(shape != batch for shape in shapes):
+            raise ValueError(f"its arrays are none of {steps} steps of trajectories {batch}")
+        if not (isinstance(counts["stats"], dict) and isinstance(counts["noted"], dict)):
+            raise ValueError("its counts are none")
+        return place
 
 
 class RunStore:
@@ -77,6 +92,8 @@ class RunStore:
         Whether to go on with the run that is there.
     checkpoint_every : float, optional
         Seconds between two commits, at most; the default is 10.
+    same : bool
+        Whether functions and objects of Python are taken for those of the run that is there.
 
     Attributes
     ----------
@@ -90,20 +107,20 @@ class RunStore:
         The largest numbers that the method noted, and `domain_exit` and `warning` of an output outside the domain.
     """
 
-    def __init__(self, path: Any, resume: Any = False, checkpoint_every: Any = None) -> None:
+    def __init__(self, path: Any, resume: Any = False, checkpoint_every: Any = None, same: Any = False) -> None:
         if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
             raise TypeError(f"`store` must be the path of a folder; got {type(path).__name__}.")
-        if not isinstance(resume, bool | np.bool_):
-            raise TypeError(f"`resume` must be True or False; got {resume!r}.")
+        check_flag("resume", resume)
+        check_flag("same", same)
         every = SECONDS if checkpoint_every is None else checkpoint_every
         if isinstance(every, bool) or not isinstance(every, int | float | np.number) or not every > 0:
             raise ValueError(f"`checkpoint_every` must be a positive number of seconds; got {every!r}.")
         self.asked, self.path = str(path), Path(os.path.abspath(os.fspath(path)))
-        self.resume, self.every = bool(resume), float(every)
+        self.resume, self.same, self.every = bool(resume), bool(same), float(every)
         self.consistent, self.committed = True, time.perf_counter()
         self.noted: dict[str, Any] = {}
         self.attributes: dict[str, Any] = {}
-        self._made_of: tuple[dict[str, str], np.ndarray, int]
+        self._made_of: tuple[Known, np.ndarray, int]
         self.store: Store
         self.appender: Appender
         self.project: Callable[[Any], Any] = _itself
@@ -111,13 +128,13 @@ class RunStore:
 
     # opening --------------------------------------------------------------------------------------
 
-    def prepare(self, known: Mapping[str, str], attributes: Mapping[str, Any], y0: np.ndarray, n_outputs: int) -> None:
+    def prepare(self, known: Known, attributes: Mapping[str, Any], y0: np.ndarray, n_outputs: int) -> None:
         """Take what the store is to be made of.
 
         Parameters
         ----------
-        known : mapping of str to str
-            What the run is known by, in words.
+        known : Known
+            What the run is known by.
         attributes : mapping
             Those of the store, as JSON has them.
         y0 : ndarray of shape (..., 2d)
@@ -125,7 +142,7 @@ class RunStore:
             That are expected.
         """
         self.attributes = dict(attributes)
-        self._made_of = dict(known), y0, n_outputs
+        self._made_of = known, y0, n_outputs
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -148,10 +165,11 @@ class RunStore:
                 ) from None
             self.store = Store.open(self.path)
             remedy = "Nothing of it was changed: name another folder, or make the same call."
-            self.store.check_same(KNOWN, known, self.asked, "run", remedy)
+            self.store.check_same(KNOWN, known, self.asked, "run", remedy, self.same)
         try:
             with self.store.locked():
                 self.store = Store.open(self.path)  # as it is now that nobody else writes it
+                self._check(y0)
                 self.appender = Appender(self.store, TIME)
                 self.committed = time.perf_counter()
                 yield
@@ -159,19 +177,25 @@ class RunStore:
             self.look, self.project = _nothing, _itself
             vars(self).pop("appender", None)
 
-    def _create(self, known: Mapping[str, str], y0: np.ndarray, n_outputs: int) -> Store:
+    def _check(self, y0: np.ndarray) -> None:
+        """Check that all is there that makes a store of a run from y0."""
+        store, growing = self.store, self.store.fields.get(TIME)
+        missing = [name for name in ("status", "ended", "message") if name not in store.attributes]
+        if missing or growing is None or growing.chunks is None or len(growing.shape) != 1:
+            raise store.damaged(f"its {(*missing, TIME)[0]} is missing")
+        if growing.chunks[0] > max(1, CHUNK // y0.size):
+            raise store.damaged(f"its chunks of {growing.chunks[0]:,} times are larger than any of such a run")
+        store.check_made_of(_fields(y0, growing.chunks[0], growing.shape[0]))
+        for name in (DOF, "status", "q0", "p0"):
+            store.committed(name, (0,) * len(store.fields[name].shape))
+
+    def _create(self, known: Known, y0: np.ndarray, n_outputs: int) -> Store:
         """Make the store; a FileExistsError says that there is something in its place."""
         batch, d = y0.shape[:-1], y0.shape[-1] // 2
-        size = max(1, min(CHUNK // y0.size, n_outputs))
-        dims = batch_dims(batch)
-        made = {TIME: Field((TIME,), (0,), float, (size,)), DOF: Field((DOF,), (d,), int, attributes=NAMED[DOF])}
-        for letter, _ in halves(d):
-            made[letter] = Field((*dims, DOF, TIME), (*batch, d, 0), y0.dtype, (*batch, d, size), NAMED[letter])
-            made[f"{letter}0"] = Field((*dims, DOF), (*batch, d), y0.dtype, attributes=NAMED[f"{letter}0"])
-        made["status"] = Field(dims, batch, np.int8, attributes=NAMED["status"])
+        made = _fields(y0, max(1, min(CHUNK // y0.size, n_outputs)))
         told = {
             **self.attributes,
-            KNOWN: json.dumps(dict(known)),
+            KNOWN: json.dumps(known.texts),
             "status": -1,
             "ended": 0,
             "message": "The run has begun.",
@@ -201,7 +225,10 @@ class RunStore:
         arrays = self.store.state()
         if not arrays:
             return None
-        place = Place.read(arrays)
+        try:
+            place = Place.read(arrays, self.store.fields["status"].shape)
+        except (KeyError, TypeError, ValueError) as error:
+            raise self.store.damaged(f"its state is none of a run ({error})") from None
         self.noted = dict(place.counts["noted"])
         return place
 
@@ -215,7 +242,7 @@ class RunStore:
 
     def status(self) -> Any:
         """Return the status of each trajectory."""
-        found = self.store.read("status").astype(int)
+        found = self.store.committed("status", (0,) * len(self.store.fields["status"].shape)).astype(int)
         return found if found.ndim else int(found)
 
     def _read(self, names: tuple[str, ...], batch: tuple[int, ...], first: int) -> np.ndarray:
@@ -274,6 +301,17 @@ class RunStore:
         self.store.write("status", (0,) * len(known.shape), np.broadcast_to(status, known.shape))
         worst = int(np.min(status))
         self.commit(place, {"status": worst, "message": message, "ended": 1})
+
+
+def _fields(y0: np.ndarray, size: int, n: int = 0) -> dict[str, Field]:
+    """The arrays of a run of n outputs, with chunks of so many times."""
+    batch, d = y0.shape[:-1], y0.shape[-1] // 2
+    dims = batch_dims(batch)
+    made = {TIME: Field((TIME,), (n,), float, (size,)), DOF: Field((DOF,), (d,), int, attributes=NAMED[DOF])}
+    for letter, _ in halves(d):
+        made[letter] = Field((*dims, DOF, TIME), (*batch, d, n), y0.dtype, (*batch, d, size), NAMED[letter])
+        made[f"{letter}0"] = Field((*dims, DOF), (*batch, d), y0.dtype, attributes=NAMED[f"{letter}0"])
+    return made | {"status": Field(dims, batch, np.int8, attributes=NAMED["status"])}
 
 
 def _itself(y: Any) -> Any:

@@ -8,6 +8,9 @@ A store is written here and not by the zarr library because of three guarantees:
   readers take: `Store.commit`. A program that is killed at any moment leaves the store of the last commit.
 - Nothing is imported for it: a worker that writes chunks needs neither zarr nor xarray.
 
+A store is taken for a stranger's: names in it are names and never paths, no folder of it is a link, what it tells is
+held against the call that opens it, and nothing is unpacked beyond the size that this gives.
+
 `xarray.open_zarr(path)` and `zarr.open_group(path)` read a store.
 """
 
@@ -17,6 +20,7 @@ import io
 import itertools
 import json
 import os
+import re
 import shutil
 import tempfile
 import uuid
@@ -27,10 +31,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import product
 from math import prod
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
+
+from sympflow.storage.identity import Known
 
 __all__ = ["Appender", "Field", "Store", "StoreError"]
 
@@ -38,8 +44,10 @@ METADATA, ATTRIBUTES, ARRAY = ".zmetadata", ".zattrs", ".zarray"
 KEPT = "sympflow_state"
 """The attribute that names the file of the state which was kept at the last commit."""
 TOLD = 90  # characters of what differs between two calls
-LARGEST_CHUNK = 2**20
-"""Numbers in a chunk of an array that grows."""
+STATE = re.compile(r"\.state-([1-9]\d{0,17})\.npz")
+MOST_METADATA = 2**26  # bytes
+STORABLE = "biufc"
+"""Kinds of dtypes that a store takes: truth values and numbers."""
 
 
 class StoreError(OSError):
@@ -76,6 +84,10 @@ class Field:
     def __post_init__(self) -> None:
         if not len(self.dims) == len(self.shape) == len(self.chunks or self.shape):
             raise ValueError(f"`dims` {self.dims}, `shape` {self.shape} and `chunks` {self.chunks} must agree.")
+        if np.dtype(self.dtype).kind not in STORABLE:
+            raise TypeError(f"`dtype` {np.dtype(self.dtype)} is none of numbers, which a store takes: convert them.")
+        if not all(isinstance(n, int | np.integer) and n >= 0 for n in (*self.shape, *(self.chunks or ()))):
+            raise ValueError(f"`shape` {self.shape} and `chunks` {self.chunks} must be whole numbers, 0 or more.")
         chunks = self.shape if self.chunks is None else self.chunks
         object.__setattr__(self, "dtype", np.dtype(self.dtype).newbyteorder("<"))
         object.__setattr__(self, "chunks", tuple(max(1, int(n)) for n in chunks))
@@ -117,7 +129,15 @@ class Field:
         shape, chunks = tuple(metadata["shape"]), tuple(metadata["chunks"])
         fill = metadata["fill_value"]
         missing = fill if isinstance(fill, int) else None
-        return cls(tuple(attributes["_ARRAY_DIMENSIONS"]), shape, np.dtype(metadata["dtype"]), chunks, own, missing)
+        known = cls(tuple(attributes["_ARRAY_DIMENSIONS"]), shape, np.dtype(metadata["dtype"]), chunks, own, missing)
+        own_layout = {"dimension_separator": ".", **known.metadata()}
+        if any(metadata.get(key, ".") != value for key, value in own_layout.items()):
+            raise ValueError("an array is laid out otherwise than here")
+        return known
+
+    def is_like(self, other: Field) -> bool:
+        """Return True if another field has the same dimensions, shape, dtype and chunks."""
+        return (self.dims, self.shape, self.dtype, self.chunks) == (other.dims, other.shape, other.dtype, other.chunks)
 
     @property
     def filled(self) -> float:
@@ -159,6 +179,9 @@ class Store:
             If it cannot be made there.
         """
         place = Path(path)
+        for name in fields:
+            if not is_name(name):
+                raise ValueError(f"`store` cannot have an array {name!r}: rename it, to letters, digits and _.")
         exists = FileExistsError(f"`store` {str(place)!r} exists.")
         if _is_taken(place):
             raise exists
@@ -196,44 +219,82 @@ class Store:
         """
         place = Path(path)
         try:
-            found = json.loads((place / METADATA).read_text(encoding="utf-8"))["metadata"]
+            found = json.loads(_read(place / METADATA, MOST_METADATA))["metadata"]
             names = [key.removesuffix(f"/{ARRAY}") for key in found if key.endswith(f"/{ARRAY}")]
             fields = {name: Field.read(found[f"{name}/{ARRAY}"], found[f"{name}/{ATTRIBUTES}"]) for name in names}
-            return cls(place, fields, found[ATTRIBUTES])
+            attributes = dict(found[ATTRIBUTES])
+            strange = [name for name in names if not is_name(name)]
+            if strange or not STATE.fullmatch(attributes.get(KEPT, ".state-1.npz")):
+                raise ValueError(f"a path in place of a name, {(strange or [attributes.get(KEPT)])[0]!r}")
+            with os.scandir(place) as entries:
+                if links := [entry.name for entry in entries if entry.is_symlink() and entry.is_dir()]:
+                    raise ValueError(f"{links[0]!r} is a link to elsewhere")
+            return cls(place, fields, attributes)
         except FileNotFoundError:
             if place.exists():
                 raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
             raise FileNotFoundError(f"`store` {str(place)!r} does not exist.") from None
-        except (ValueError, KeyError, TypeError, AttributeError, NotADirectoryError):
-            raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
+        except (ValueError, KeyError, TypeError, AttributeError, NotADirectoryError, RecursionError) as error:
+            raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from error
 
-    def check_same(self, key: str, mine: Mapping[str, str], asked: str, kind: str, remedy: str) -> None:
+    def check_same(self, key: str, mine: Known, asked: str, kind: str, remedy: str, same: bool) -> None:
         """Check that a store is of the call that asks for it.
 
         Parameters
         ----------
         key : str
             The attribute that says of which call a store is, as JSON.
-        mine : mapping of str to str
-            What the call is known by, in words.
+        mine : Known
+            What the call is known by.
         asked : str
             The path as it was given.
         kind : str
             "run" or "ensemble".
         remedy : str
+        same : bool
+            Whether functions and objects of Python are taken for those of the store.
 
         Raises
         ------
         ValueError
-            If it is of another call, or of none of this kind.
+            If it is of another call, or of none of this kind, or if that cannot be told.
         """
-        theirs = json.loads(self.attributes.get(key, "{}"))
-        if not theirs:
+        try:
+            theirs = json.loads(self.attributes[key])
+        except (KeyError, TypeError, ValueError):
+            theirs = None
+        if not isinstance(theirs, dict):
             article = "an" if kind[0] in "aeiou" else "a"
             raise ValueError(f"`store` {asked!r} is no store of {article} {kind}: name another folder.")
-        other = difference(theirs, mine)
-        if other:
-            raise ValueError(f"`store` {asked!r} is of another {kind}: {other}. {remedy}")
+        known = {name: text for name, text in mine.texts.items() if not (same and name in mine.python)}
+        if other := difference(theirs, known):
+            name = other.split("`")[1]
+            vouched = f" If the code of `{name}` means the same, pass same=True." * (name in mine.python)
+            raise ValueError(f"`store` {asked!r} is of another {kind}: {other}. {remedy}{vouched}")
+        if mine.untold and not same:
+            name, part = next(iter(mine.untold.items()))
+            raise ValueError(
+                f"`store` {asked!r} may be of another {kind}: `{name}` holds {part}, which cannot be told from others. "
+                "Pass same=True if all is the same, or name another folder."
+            )
+
+    def check_made_of(self, fields: Mapping[str, Field]) -> None:
+        """Check that the arrays are those of the call that opens the store.
+
+        Raises
+        ------
+        StoreError
+            If one is missing, or is another, or one too many.
+        """
+        for name in {**fields, **self.fields}:
+            if name in self.fields and not (name in fields and fields[name].is_like(self.fields[name])):
+                raise self.damaged(f"its array {name!r} is none that the call makes")
+            if name not in self.fields or not (self.path / name).is_dir():
+                raise self.damaged(f"its array {name!r} is missing")
+
+    def damaged(self, why: str) -> StoreError:
+        """Return the error that says what is wrong with the store."""
+        return StoreError(f"`store` {str(self.path)!r} is damaged: {why}. Give another place, or a copy of it.")
 
     # chunks ---------------------------------------------------------------------------------------
 
@@ -294,15 +355,16 @@ class Store:
             return whole
         assert known.chunks is not None
         shape = tuple(part.stop - part.start for part in known.region(index))
+        size = prod(known.chunks) * known.dtype.itemsize
         try:
-            data = zlib.decompress(self._file(name, index).read_bytes())
-            if len(data) != prod(known.chunks) * known.dtype.itemsize:
-                raise zlib.error("another length")
+            unpacked = zlib.decompressobj()
+            data = unpacked.decompress(_read(self._file(name, index), size + size // 64 + 1024), size + 1)
+            if len(data) != size or not unpacked.eof:
+                raise ValueError("another length")
         except FileNotFoundError:
             return np.full(shape, known.filled, dtype=known.dtype)
-        except zlib.error as error:
-            file = self._file(name, index)
-            raise StoreError(f"`store` {str(self.path)!r} is damaged: {file.name} of {name!r} ({error}).") from None
+        except (zlib.error, ValueError) as error:
+            raise self.damaged(f"{self._file(name, index).name} of {name!r} ({error})") from None
         return np.frombuffer(data, known.dtype).reshape(known.chunks)[tuple(map(slice, shape))]
 
     def committed(self, name: str, index: tuple[int, ...]) -> np.ndarray:
@@ -314,8 +376,7 @@ class Store:
             If it is damaged, or not there.
         """
         if not self.has(name, index):
-            file = self._file(name, index)
-            raise StoreError(f"`store` {str(self.path)!r} is damaged: {file.name} of {name!r} is missing.")
+            raise self.damaged(f"{self._file(name, index).name} of {name!r} is missing")
         return self.read(name, index)
 
     # commits --------------------------------------------------------------------------------------
@@ -347,8 +408,8 @@ class Store:
         before = self.attributes.get(KEPT)
         with _told(self.path):
             if state is not None:
-                number = 1 + int(before.split("-")[1].removesuffix(".npz")) if before else 1
-                changed[KEPT] = f".state-{number}.npz"
+                last = STATE.fullmatch(before or "")
+                changed[KEPT] = f".state-{1 + int(last[1]) if last else 1}.npz"
                 buffer = io.BytesIO()
                 np.savez(buffer, **dict(state))  # type: ignore[arg-type]
                 _replace(self.path / changed[KEPT], buffer.getvalue())
@@ -381,10 +442,9 @@ class Store:
         if name is None:
             return {}
         try:
-            with open(self.path / name, "rb") as file, np.load(file, allow_pickle=False) as kept:
-                return dict(kept)
-        except (OSError, ValueError, zlib.error, zipfile.BadZipFile) as error:
-            raise StoreError(f"`store` {str(self.path)!r} is damaged: its state cannot be read ({error}).") from None
+            return read_arrays(self.path / name)
+        except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
+            raise self.damaged(f"its state cannot be read ({error})") from None
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -400,7 +460,10 @@ class Store:
         except ImportError:  # Windows, where an open file is not replaced anyway
             yield
             return
-        with open(self.path / ".lock", "w") as file:
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
+        with _told(self.path):
+            opened = os.open(self.path / ".lock", flags, 0o644)
+        with open(opened, "w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -483,6 +546,41 @@ class Appender:
         self.store.commit({self.dim: self.length}, attributes, state)
 
 
+def is_name(name: Any) -> bool:
+    """Return True for a name of an array: no path, and not hidden."""
+    if not isinstance(name, str) or name.startswith(".") or not name.isprintable():
+        return False
+    return PurePath(name).name == name != "" and "\\" not in name
+
+
+def read_arrays(file: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file, none of which takes more memory than the file has bytes.
+
+    Raises
+    ------
+    OSError, ValueError, EOFError, RuntimeError, BadZipFile
+        If they cannot be read, are packed, or hold other objects than numbers.
+    """
+    arrays = {}
+    with zipfile.ZipFile(file) as archive:
+        for member in archive.infolist():
+            if member.compress_type != zipfile.ZIP_STORED:
+                raise ValueError(f"{member.filename} is packed")
+            content = io.BytesIO(archive.read(member))
+            shape, _, dtype = _npy_header(content)
+            if prod(shape) * dtype.itemsize != member.file_size - content.tell():
+                raise ValueError(f"{member.filename} has another length")
+            content.seek(0)
+            arrays[member.filename.removesuffix(".npy")] = np.load(content, allow_pickle=False)
+    return arrays
+
+
+def _npy_header(content: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    if np.lib.format.read_magic(content) != (1, 0):
+        raise ValueError("an array of another format")
+    return np.lib.format.read_array_header_1_0(content)
+
+
 def difference(theirs: Mapping[str, str], mine: Mapping[str, str]) -> str:
     """Return what differs first between the texts of a store and of a call, cut to where it does; "" if nothing."""
     for name, text in mine.items():
@@ -497,6 +595,15 @@ def difference(theirs: Mapping[str, str], mine: Mapping[str, str]) -> str:
 
 def _json(value: Any) -> bytes:
     return json.dumps(value, allow_nan=False, indent=1).encode()
+
+
+def _read(path: Path, most: int) -> bytes:
+    """The content of a file; a ValueError if it has more bytes than that."""
+    with path.open("rb") as file:
+        content = file.read(most + 1)
+    if len(content) > most:
+        raise ValueError(f"more than {most:,} bytes")
+    return content
 
 
 def _replace(path: Path, data: bytes, durable: bool = True) -> None:

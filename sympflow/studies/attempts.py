@@ -108,6 +108,23 @@ def tolerance_of(integrator: Any) -> float | None:
     return integrator.rtol if "rtol" in integrator.options() else None
 
 
+GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+def instants(t0: float, t1: float, n: int, dt: float) -> np.ndarray:
+    """The times (n,) at which methods are compared: one in each n-th of the interval, the last at its end.
+
+    Their places within these parts go on by the golden section, so that they meet all phases of an oscillation even
+    where its period divides the parts. They are ends of steps dt where a part holds two of these or more, so that a
+    method makes no other steps for them.
+    """
+    k = np.arange(1, n)
+    elapsed = (k - 1 + (GOLDEN * k) % 1) * (abs(t1 - t0) / n)
+    if 2 * dt * n <= abs(t1 - t0):
+        elapsed = dt * np.rint(elapsed / dt)
+    return np.append(t0 + math.copysign(1, t1 - t0) * elapsed, t1)
+
+
 # rows -------------------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
@@ -372,7 +373,8 @@ def _period(comparison: Compared) -> float | None:
 
 def _reference_points(comparison: Compared) -> np.ndarray:
     system = comparison.system
-    accurate = build("kahan_li8", {}) if system.separable else build("dop853", {"rtol": 1e-12, "atol": 1e-12})
+    atol = 1e-12 * smallest_size(system, to_numpy(comparison.y0))
+    accurate = build("kahan_li8", {}) if system.separable else build("dop853", {"rtol": 1e-12, "atol": atol})
     return _phase_points(comparison, accurate)
 
 

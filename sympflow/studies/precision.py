@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_counts, check_t_span, positive_numbers
+from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.metrics.energy import failed
@@ -73,10 +74,10 @@ def work_precision(
         Steps of fixed-step methods; by default 32·system.dt, halved until the error is at rounding, at most to
         system.dt/256.
     tolerances : sequence of float
-        rtol of adaptive methods, with atol = rtol/1000, the ratio of SciPy's defaults.
+        rtol of adaptive methods, with atol = rtol/1000, the ratio of SciPy's defaults, times the size of q and p at y0.
     n_outputs : int
-        Number of instants. Reaching one between two steps costs a method a shorter step, in run time and in
-        evaluations: with steps as long as the time between instants it is the outputs that are measured.
+        Number of instants, as for `compare`. Reaching one between two steps costs a method a shorter step, in run time
+        and in evaluations: with steps as long as the time between instants it is the outputs that are measured.
     repeats : int
         Timed runs of each point, interleaved over all points of one batch size.
     budget : float
@@ -113,10 +114,11 @@ def work_precision(
         raise ValueError("`y0` must be one state: give several as `batch`.")
     if batch is not None:
         starts.append(_batch(system, batch))
+    dt, size = system.dt if steps is None else steps[0], smallest_size(system, starts[0])
     if steps is None:
         steps = [LARGEST_STEP * system.dt / 2**k for k in range(N_STEPS)]
-    swept = [(c, _sweep(c, c.label in methods, steps, tolerances)) for c in candidates(methods)]
-    t = t0 + (t1 - t0) * np.arange(1, n_outputs + 1) / n_outputs
+    swept = [(c, _sweep(c, c.label in methods, steps, tolerances, size)) for c in candidates(methods)]
+    t = attempts.instants(t0, t1, n_outputs, dt)
     rows: list[Row] = []
     references: list[Reference | None] = []
     for start in starts:
@@ -146,15 +148,17 @@ def _batch(system: HamiltonianSystem, batch: int | ArrayLike) -> np.ndarray:
     return states
 
 
-def _sweep(candidate: Candidate, by_name: bool, steps: Sequence[float], tolerances: Sequence[float]) -> list[Any]:
-    """The candidate's integrator at each of its steps or tolerances, from coarse to fine."""
+def _sweep(
+    candidate: Candidate, by_name: bool, steps: Sequence[float], tolerances: Sequence[float], size: float
+) -> list[Any]:
+    """The candidate's integrator at each of its steps or tolerances, from coarse to fine; `size` is that of states."""
     integrator = candidate.integrator
     if integrator is None or not by_name or integrator.trained:
         return [integrator]
     if isinstance(integrator, FixedStep):
         return [replace(integrator, dt=dt) for dt in sorted(steps, reverse=True)]
     if tolerance_of(integrator) is not None:
-        return [replace(integrator, rtol=r, atol=r / 1000) for r in sorted(tolerances, reverse=True)]
+        return [replace(integrator, rtol=r, atol=r / 1000 * size) for r in sorted(tolerances, reverse=True)]
     return [integrator]
 
 

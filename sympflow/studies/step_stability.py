@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span, positive_numbers
 from sympflow.arrays import is_tensor, to_numpy
+from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.energy import max_energy_error
@@ -181,7 +182,15 @@ def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarra
     if given.ndim == 2:
         return given
     times = system.dt * np.array(PHASES)
-    sol = solve(system, "dop853", (0.0, float(times[-1])), given, t_eval=times, rtol=1e-11, atol=1e-13)
+    sol = solve(
+        system,
+        "dop853",
+        (0.0, float(times[-1])),
+        given,
+        t_eval=times,
+        rtol=1e-11,
+        atol=1e-13 * smallest_size(system, given),
+    )
     return sol.states if sol.success and np.isfinite(sol.y).all() else given[None]
 
 
@@ -190,7 +199,8 @@ def _orbit(system: HamiltonianSystem, y0: np.ndarray, t_span: tuple[float, float
     length = min(abs(t_span[1] - t_span[0]), MOST_OF_ORBIT * system.dt)
     times = np.linspace(0.0, length, ORBIT)
     with _quiet():
-        states = solve(system, "dop853", (0.0, length), y0, t_eval=times, rtol=1e-6, atol=1e-8).states
+        atol = 1e-8 * smallest_size(system, y0)
+        states = solve(system, "dop853", (0.0, length), y0, t_eval=times, rtol=1e-6, atol=atol).states
     return states if len(states) else y0[None]
 
 

@@ -164,9 +164,12 @@ def _of_toml(file: Path, name: str | None) -> Callable[..., HamiltonianSystem]:
 
 def _table(file: Path) -> dict[str, Any]:
     """The keys of a file, checked."""
+    text = _text(file)
     try:
-        table = tomllib.loads(_text(file))
-    except tomllib.TOMLDecodeError as error:
+        table = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(f"`system` {str(file)!r} is nested too deeply: write it in fewer brackets.") from None
+    except ValueError as error:  # of its grammar, and of numbers with thousands of digits
         raise ValueError(f"`system` {str(file)!r} is no TOML ({error}): mend it, texts in quotes.") from error
     for key, value in table.items():
         if key not in KEYS:

@@ -295,10 +295,19 @@ def test_systems_of_one_name_do_not_overwrite_their_files():
 
 def test_a_backticked_argument_is_the_option_of_the_command_that_runs():
     said = "`t_eval` and `hidden`: use backend='array' or `dt=0.1`, or flow.save(path=3); `rtol` stays."
+    said += ' Pass damping=True and order="pairs".'
     here = "`--n-outputs` and `hidden`: use `--backend array` or `--dt 0.1`, or flow.save(path=3); `rtol` stays."
+    here += " Pass `--damping` and `--order pairs`."
     contexts = []
 
-    def command(ctx: typer.Context, n_outputs: int = 1, backend: str = "", dt: float = 1.0) -> None:
+    def command(
+        ctx: typer.Context,
+        n_outputs: int = 1,
+        backend: str = "",
+        dt: float = 1.0,
+        damping: bool = False,
+        order: str = "",
+    ) -> None:
         contexts.append(ctx)
 
     app = typer.Typer()

@@ -5,14 +5,12 @@ import os
 import signal
 import subprocess
 import sys
-from functools import partial
 
 import numpy as np
 import pytest
 
 import sympflow
 from sympflow.ensembles import results
-from sympflow.ensembles.callables import fingerprint
 from sympflow.storage import store as storage
 
 SYSTEM = sympflow.systems.henon_heiles()
@@ -129,46 +127,8 @@ def test_a_store_that_is_there_or_of_another_ensemble(tmp_path):
         run(store=3)
 
 
-OFFSET = 0.0
-
-
-def largest(t, y, factor=1.0):
-    return factor * max(value + OFFSET for value in y[0])
-
-
-class Scaled:
-    def __init__(self, factor):
-        self.factor = factor
-
-    def __call__(self, t, y):
-        return self.factor * y[0].max()
-
-
 def scaled(factor):
     return lambda t, y: factor * y[0].max()
-
-
-@pytest.mark.parametrize(
-    "make", [scaled, Scaled, lambda factor: partial(largest, factor=factor), lambda factor: Scaled(factor).__call__]
-)
-def test_functions_are_known_by_the_values_they_compute_with(make):
-    assert fingerprint(make(1.0)) == fingerprint(make(1.0))
-    assert fingerprint(make(1.0)) != fingerprint(make(2.0))
-
-
-def test_functions_are_known_by_globals_and_defaults_in_any_process(monkeypatch):
-    before = fingerprint(largest)
-    monkeypatch.setitem(globals(), "OFFSET", 1.0)
-    assert fingerprint(largest) != before
-    monkeypatch.setitem(globals(), "OFFSET", 0.0)
-    assert fingerprint(largest) == before
-    monkeypatch.setattr(largest, "__defaults__", (2.0,))
-    assert fingerprint(largest) != before
-    words = (
-        "from sympflow.ensembles.callables import fingerprint\nk={'a', 'b'}\nprint(fingerprint(lambda t, y: 'a' in k))"
-    )
-    told = {subprocess.run([sys.executable, "-c", words], check=True, capture_output=True).stdout for _ in range(2)}
-    assert len(told) == 1
 
 
 def test_a_store_is_of_one_step_and_one_function(tmp_path):

@@ -167,6 +167,12 @@ def test_energy_errors_where_some_values_drive_the_system():
             "`reduce` raises ZeroDivisionError: division by zero",
         ),
         ({"reduce": lambda t, y: "text"}, TypeError, "`reduce` must return numbers"),
+        (
+            {"reduce": lambda t, y: 2**53 + 1},
+            ValueError,
+            r"`reduce` cannot be kept: reduced has an integer",
+        ),
+        ({"reduce": lambda t, y: {"a": [1, -(2**70)]}}, ValueError, "`reduce` cannot be kept: a has an integer beyond"),
         ({"reduce": lambda t, y: {"status": 1.0}}, ValueError, "`reduce` returns 'status', a name that"),
         ({"workers": "two"}, TypeError, "`workers` must be a number"),
         ({"backend": "gpu"}, ValueError, "`backend` must be one of 'auto'"),
@@ -205,6 +211,37 @@ def test_a_function_that_fails_later_fails_a_row():
     assert "RuntimeError: not this one" in result.messages[7,]
     assert "returns reduced of shape (3,), but reduced of shape (2,) for the first" in result.messages[9,]
     assert np.isnan(result.reduced[7]).all()
+
+
+def test_numbers_of_a_function_are_kept_or_the_row_fails():
+    def kinds(t, y):
+        one = y[0, 0] == STATES[3, 0]
+        huge = y[0, 0] == STATES[4, 0]
+        return {"real": 1j if one else 1 + 0j * t[0], "complex": complex(0, 1), "whole": 2**63 if huge else 2**53}
+
+    def real_first(t, y):
+        return {name: v.real if name == "real" and v == 1 else v for name, v in kinds(t, y).items()}
+
+    result = kept(reduce=real_first)
+    assert np.flatnonzero(result.status).tolist() == [3, 4]
+    assert "returns complex real, and real ones for the first orbit" in result.messages[3,]
+    assert "whole has an integer beyond 2**53" in result.messages[4,]
+    assert (result.complex[result.status == 0] == 1j).all()
+    assert (result.whole[result.status == 0] == 2**53).all()
+    assert kept(reduce=kinds).real[3] == 1j
+
+
+class Wrong(reductions.Final):
+    def fields(self, problem):
+        return {"count": ((), np.dtype(int))}
+
+    def reduce(self, chunk):
+        return {"count": np.full(len(chunk), 1.5)}
+
+
+def test_a_reduction_returns_what_it_tells():
+    with pytest.raises(TypeError, match="`reduce` returns count as float64, which its `fields` told as int64"):
+        kept(reduce=Wrong())
 
 
 def test_what_is_sent_to_processes_is_small_and_can_be_sent():

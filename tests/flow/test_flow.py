@@ -419,3 +419,14 @@ def test_layers_must_agree():
         SympFlow.from_layers([Kick(MLPPotential(1)), Drift(MLPPotential(2))], dt=1.0)
     with pytest.raises(ValueError, match="`layers`"):
         SympFlow.from_layers([], dt=1.0)
+
+
+def test_times_in_a_column_are_no_outer_product_unless_it_is_asked_for():
+    flow, x, t = SympFlow(1, 1, [4], seed=0), states(3, 1), times(3)
+    with pytest.raises(
+        ValueError, match=r"^`t` of shape \(3, 1\) would take every state .*pass t\[\.\.\., 0\].*x\[None\]"
+    ):
+        flow(t[:, None], x)
+    every = flow(t[:, None], x[None])
+    assert torch.allclose(every[[0, 1, 2], [0, 1, 2]], flow(t, x), atol=1e-14, rtol=0)
+    assert flow(times(2)[:, None], x).shape == (2, 3, 2)

@@ -200,6 +200,12 @@ class TestNumbaFunctions:
         (lambda: HamiltonianSystem.from_sympy("p**2/2 + t*q"), TypeError, "^`expression` depends on the time"),
         (lambda: HamiltonianSystem.from_sympy("p**2/2 + ("), ValueError, "^`expression` cannot be parsed"),
         (lambda: HamiltonianSystem.from_sympy("p1**2 + q + q2"), ValueError, "^`expression` mixes q, p"),
+        (
+            lambda: HamiltonianSystem.from_sympy("p**2 + q99999999999"),
+            ValueError,
+            "^`expression` has coordinates of the",
+        ),
+        (lambda: HamiltonianSystem.from_sympy("p1**2 + q" + "9" * 5000), ValueError, "holds q9{39}… without"),
         (lambda: HamiltonianSystem.from_sympy("3"), ValueError, "^`expression` must depend on q1"),
         (lambda: HamiltonianSystem.from_sympy("p**2 + q", params={"k": 1}), ValueError, "^`params` has 'k'"),
         (

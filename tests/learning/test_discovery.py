@@ -123,7 +123,7 @@ def test_terms_that_are_nearly_alike_are_told_apart(H, n, seed):
     ids=["q p", "rotation", "Larmor"],
 )
 def test_quadratic_forms_of_q_and_p_are_found(H, ndof):
-    found = sympflow.discover(noisy(H, ndof, 0), "polynomials", degree=2)
+    found = sympflow.discover(noisy(H, ndof, 0, 16), "polynomials", degree=2)
     names = {s.name: s for pair in coordinates(ndof) for s in pair} | ({"q": q, "p": p} if ndof == 1 else {})
     assert set(found.discovery.terms) == set(sp.expand(sp.sympify(H, names)).as_coefficients_dict())
     assert found.discovery.explains
@@ -137,16 +137,9 @@ def circles(sigma):
     return t, y + sigma * random.normal(size=y.shape)
 
 
-def doubled(sigma):
-    """A pendulum and twice the same."""
-    times, y = measured(pendulum(), 0.0, n=8)
-    y = y[:, [0, 0, 1, 1]] * [[1.0], [2.0], [1.0], [2.0]]
-    return times, y + sigma * np.random.default_rng(0).normal(size=y.shape)
-
-
 @pytest.mark.parametrize(
     ("data", "same"),
-    [(circles(0.0), "p2 - q1, p1 + q2"), (circles(0.01), "p2 - q1, p1 + q2"), (doubled(0.01), "q1 - 0.5*q2")],
+    [(circles(0.0), "p2 - q1, p1 + q2"), (circles(0.01), "p2 - q1, p1 + q2")],
 )
 def test_what_the_data_do_not_tell_is_said(data, same):
     with pytest.warns(UserWarning, match="The data do not tell H beyond themselves: .* to the noise, ") as said:

@@ -1,13 +1,18 @@
 """The test whether any Hamiltonian explains the data, before fits: friction, another order of columns, no H at all."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import sympflow
+from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
 from sympflow.learning.learner import Search, _said
+from sympflow.learning.library import library_for
+from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import best_by_increments
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training.session import Session
@@ -30,6 +35,15 @@ def walks():
     return [(np.arange(31.0), np.cumsum(y, 1)) for y in np.random.default_rng(0).normal(size=(6, 2, 31))]
 
 
+def turning(t, y):
+    """An isotropic oscillator in a magnetic field, whose states are those of an H in the order q1, p1, q2, p2 too."""
+    return [y[2], y[3], -y[0] + 0.8 * y[3], -y[1] - 0.8 * y[2]]
+
+
+def driven(t, y):
+    return [y[1], -np.sin(y[0]) + 0.3 * np.cos(1.7 * t)]
+
+
 def in_pairs(runs):
     return [(t, y[[0, 2, 1, 3]]) for t, y in runs]
 
@@ -45,6 +59,9 @@ CASES = {
         lambda: runs(lambda t, y: [y[2], y[3], y[1] - 2 * y[0], (y[0] - 2 * y[1]) / 3], 2),
         "need not be Hamiltonian",
     ),
+    "little friction": (lambda: runs(lambda t, y: [y[1], -np.sin(y[0]) - 0.01 * y[1]], 1, span=12.0), "friction"),
+    "quadratic drag": (lambda: runs(lambda t, y: [y[1], -np.sin(y[0]) - 0.2 * abs(y[1]) * y[1]], 1), "drag"),
+    "a magnetic field": (lambda: runs(turning, 2, points=61), "turns p"),
     "a limit cycle": (lambda: runs(lambda t, y: [y[1], (1 - y[0] ** 2) * y[1] - y[0]], 1), "need not be Hamiltonian"),
 }
 
@@ -55,7 +72,7 @@ def test_increments_tell_data_of_no_hamiltonian(name):
     data = Trajectories.read(make())
     about = _said(data, None, None, False, None, None)
     models = [c.model for family in FAMILIES.values() if family.linear for c in family.models(about)]
-    _, reading = best_by_increments(*data.split(), models)
+    _, reading, _ = best_by_increments(*data.split(), models)
     assert (reading is None) == (not said)
     assert reading is None or said in reading.said
 
@@ -79,10 +96,41 @@ def test_discover_tells_it_too_and_ends_with_its_time():
     with pytest.warns(UserWarning, match='pass order="pairs"'):
         system = sympflow.discover(wrong)
     assert not system.discovery.explains
-    assert len(system.discovery.path) == 1
+    assert len(system.discovery.path) <= 2  # what the search began with, and the same with a term less
     right = runs(lambda t, y: [y[1], -np.sin(y[0])], 1, n=5, width=1.5)
     with pytest.warns(UserWarning, match="time budget"):
         system = sympflow.discover(right, time_budget=1e-6)
     assert len(system.discovery.terms) >= 1
     with pytest.raises(ValueError, match="`time_budget` must be a positive"):
         sympflow.discover(right, time_budget=-1)
+
+
+@pytest.mark.parametrize(
+    ("field", "d", "damped", "said"),
+    [
+        (lambda t, y: [y[1], -y[0] - 0.2 * y[1]], 1, False, "Friction p' = -γp with γ = 0.2"),
+        (lambda t, y: [y[1], -y[0] - 0.2 * abs(y[1]) * y[1]], 1, True, "Quadratic drag p' = -c|p|p with c = 0.2"),
+        (driven, 1, False, "angular frequency 1.7"),
+        (turning, 2, False, "magnetic field, by which p_i' = B p_j, p_j' = -B p_i with B = 0.8"),
+        (lambda t, y: [y[1], -np.sin(y[0])], 1, False, "otherwise"),
+    ],
+)
+def test_hints_name_the_reason_and_its_size(field, d, damped, said):
+    data = Trajectories.read(runs(field, d, points=61, noise=1e-3))
+    smooth = smoothed(data)
+    found = hint(library_for(None, d, 4, smooth.points)[0], smooth, data, "otherwise", damped)
+    assert re.search(rf"{re.escape(said)}\d?", found), found
+    one = smoothed(data.subset([0]))
+    assert "driven" not in hint(library_for(None, d, 4, one.points)[0], one, data, "otherwise", damped)
+
+
+def test_friction_of_one_percent_is_named():
+    """It leaves more than half of the squares of a model without it, for most of them are noise."""
+    data = Trajectories.read(
+        runs(lambda t, y: [y[1], -np.sin(y[0]) - 0.01 * y[1]], 1, span=24.0, points=41, noise=0.02)
+    )
+    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, 2 * np.pi, None), Setting(), 0)
+    search.run(["waves"], Session())
+    with pytest.warns(UserWarning, match=r"There is friction, γ = 0\.01\d*: .* Pass damping=True"):
+        search.diagnose(Session())
+    assert search.tested[0].rate == pytest.approx(-0.01, rel=0.2)

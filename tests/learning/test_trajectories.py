@@ -1,5 +1,7 @@
 """Trajectories from arrays, tables, Datasets and results: read alike, and refused by name."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -56,6 +58,50 @@ def test_results_of_solvers_are_read():
     assert_same(Trajectories.read(scipy), [(t, scipy.y)])
 
 
+TIMES, BOTH = np.stack([t, 2 * t]), np.stack([RUN, 2 * RUN])
+SAME, EACH = [(t, RUN), (t, 2 * RUN)], [(t, RUN), (2 * t, 2 * RUN)]
+PADDED = np.where(np.arange(6) < 4, TIMES, [[1], [np.nan]] * TIMES)
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "runs"),
+    [
+        ((TIMES, BOTH), {}, EACH),
+        ((PADDED, BOTH), {}, [(t, RUN), (2 * t[:4], 2 * RUN[:, :4])]),
+        ({"t": t, "y": BOTH}, {}, SAME),
+        ({"time": TIMES, "y": BOTH}, {}, EACH),
+        ({"t": TIMES, "q": BOTH[:, 0], "p": BOTH[:, 1]}, {}, EACH),
+        ({"t": t, "q": BOTH[:, :1], "p": BOTH[:, 1:], "k": 3.0}, {}, SAME),
+        ({"t": t, "q": BOTH[:, 0], "p": BOTH[:, 1]}, {"ndof": 1}, SAME),
+        ({"t": t, "q": FOUR[:2], "p": FOUR[2:]}, {"ndof": 2}, [(t, FOUR)]),
+        ((BOTH[:, :, 0], [[0.5], [0.5]], BOTH[:, :, 1]), {}, [([0, 0.5], y[:, :2]) for y in BOTH]),
+    ],
+)
+def test_each_trajectory_has_its_times_and_arrays_have_names(data, options, runs, tmp_path):
+    assert_same(Trajectories.read(data, **options), runs)
+    if isinstance(data, dict):
+        np.savez(tmp_path / "runs.npz", **data)
+        assert_same(Trajectories.read(tmp_path / "runs.npz", **options), runs)
+
+
+def test_dictionaries_of_columns_are_tables():
+    pytest.importorskip("pandas")
+    assert_same(Trajectories.read({"t": t, "q": RUN[0], "p": RUN[1]}), [(t, RUN)])
+    assert_same(Trajectories.read({"t": t, "w": RUN[1], "a": RUN[0]}, q=["a"], p=["w"]), [(t, RUN)])
+
+
+@pytest.mark.parametrize(("ending", "by"), [(".csv", ","), (".txt", " "), (".tsv", "\t")])
+def test_files_without_names_are_refused_unless_a_comment_has_them(tmp_path, ending, by):
+    pytest.importorskip("pandas")
+    path = tmp_path / f"runs{ending}"
+    np.savetxt(path, np.column_stack([t, *RUN]), delimiter=by)
+    with pytest.raises(ValueError, match=r"^`data` names .* numbers in place of the names .* t,q1,p1"):
+        Trajectories.read(path)
+    for comments in ("# ", ""):
+        np.savetxt(path, np.column_stack([t, *RUN]), delimiter=by, header=by.join("tqp"), comments=comments)
+        assert_same(Trajectories.read(path), [(t, RUN)])
+
+
 def no_engine(path):
     raise ImportError("Unable to find a usable engine")
 
@@ -84,7 +130,13 @@ def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
     assert_same(Trajectories.read(tmp_path / "runs.nc"), runs)
     sol.to_xarray().to_zarr(tmp_path / "runs.zarr", consolidated=False)
     assert_same(Trajectories.read(tmp_path / "runs.zarr"), runs)
-    with pytest.raises(ValueError, match=r"names a file \.mat: \.csv, \.parquet, \.nc and \.zarr are read"):
+    large = tmp_path / "large.zarr"
+    sol.to_xarray().assign(more=("x", np.zeros(3))).to_zarr(large, consolidated=False, zarr_format=2)
+    described = json.loads((large / "more" / ".zarray").read_text())
+    (large / "more" / ".zarray").write_text(json.dumps(described | {"shape": [10**13]}))
+    with pytest.raises(ValueError, match=r"`data` tells of .* GiB, more than"):
+        Trajectories.read(large)
+    with pytest.raises(ValueError, match=r"names a file \.mat: \.csv, \.parquet, \.npz, \.nc and"):
         (tmp_path / "runs.mat").touch()
         Trajectories.read(tmp_path / "runs.mat")
     read = Trajectories.read(tmp_path / "runs.csv", ndof=2)
@@ -213,6 +265,11 @@ def test_angles_that_were_wrapped_are_noticed_and_continued():
         ((t, FOUR), {"velocity_mass": [[1, 2], [2, 1]]}, "positive definite"),
         ((t[:0], FOUR[None, :, :0]), {}, "has no numbers"),
         ((np.eye(2), [1, 2, 3], np.eye(2)), {}, r"give x \(N, 2d\), t \(N,\)"),
+        ((np.stack([t, t]), np.ones((3, 2, 6))), {}, r"times of shape \(2, 6\) .* give t \(n,\) for all, or \(N, n\)"),
+        ({"y": FOUR}, {}, "no times: give them as t"),
+        ({"t": t, "q": FOUR[:2], "p": FOUR[2:]}, {}, "k coordinates or k trajectories: pass `ndof`"),
+        ({"t": t, "q": FOUR[:2], "v": FOUR[2:]}, {}, "with q and p of one shape"),
+        ({"t": t, "q": t, "p": t[:3]}, {}, "columns must be of one length"),
     ],
 )  # fmt: skip
 def test_bad_data_are_refused_with_the_remedy(data, options, message):

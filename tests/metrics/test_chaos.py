@@ -107,10 +107,12 @@ def test_vectors_of_a_driven_system_are_those_of_neighbouring_orbits():
     text, values = "p**2/2 - cos(q)*(1 + a*cos(w*t))", {"a": 0.8, "w": 1.7}
     system = HamiltonianSystem.from_sympy(text, time="t", params=values)
     y0, w0, step = np.array([1.0, 0.2]), np.array([0.8, 0.6]), 1e-7
+    scale = np.array([1.8**0.25, 1.8**-0.25])  # q and p in units of the oscillation at rest, at t = 0
     how = {"method": "verlet", "t_span": (0.3, 10.3), "dt": 0.1, "backend": "array"}
     found = sympflow.lyapunov(system, y0=y0, deviations=w0, **how)
     ends = [sympflow.solve(system, y0=y0 + x * w0, **how).y[:, -1] for x in (step, -step)]
-    rate = np.log(np.linalg.norm(ends[0] - ends[1]) / (2 * step)) / 10
+    lengths = [np.linalg.norm(scale * w) for w in (ends[0] - ends[1], 2 * step * w0)]
+    rate = np.log(lengths[0] / lengths[1]) / 10
     assert found.value == pytest.approx(rate, abs=1e-7)
     with pytest.raises(ValueError, match="`y0` is a batch, whose steps"):
         sympflow.lyapunov(system, "dop853", (0, 1), [y0, y0])
@@ -161,6 +163,18 @@ def test_orbits_that_fail_have_a_status_and_leave_the_others_alone():
         assert np.isfinite(found.value[1])
         assert 3 < found.t_end[0] < 6
         assert "(index 0)" in found.message
+
+
+@pytest.mark.parametrize("function", [sympflow.lyapunov, sympflow.sali])
+def test_the_end_of_an_orbit_is_its_last_finite_step(function):
+    """Orbits fail within the first block of steps, after which all are looked at."""
+    system, y0 = henon_heiles_escape(), [[9.0, 0.1, 0.0, 0.0], [0, 0.1, 0, 0], [5.0, 0.1, 3.0, 0.0]]
+    ends = [sympflow.solve(system, "verlet", (0, 10), y, dt=0.1).stats.get("failed_at", 10.0) for y in y0]
+    assert 0 < ends[0] < ends[2] < 5
+    for found in both_ways(function, system, "verlet", (0, 10), y0, dt=0.1):
+        assert found.status.tolist() == [-1, 0, -1]
+        assert np.all((np.array(ends) - 0.5 < found.t_end) & (found.t_end <= np.array(ends) + 1e-12))
+        assert f"after t = {found.t_end[0]:.17g}" in found.message
 
 
 @pytest.mark.parametrize(

@@ -53,8 +53,8 @@ def test_an_error_is_at_least_a_hundred_times_that_of_the_reference_or_is_marked
 
 def test_evaluations_are_those_of_one_trajectory(report):
     for trajectories in (1, 20):
-        row = next(r for r in points(report, "verlet", trajectories) if r.dt == 0.1)
-        assert row.force_evaluations == 100 + 10  # an output closes a step that was merged with the next
+        row = next(r for r in points(report, "verlet", trajectories) if r.dt == 0.05)
+        assert row.force_evaluations == 200 + 10  # an output closes a step that was merged with the next
         assert row.hessian_evaluations == 0
     alone, batch = points(report, "rk45")[0], points(report, "rk45", 20)[0]
     assert batch.force_evaluations == pytest.approx(alone.force_evaluations, rel=0.3)
@@ -140,7 +140,7 @@ def test_a_flow_in_another_time_is_a_point_as_it_is_a_row_of_compare():
     flow = get("sympflow")(flow="kepler-log-1")
     few = {"t_span": (0, 20), "n_outputs": 20, "repeats": 1}
     verlet, point = work_precision(systems.kepler(0.6), ["verlet", flow], steps=[0.05], **few).rows
-    (row,) = compare(systems.kepler(0.6), [flow], ["error", "energy"], **few).rows
+    (row,) = compare(systems.kepler(0.6), [flow], ["error", "energy"], dt=0.05, **few).rows
     assert (point.label, point.status, point.dt) == ("sympflow", "uncertain", row.dt)  # better than the reference
     assert point.training_time == row.training_time > 0
     assert point.energy_error == row.energy_error < 1e-6 * verlet.energy_error
@@ -196,12 +196,12 @@ def test_a_warm_up_is_a_run_of_a_few_steps_with_as_many_outputs():
     assert runs[2][0][1] == -0.1
 
 
-def test_an_error_that_is_small_by_chance_does_not_end_a_sweep():
-    """At dt·ω = 2 Verlet turns an oscillator at rest by half a turn: all outputs have its energy, but for rounding."""
+def test_an_error_that_would_be_small_by_chance_is_measured():
+    """At dt·ω = 2 Verlet turns an oscillator at rest by half a turn: all its steps have its energy but for rounding."""
     few = {"t_span": (0, 20 / 1.3), "y0": [1.0, 0.0], "n_outputs": 10, "repeats": 1}
     rows = work_precision(systems.harmonic_oscillator(1.3), ["verlet"], steps=[2 / 1.3, 0.4, 0.1], **few).rows
     assert [row.dt for row in rows] == [2 / 1.3, 0.4, 0.1]
-    assert 0 < rows[0].energy_error < 1e-12 < rows[2].energy_error < rows[1].energy_error
+    assert 1e-3 < rows[2].energy_error < rows[1].energy_error < rows[0].energy_error
 
 
 def test_a_driven_system_is_judged_by_its_energy_balance_and_a_damped_one_by_its_state(tmp_path):

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 import textwrap
+import zipfile
 
 import numpy as np
 import pytest
@@ -279,6 +280,16 @@ def test_a_checkpoint_is_never_unpickled(tmp_path):
     torch.save({"format": 1, "config": Killed()}, path)
     with pytest.raises(ValueError, match=r"`resume` .* is not a checkpoint"):
         checkpoints.read(path)
+
+
+def test_a_packed_checkpoint_is_refused(tmp_path):
+    """A small file may unpack to any size."""
+    torch.save({"format": 1}, tmp_path / "whole")
+    with zipfile.ZipFile(tmp_path / "whole") as whole, zipfile.ZipFile(tmp_path / "packed", "w", 8) as packed:
+        for name in whole.namelist():
+            packed.writestr(name, whole.read(name))
+    with pytest.raises(ValueError, match=r"`resume` .* is not a checkpoint \(ValueError\)"):
+        checkpoints.read(tmp_path / "packed")
 
 
 # how a run ends ------------------------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ def stages(y, h, t, work):
 
     Returns the iterations taken, negative if in vain.
     """
-    K, change, M, Y, g, S, growth = work
+    K, change, M, Y, g, S, growth, sizes = work
     for m in range(len(K)):
         K[m] = 0.0
     if DAMPED:
@@ -53,7 +53,8 @@ def stages(y, h, t, work):
                     for n in range(SIZE):
                         M[row + m, j * SIZE + n] = -factor * S[other, n]
                 M[row + m, row + m] += 1.0
-        if not solve_in_place(M, change):
+        fill_sizes(y, K, change, sizes)
+        if not solve_in_place(M, change, sizes):
             return -iteration
         for m in range(len(K)):
             K[m] -= change[m]

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 SIZE = 2 * NDOF
+SMALLEST = 1e-150  # of a size whose reciprocal is multiplied by other numbers
 DAMPED = len(RATES) > 0
 
 
@@ -26,17 +27,37 @@ def copy_numbers(source, target):
 def workspace():
     n = STAGES * SIZE
     growth = np.ones((STAGES, NDOF))
-    return np.zeros(n), np.zeros(n), np.zeros((n, n)), np.zeros(SIZE), np.zeros(SIZE), np.zeros((SIZE, SIZE)), growth
+    state, S = np.zeros(SIZE), np.zeros((SIZE, SIZE))
+    return np.zeros(n), np.zeros(n), np.zeros((n, n)), state, np.zeros(SIZE), S, growth, np.ones(n)
 
 
 @njit(**OPTIONS)
-def solve_in_place(M, x):
-    """M⁻¹x into x by Gaussian elimination with partial pivoting; M is overwritten. False if a pivot vanishes."""
+def fill_sizes(y, K, change, sizes):
+    """The reciprocal size of each unknown (n,): of its variable, or of the largest of its kind where that is 0."""
+    for part in range(2):
+        top = 0.0
+        for m in range(part * NDOF, (part + 1) * NDOF):
+            sizes[m] = abs(y[m])
+            for i in range(STAGES):
+                sizes[m] = max(sizes[m], abs(K[i * SIZE + m]), abs(change[i * SIZE + m]))
+            top = max(top, sizes[m])
+        for m in range(part * NDOF, (part + 1) * NDOF):
+            size = sizes[m] if sizes[m] > 0.0 else top
+            for i in range(STAGES):
+                sizes[i * SIZE + m] = 1.0 / max(size, SMALLEST) if size > 0.0 else 1.0
+
+
+@njit(**OPTIONS)
+def solve_in_place(M, x, sizes):
+    """M⁻¹x into x by Gaussian elimination; M is overwritten. False if a pivot vanishes.
+
+    Pivots are the largest of their column in units of the sizes of the unknowns, whose reciprocals `sizes` go along.
+    """
     n = len(x)
     for k in range(n):
         pivot = k
         for i in range(k + 1, n):
-            if abs(M[i, k]) > abs(M[pivot, k]):
+            if abs(M[i, k]) * sizes[i] > abs(M[pivot, k]) * sizes[pivot]:
                 pivot = i
         if not abs(M[pivot, k]) > 0.0:
             return False
@@ -44,6 +65,7 @@ def solve_in_place(M, x):
             for j in range(k, n):
                 M[k, j], M[pivot, j] = M[pivot, j], M[k, j]
             x[k], x[pivot] = x[pivot], x[k]
+            sizes[k], sizes[pivot] = sizes[pivot], sizes[k]
         for i in range(k + 1, n):
             factor = M[i, k] / M[k, k]
             if factor != 0.0:

@@ -59,8 +59,11 @@ def close_tile(Y, Z, error, width, table):
 
 
 @njit(**OPTIONS)
-def look(Z, width, whole, squares):
-    """Into `whole` 0 where a lane is finite, and the squares of the lengths of its vectors (VECTORS, LANES)."""
+def look(Z, scale, width, whole, squares):
+    """Into `whole` 0 where a lane is finite, and the squares of the lengths of its vectors (VECTORS, LANES).
+
+    `scale` (2 ORBIT,) weighs the squares of the components.
+    """
     for lane in range(width):
         whole[lane] = 0.0
     for i in range(ORBIT):
@@ -69,9 +72,11 @@ def look(Z, width, whole, squares):
     for k in range(VECTORS):
         for lane in range(width):
             squares[k, lane] = 0.0
-        for i in range((1 + k) * ORBIT, (2 + k) * ORBIT):
+        for m in range(ORBIT):
+            i = (1 + k) * ORBIT + m
             for lane in range(width):
-                squares[k, lane] += Z[i, lane] * Z[i, lane] + Z[NDOF + i, lane] * Z[NDOF + i, lane]
+                squares[k, lane] += scale[m] * Z[i, lane] * Z[i, lane]
+                squares[k, lane] += scale[ORBIT + m] * Z[NDOF + i, lane] * Z[NDOF + i, lane]
         for lane in range(width):
             whole[lane] += 0.0 * squares[k, lane]
 
@@ -91,25 +96,27 @@ def rescale(Y, width, squares, exponents):
 
 
 @njit(**OPTIONS)
-def alignment(Z, lane):
+def alignment(Z, scale, lane):
     """min(|u + v|, |u − v|) of two vectors made unit vectors u and v."""
     uu = vv = 0.0
     for i in range(ORBIT, 2 * ORBIT):
         j = i + ORBIT
-        uu += Z[i, lane] * Z[i, lane] + Z[NDOF + i, lane] * Z[NDOF + i, lane]
-        vv += Z[j, lane] * Z[j, lane] + Z[NDOF + j, lane] * Z[NDOF + j, lane]
+        of_q, of_p = scale[i - ORBIT], scale[i]
+        uu += of_q * Z[i, lane] * Z[i, lane] + of_p * Z[NDOF + i, lane] * Z[NDOF + i, lane]
+        vv += of_q * Z[j, lane] * Z[j, lane] + of_p * Z[NDOF + j, lane] * Z[NDOF + j, lane]
     a, b = 1.0 / math.sqrt(uu), 1.0 / math.sqrt(vv)
     plus = minus = 0.0
     for i in range(ORBIT, 2 * ORBIT):
         j = i + ORBIT
         u_q, u_p, v_q, v_p = a * Z[i, lane], a * Z[NDOF + i, lane], b * Z[j, lane], b * Z[NDOF + j, lane]
-        plus += (u_q + v_q) * (u_q + v_q) + (u_p + v_p) * (u_p + v_p)
-        minus += (u_q - v_q) * (u_q - v_q) + (u_p - v_p) * (u_p - v_p)
+        of_q, of_p = scale[i - ORBIT], scale[i]
+        plus += of_q * (u_q + v_q) * (u_q + v_q) + of_p * (u_p + v_p) * (u_p + v_p)
+        minus += of_q * (u_q - v_q) * (u_q - v_q) + of_p * (u_p - v_p) * (u_p - v_p)
     return math.sqrt(min(plus, minus))
 
 
 @njit(**OPTIONS)
-def volume(Z, lane, W):
+def volume(Z, scale, lane, W):
     """Volume of the parallelepiped of the vectors made unit vectors: the product of R's diagonal in W = QR.
 
     The vectors are made orthogonal one after the other, each twice (`W` (VECTORS, 2 ORBIT) is overwritten).
@@ -117,8 +124,8 @@ def volume(Z, lane, W):
     total = 1.0
     for k in range(VECTORS):
         for i in range(ORBIT):
-            W[k, i] = Z[(1 + k) * ORBIT + i, lane]
-            W[k, ORBIT + i] = Z[NDOF + (1 + k) * ORBIT + i, lane]
+            W[k, i] = math.sqrt(scale[i]) * Z[(1 + k) * ORBIT + i, lane]
+            W[k, ORBIT + i] = math.sqrt(scale[ORBIT + i]) * Z[NDOF + (1 + k) * ORBIT + i, lane]
         length = row_length(W, k)
         for i in range(2 * ORBIT):
             W[k, i] /= length
@@ -147,11 +154,11 @@ def row_length(W, k):
 
 
 @njit(**OPTIONS)
-def spread_of(Z, lane, kind, W):
+def spread_of(Z, scale, lane, kind, W):
     if kind == ALIGNMENT:
-        return alignment(Z, lane)
+        return alignment(Z, scale, lane)
     if kind == VOLUME:
-        return volume(Z, lane, W)
+        return volume(Z, scale, lane, W)
     return math.nan
 
 
@@ -170,8 +177,10 @@ def note(i, n, exponents, squares, spread, lane, growth, spreads, row):
 
 
 @njit(**OPTIONS)
-def rollout_tangents(table, x0, n_steps, every, save, kind, limit, growth, spreads, reached, stop):
+def rollout_tangents(table, x0, scale, n_steps, every, save, kind, limit, growth, spreads, reached, stop):
     """Run each row of `x0` (N, 2 NDOF), an orbit and its vectors, looked at after each `every` steps.
+
+    Lengths are those of the components weighed by the roots of `scale` (2 ORBIT,).
 
     After the steps `save` the logarithms of the lengths of the vectors go into `growth` (N, VECTORS, n + 1) and their
     spread, of a kind, into `spreads` (N, n + 1); the last entry is that at the end of the orbit, which is where the
@@ -213,13 +222,13 @@ def rollout_tangents(table, x0, n_steps, every, save, kind, limit, growth, sprea
                 else:
                     advance_tile(Y, Z, width, table, first, block)
                 close_tile(Y, Z, Z, width, table)
-                look(Z, width, whole, squares)
+                look(Z, scale, width, whole, squares)
                 rescale(Y, width, squares, exponents[tile])
                 noted = saved < len(save) and save[saved] == n + block
                 last = n + block == n_steps
                 if noted or last or limit > 0.0:
                     for lane in range(count):
-                        spread[lane] = spread_of(Z, lane, kind, W)
+                        spread[lane] = spread_of(Z, scale, lane, kind, W)
                 for lane in range(count):
                     i = index[tile * LANES + lane]
                     if whole[lane] != 0.0:

@@ -1,0 +1,6 @@
+"""Traced numbers → a small program → LLVM IR → machine code. Knows nothing of Hamiltonian systems.
+
+Read in this order: `numbers` (what arithmetic is done with), `functions` (one table of what may be done), `program`
+(operations recorded, differentiated, evaluated with arrays), `arrange` (the order of operations), `control` (loops,
+conditions, memory), `elementary` (exp, log, sin and their kin by arithmetic alone) and `machine` (from text to code).
+"""

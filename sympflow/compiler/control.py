@@ -1,0 +1,513 @@
+"""Functions of machine code as text of LLVM IR: values, loops, conditions, memory, calls.
+
+A `Value` is a number of the kind "exists when the code runs": a double, or a register of several, one trajectory each.
+A stage called with values writes its operations into the `Code` of the function that is being built. Nothing here
+reassociates or fuses: a scalar and every lane of a register get the same operations, and so the same bits.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from sympflow.compiler.numbers import Number
+
+__all__ = ["BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Type", "Value", "Variable"]
+
+
+class Type(NamedTuple):
+    """A type of values: the scalar's name in LLVM, and how many of them lie in a register."""
+
+    scalar: str
+    width: int = 1
+
+    def __str__(self) -> str:
+        return self.scalar if self.width == 1 else f"<{self.width} x {self.scalar}>"
+
+    @property
+    def floating(self) -> bool:
+        return self.scalar in ("double", "float")
+
+    @property
+    def suffix(self) -> str:
+        """The type in names of intrinsics."""
+        short = {"double": "f64", "float": "f32"}.get(self.scalar, self.scalar)
+        return short if self.width == 1 else f"v{self.width}{short}"
+
+    def of(self, scalar: str) -> Type:
+        """The type of other scalars, as many of them."""
+        return Type(scalar, self.width)
+
+
+DOUBLE, INT, BOOL, POINTER = Type("double"), Type("i64"), Type("i1"), Type("ptr")
+
+
+class Value(Number):
+    """A value of the function that is being built."""
+
+    __slots__ = ("code", "name", "type")
+
+    def __init__(self, code: Code, type: Type, name: str) -> None:
+        self.code, self.type, self.name = code, type, name
+
+    def apply(self, name: str, args: Sequence[Any]) -> Any:
+        return self.code.apply(name, args)
+
+    @property
+    def bits(self) -> Value:
+        """The bits of a double as a whole number."""
+        return self.code.convert("bitcast", self, "i64")
+
+    @property
+    def real(self) -> Value:
+        """The double of these bits."""
+        return self.code.convert("bitcast", self, "double")
+
+    def __and__(self, other: Any) -> Value:
+        return self._bitwise("and", other)
+
+    def __or__(self, other: Any) -> Value:
+        return self._bitwise("or", other)
+
+    def __xor__(self, other: Any) -> Value:
+        return self._bitwise("xor", other)
+
+    def __lshift__(self, other: Any) -> Value:
+        return self._bitwise("shl", other)
+
+    def __rshift__(self, other: Any) -> Value:
+        return self._bitwise("lshr", other)
+
+    def _bitwise(self, operation: str, other: Any) -> Value:
+        return self.code.op(operation, self.type, self, self.code.operand(other, self.type))
+
+    def __repr__(self) -> str:
+        return f"{self.type} {self.name}"
+
+
+LOWERED: dict[str, Callable[..., Value]] = {}
+"""Code of functions of several instructions: see `elementary`."""
+
+
+class Variable:
+    """A place that holds one value after the other."""
+
+    __slots__ = ("_code", "_place", "_type")
+
+    def __init__(self, code: Code, x: Value) -> None:
+        self._code, self._type, self._place = code, x.type, code.memory(1, x.type)
+        self.value = x
+
+    @property
+    def value(self) -> Value:
+        return self._code.load(self._place, 0, self._type)
+
+    @value.setter
+    def value(self, x: Value) -> None:
+        self._code.store(x, self._place)
+
+
+class Module:
+    """The functions of one piece of machine code, and what they need.
+
+    Parameters
+    ----------
+    fused : bool
+        True if the machine multiplies and adds in one instruction; else the two are rounded apart.
+    """
+
+    def __init__(self, fused: bool = True) -> None:
+        self.fused = fused
+        self._declared: dict[str, str] = {}
+        self._functions: dict[str, str] = {}
+        self._uses: dict[str, int] = {}
+
+    def function(
+        self,
+        name: str,
+        arguments: Sequence[Type],
+        result: Type | None = None,
+        within: bool = False,
+        rare: bool = True,
+    ) -> Code:
+        """Begin a function; `within` for one that is called by the others only, `rare`ly, and not copied into them."""
+        return Code(self, name, arguments, result, within, rare)
+
+    def used(self, name: str) -> int:
+        """Count one more use of a name, and return how many there are."""
+        self._uses[name] = self._uses.get(name, 0) + 1
+        return self._uses[name]
+
+    def declare(self, name: str, text: str) -> None:
+        """Put a declaration or a constant before the functions, once."""
+        self._declared[name] = text
+
+    def has(self, name: str) -> bool:
+        return name in self._functions
+
+    def add(self, name: str, text: str) -> None:
+        self._functions[name] = text
+
+    def __str__(self) -> str:
+        return "\n".join([*self._declared.values(), *self._functions.values()]) + "\n"
+
+
+def literal(x: float, type: Type) -> str:
+    """Return a constant as LLVM writes it."""
+    if type.floating:
+        (narrow,) = struct.unpack("<f", struct.pack("<f", x)) if type.scalar == "float" else (x,)
+        text = f"0x{struct.unpack('<Q', struct.pack('<d', narrow))[0]:016X}"
+    elif type.scalar == "i1":
+        text = "true" if x else "false"
+    else:
+        text = str(int(x))
+    return text if type.width == 1 else f"splat ({type.scalar} {text})"
+
+
+_PLAIN = {"add": "fadd", "sub": "fsub", "mul": "fmul", "times": "fmul", "div": "fdiv"}
+_INTEGER = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or"}
+_COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "eq": ("oeq", "eq")}
+_INTRINSIC = {"sqrt": "llvm.sqrt", "abs": "llvm.fabs", "floor": "llvm.floor"}
+
+
+class Code:
+    """One function, written line by line.
+
+    Attributes
+    ----------
+    arguments : list of Value
+    """
+
+    def __init__(
+        self,
+        module: Module,
+        name: str,
+        arguments: Sequence[Type],
+        result: Type | None,
+        within: bool = False,
+        rare: bool = True,
+    ) -> None:
+        self.module, self.name, self.result = module, name, result
+        self._kind, self._traits = ("internal ", f" noinline{' cold' if rare else ''}") if within else ("", "")
+        self._types = list(arguments)
+        self.arguments = [Value(self, type, f"%a{i}") for i, type in enumerate(arguments)]
+        self._lines: list[str] = []
+        self._entry: list[str] = []
+        self._count = 0
+        self._block = "entry"
+        self._before: dict[str, str] = {}
+        self._known: dict[tuple[str, Any], list[Value]] = {}
+
+    # arithmetic ---------------------------------------------------------------------------------------------------
+
+    def constant(self, x: float, type: Type = DOUBLE) -> Value:
+        return Value(self, type, literal(x, type))
+
+    def operand(self, x: Any, type: Type) -> Value:
+        """A number or float as a value of the type; a scalar goes to all lanes."""
+        if not isinstance(x, Value):
+            return self.constant(x, type)
+        return self.splat(x, type.width) if x.type.width != type.width else x
+
+    def op(self, operation: str, type: Type, *args: Value) -> Value:
+        """Write an instruction of operands of one type."""
+        return self._new(type, f"{operation} {args[0].type} {', '.join(a.name for a in args)}")
+
+    def intrinsic(self, name: str, *args: Value, result: Type | None = None, more: str = "") -> Value:
+        """Write a call of an LLVM intrinsic that is overloaded by the type of its first argument."""
+        full = f"{name}.{args[0].type.suffix}"
+        return self.external(full, args, args[0].type if result is None else result, more)
+
+    def external(self, name: str, args: Sequence[Value], result: Type | None, more: str = "") -> Value:
+        """Write a call of a function that is declared only: an intrinsic, or one of the C library."""
+        types = ", ".join(str(a.type) for a in args) + (f", {more.split(maxsplit=1)[0]}" if more else "")
+        self.module.declare(name, f"declare {result or 'void'} @{name}({types})")
+        given = ", ".join([*(f"{a.type} {a.name}" for a in args), *([more] if more else [])])
+        return self._new(result, f"call {result or 'void'} @{name}({given})")
+
+    def call(self, name: str, args: Sequence[Value], result: Type | None = None) -> Value:
+        """Write a call of a function of the module."""
+        given = ", ".join(f"{a.type} {a.name}" for a in args)
+        return self._new(result, f"call {result or 'void'} @{name}({given})")
+
+    def outlined(
+        self,
+        name: str,
+        args: Sequence[Value],
+        body: Callable[..., Value | None],
+        result: Type | None = None,
+        rare: bool = False,
+    ) -> Value:
+        """Write a call of a function of its own, made of `body(*arguments)` when it is called first."""
+        if not self.module.has(name):
+            function = self.module.function(name, [a.type for a in args], result, within=True, rare=rare)
+            function.give(body(*function.arguments))
+        return self.call(name, args, result)
+
+    def once(self, key: Any, make: Callable[[], Sequence[Value]]) -> list[Value]:
+        """The values of `make()`, or those that it gave for this key before, if they hold here."""
+        block: str | None = self._block
+        while block is not None:
+            if (block, key) in self._known:
+                return self._known[block, key]
+            block = self._before.get(block)
+        values = list(make())
+        self._known[self._block, key] = values
+        return values
+
+    def pack(self, values: Sequence[Value]) -> Value:
+        """Several values as one, to be given by a function."""
+        type = Type(f"{{ {', '.join(str(v.type) for v in values)} }}")
+        total = Value(self, type, "poison")
+        for i, v in enumerate(values):
+            total = self._new(type, f"insertvalue {type} {total.name}, {v.type} {v.name}, {i}")
+        return total
+
+    def unpack(self, packed: Value, types: Sequence[Type]) -> list[Value]:
+        return [self._new(t, f"extractvalue {packed.type} {packed.name}, {i}") for i, t in enumerate(types)]
+
+    def lanes(self, function: Callable[..., Value], args: Sequence[Value], result: Type) -> Value:
+        """Call a function of scalars with one lane after the other."""
+        if result.width == 1:
+            return function(*args)
+        total = Value(self, result, "poison")
+        for k in range(result.width):
+            lane = [self._new(Type(a.type.scalar), f"extractelement {a.type} {a.name}, i64 {k}") for a in args]
+            y = function(*lane)
+            total = self._new(result, f"insertelement {result} {total.name}, {y.type} {y.name}, i64 {k}")
+        return total
+
+    def apply(self, name: str, args: Sequence[Any]) -> Value:
+        """Write a function of the table; operands that are floats become constants."""
+        numbers = [a for a in args if isinstance(a, Value)]
+        width = max(a.type.width for a in numbers)
+        scalar = next((a.type.scalar for a in numbers if a.type.scalar != "i1"), None)
+        if scalar is None:
+            scalar = "double" if name == "where" else "i1"
+        type = Type(scalar, width)
+        if name == "where":
+            values = [self.operand(args[0], type.of("i1")), *(self.operand(a, type) for a in args[1:])]
+            return self.select(*values)
+        values = [self.operand(a, type) for a in args]
+        if name in _COMPARED:
+            kind = "fcmp " + _COMPARED[name][0] if type.floating else "icmp " + _COMPARED[name][1]
+            return self.op(kind, type.of("i1"), *values)
+        if not type.floating:
+            if name == "not":
+                return self.op("xor", type, values[0], self.constant(1, type))
+            if name == "neg":
+                return self.op("sub", type, self.constant(0, type), values[0])
+            if name in ("min", "max"):
+                return self.intrinsic(f"llvm.s{name}", *values)
+            return self.op(_INTEGER[name], type, *values)
+        if name in _PLAIN:
+            return self.op(_PLAIN[name], type, *values)
+        if name == "neg":
+            return self.op("fneg", type, *values)
+        if name == "fma":
+            return self.fma(*values)
+        if name in _INTRINSIC:
+            return self.intrinsic(_INTRINSIC[name], *values)
+        if name == "pow" and not isinstance(args[1], Value):
+            return LOWERED["power"](values[0], float(args[1]))
+        return LOWERED[name](*values)
+
+    def fma(self, x: Value, y: Value, z: Value) -> Value:
+        """x·y + z, rounded once where the machine can."""
+        if self.module.fused:
+            return self.intrinsic("llvm.fma", x, y, z)
+        return self.op("fadd", x.type, self.op("fmul", x.type, x, y), z)
+
+    def select(self, condition: Value, x: Value, y: Value) -> Value:
+        text = f"select {condition.type} {condition.name}, {x.type} {x.name}, {y.type} {y.name}"
+        return self._new(x.type, text)
+
+    def convert(self, operation: str, x: Value, scalar: str) -> Value:
+        """Write a conversion: bitcast, sitofp, fptosi, zext, sext, trunc …"""
+        type = x.type.of(scalar)
+        return self._new(type, f"{operation} {x.type} {x.name} to {type}")
+
+    def splat(self, x: Value, width: int) -> Value:
+        """A scalar in all lanes."""
+        if width == 1:
+            return x
+        if not x.name.startswith("%"):
+            return Value(self, Type(x.type.scalar, width), f"splat ({x.type.scalar} {x.name})")
+        type = Type(x.type.scalar, width)
+        first = self._new(type, f"insertelement {type} poison, {x.type} {x.name}, i64 0")
+        return self._new(type, f"shufflevector {type} {first.name}, {type} poison, <{width} x i32> zeroinitializer")
+
+    def any(self, condition: Value) -> Value:
+        """True if a condition holds in any lane."""
+        if condition.type.width == 1:
+            return condition
+        return self.intrinsic("llvm.vector.reduce.or", condition, result=BOOL)
+
+    # memory -------------------------------------------------------------------------------------------------------
+
+    def at(self, pointer: Value, index: Any, scalar: str = "double") -> Value:
+        """The address of an element of an array of scalars."""
+        if isinstance(index, int) and index == 0:
+            return pointer
+        index = self.operand(index, INT)
+        return self._new(POINTER, f"getelementptr inbounds {scalar}, ptr {pointer.name}, i64 {index.name}")
+
+    def load(self, pointer: Value, index: Any = 0, type: Type = DOUBLE, shared: bool = False) -> Value:
+        """The value at an index of an array of scalars, aligned as these are; `shared` if another thread changes it."""
+        place = self.at(pointer, index, type.scalar)
+        kind = "load volatile" if shared else "load"
+        return self._new(type, f"{kind} {type}, ptr {place.name}, align {_SIZES[type.scalar]}")
+
+    def store(self, x: Value, pointer: Value, index: Any = 0) -> None:
+        place = self.at(pointer, index, x.type.scalar)
+        self._lines.append(f"  store {x.type} {x.name}, ptr {place.name}, align {_SIZES[x.type.scalar]}")
+
+    def memory(self, count: int, type: Type = DOUBLE) -> Value:
+        """Room for so many values on the stack, aligned to 64 bytes."""
+        self._count += 1
+        name = f"%m{self._count}"
+        self._entry.append(f"  {name} = alloca [{count} x {type}], align 64")
+        return Value(self, POINTER, name)
+
+    def variable(self, x: Value) -> Variable:
+        """A variable with this value; the machine keeps it in a register."""
+        return Variable(self, x)
+
+    # control ------------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def over(self, count: Any) -> Iterator[Value]:
+        """Execute what is written inside for k = 0 … count − 1, none if the count is not positive."""
+        k = self.variable(self.constant(0, INT))
+        with self.during(lambda: k.value < count):
+            yield k.value
+            k.value = k.value + 1
+
+    @contextmanager
+    def during(self, condition: Callable[[], Value]) -> Iterator[None]:
+        """Execute what is written inside again and again while a condition holds."""
+        head, inside, after, before = self._label(), self._label(), self._label(), self._block
+        self._branch(head)
+        self._begin(head, before)
+        self._lines.append(f"  br i1 {condition().name}, label %{inside}, label %{after}")
+        self._begin(inside, head)
+        yield
+        self._branch(head)
+        self._begin(after, head)
+
+    @contextmanager
+    def given(self, condition: Value) -> Iterator[None]:
+        """Execute what is written inside if a condition holds."""
+        inside, after, before = self._label(), self._label(), self._block
+        self._lines.append(f"  br i1 {condition.name}, label %{inside}, label %{after}")
+        self._begin(inside, before)
+        yield
+        self._branch(after)
+        self._begin(after, before)
+
+    def loop(self, count: Any, carried: Sequence[Value], body: Callable[..., Sequence[Value]]) -> list[Value]:
+        """Execute `body(k, values)` for k = 0 … count − 1, none if the count is not positive.
+
+        Returns the values after the last one.
+        """
+        count = self.operand(count, INT)
+        head, inside, after = self._label(), self._label(), self._label()
+        before = self._block
+        self._branch(head)
+        self._begin(head, before)
+        place = len(self._lines)
+        k = self._name(INT)
+        values = [self._name(v.type) for v in carried]
+        condition = k < count
+        self._lines.append(f"  br i1 {condition.name}, label %{inside}, label %{after}")
+        self._begin(inside, head)
+        new = list(body(k, values))
+        following = k + 1
+        end = self._block
+        self._branch(head)
+        phis = [
+            f"  {v.name} = phi {v.type} [ {first.name}, %{before} ], [ {last.name}, %{end} ]"
+            for v, first, last in zip([k, *values], [self.constant(0, INT), *carried], [following, *new], strict=True)
+        ]
+        self._lines[place:place] = phis
+        self._begin(after, head)
+        return values
+
+    def repeat(self, carried: Sequence[Value], body: Callable[..., tuple[Value, Sequence[Value]]]) -> list[Value]:
+        """Execute `body(values)`, which returns whether to go on and the new values, at least once."""
+        head, after, before = self._label(), self._label(), self._block
+        self._branch(head)
+        self._begin(head, before)
+        place = len(self._lines)
+        values = [self._name(v.type) for v in carried]
+        again, new = body(values)
+        end = self._block
+        self._lines.append(f"  br i1 {again.name}, label %{head}, label %{after}")
+        self._lines[place:place] = [
+            f"  {v.name} = phi {v.type} [ {first.name}, %{before} ], [ {last.name}, %{end} ]"
+            for v, first, last in zip(values, carried, new, strict=True)
+        ]
+        self._begin(after, end)
+        return list(new)
+
+    def when(
+        self,
+        condition: Value,
+        then: Callable[[], Sequence[Value]],
+        otherwise: Callable[[], Sequence[Value]] = tuple,
+        rare: bool = False,
+    ) -> list[Value]:
+        """Execute one of two bodies, and return its values; `rare` if the first one hardly ever."""
+        yes, no, after, before = self._label(), self._label(), self._label(), self._block
+        weights = ""
+        if rare:
+            self.module.declare("!rare", '!0 = !{!"branch_weights", i32 1, i32 100000}')
+            weights = ", !prof !0"
+        self._lines.append(f"  br i1 {condition.name}, label %{yes}, label %{no}{weights}")
+        ends, results = [], []
+        for label, body in ((yes, then), (no, otherwise)):
+            self._begin(label, before)
+            results.append(list(body()))
+            ends.append(self._block)
+            self._branch(after)
+        self._begin(after, before)
+        return [
+            self._new(x.type, f"phi {x.type} [ {x.name}, %{ends[0]} ], [ {y.name}, %{ends[1]} ]")
+            for x, y in zip(*results, strict=True)
+        ]
+
+    def give(self, x: Value | None = None) -> None:
+        """End the function, with its result."""
+        self._lines.append("  ret void" if x is None else f"  ret {x.type} {x.name}")
+        given = ", ".join(f"{t}{' noalias' if t == POINTER else ''} %a{i}" for i, t in enumerate(self._types))
+        head = f"define {self._kind}{self.result or 'void'} @{self.name}({given}){self._traits} nounwind {{\nentry:"
+        self.module.add(self.name, "\n".join([head, *self._entry, *self._lines, "}"]))
+
+    def _name(self, type: Type) -> Value:
+        self._count += 1
+        return Value(self, type, f"%v{self._count}")
+
+    def _new(self, type: Type | None, text: str) -> Value:
+        if type is None:
+            self._lines.append(f"  {text}")
+            return Value(self, BOOL, "poison")
+        value = self._name(type)
+        self._lines.append(f"  {value.name} = {text}")
+        return value
+
+    def _label(self) -> str:
+        self._count += 1
+        return f"b{self._count}"
+
+    def _begin(self, label: str, before: str) -> None:
+        """Begin a block, which is reached through the one before only."""
+        self._lines.append(f"{label}:")
+        self._block, self._before[label] = label, before
+
+    def _branch(self, label: str) -> None:
+        self._lines.append(f"  br label %{label}")
+
+
+_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1}

@@ -1,0 +1,193 @@
+"""The table of functions: of each its value with arrays and tensors, its derivatives, its cost.
+
+Machine code of each is in `control` (one instruction) or `elementary` (several). A function that is in no table cannot
+be traced. Derivatives are written with numbers of any kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sympflow.compiler.numbers import Number
+
+__all__ = ["FUNCTIONS", "Function", "apply", "fma", "times", "where"]
+
+
+@dataclass(frozen=True)
+class Function:
+    """A function of real numbers.
+
+    Attributes
+    ----------
+    numpy : callable
+        Of arrays.
+    tensor : str or callable
+        Its name in torch, or the function of tensors.
+    partials : callable, optional
+        Of the value y and the arguments x…: the derivative by each argument, 0.0 where it is none.
+    cost : int
+        When its value is known, in cycles of a typical processor: the same on every machine, so that programs are.
+    infix : str
+        Its sign between two arguments, as a program prints it.
+    """
+
+    numpy: Callable[..., Any]
+    tensor: str | Callable[..., Any]
+    partials: Callable[..., tuple[Any, ...]] | None = None
+    cost: int = 1
+    infix: str = ""
+
+    def torch(self, *args: Any) -> Any:
+        """Return the value of tensors and floats."""
+        import torch
+
+        function = getattr(torch, self.tensor) if isinstance(self.tensor, str) else self.tensor
+        return function(*_alike(args))
+
+
+def _alike(args: tuple[Any, ...]) -> list[Any]:
+    """The arguments as tensors of the device and dtype of those that are, float64 if these are conditions."""
+    import torch
+
+    tensors = [x for x in args if isinstance(x, torch.Tensor)]
+    dtype = next((x.dtype for x in tensors if x.dtype != torch.bool), torch.float64)
+    return [x if isinstance(x, torch.Tensor) else tensors[0].new_tensor(x, dtype=dtype) for x in args]
+
+
+def _special(name: str) -> Callable[..., Any]:
+    """A function of scipy.special, which is loaded by its first call."""
+
+    def function(*args: Any) -> Any:
+        from scipy import special
+
+        return getattr(special, name)(*args)
+
+    return function
+
+
+def _multiply_add(a: Any, b: Any, c: Any) -> Any:
+    return a * b + c
+
+
+def _sign(x: Any) -> Any:
+    """The sign of tensors, NaN of NaN."""
+    return x.sign().where(~x.isnan(), x)
+
+
+def _trigamma(x: Any) -> Any:
+    return _special("polygamma")(1, x)
+
+
+def _trigamma_of_tensors(x: Any) -> Any:
+    import torch
+
+    return torch.special.zeta(2.0, x)  # torch.polygamma(1, x) has errors of 4e-10
+
+
+def _no_further(y: Any, x: Any) -> tuple[Any]:
+    raise NotImplementedError("the third derivative of lgamma is not in the table: use a method without it.")
+
+
+def _choice(y: Any, c: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
+    return 0.0, apply("where", c, 1.0, 0.0), apply("where", c, 0.0, 1.0)
+
+
+def _power_rule(y: Any, x: Any, n: Any) -> tuple[Any, Any]:
+    by_n = 0.0 if isinstance(n, float | int) else apply("mul", y, apply("log", x))
+    return apply("mul", n, apply("pow", x, n - 1.0)), by_n
+
+
+def _quotient_rule(y: Any, a: Any, b: Any) -> tuple[Any, Any]:
+    return (1.0 / b, -(y / b)) if not isinstance(a, float | int) else (0.0, -(y * y) * (1.0 / a))
+
+
+def _chosen(sign: float) -> Callable[..., tuple[Any, Any]]:
+    """Derivatives of the larger (1) or smaller (−1) of two; at a tie those of the first."""
+
+    def partials(y: Any, a: Any, b: Any) -> tuple[Any, Any]:
+        first = apply("le", b, a) if sign > 0 else apply("le", a, b)
+        return apply("where", first, 1.0, 0.0), apply("where", first, 0.0, 1.0)
+
+    return partials
+
+
+_TWO_OVER_ROOT_PI = 2.0 / np.sqrt(np.pi)
+
+# fmt: off
+FUNCTIONS: dict[str, Function] = {
+    "add": Function(np.add, "add", lambda y, a, b: (1.0, 1.0), 3, "+"),
+    "sub": Function(np.subtract, "sub", lambda y, a, b: (1.0, -1.0), 3, "-"),
+    "mul": Function(np.multiply, "mul", lambda y, a, b: (b, a), 3, "*"),
+    "times": Function(np.multiply, "mul", lambda y, a, b: (b, a), 3, "*"),
+    "div": Function(np.divide, "div", _quotient_rule, 13, "/"),
+    "neg": Function(np.negative, "neg", lambda y, a: (-1.0,), 1),
+    "fma": Function(_multiply_add, _multiply_add, lambda y, a, b, c: (b, a, 1.0), 4),
+    "pow": Function(np.power, "pow", _power_rule, 120, "**"),
+    "sqrt": Function(np.sqrt, "sqrt", lambda y, x: (0.5 / y,), 20),
+    "abs": Function(np.abs, "abs", lambda y, x: (apply("sign", x),), 1),
+    "sign": Function(np.sign, _sign, lambda y, x: (0.0,), 4),
+    "min": Function(np.minimum, "minimum", _chosen(-1.0), 3),
+    "max": Function(np.maximum, "maximum", _chosen(1.0), 3),
+    "floor": Function(np.floor, "floor", lambda y, x: (0.0,), 8),
+    "mod": Function(np.mod, "remainder", lambda y, a, b: (1.0, -apply("floor", a / b)), 30),
+    "lt": Function(np.less, "lt", None, 4, "<"),
+    "le": Function(np.less_equal, "le", None, 4, "<="),
+    "eq": Function(np.equal, "eq", None, 4, "=="),
+    "and": Function(np.logical_and, "logical_and", None, 1, "&"),
+    "or": Function(np.logical_or, "logical_or", None, 1, "|"),
+    "not": Function(np.logical_not, "logical_not", None, 1),
+    "where": Function(np.where, "where", _choice, 2),
+    "exp": Function(np.exp, "exp", lambda y, x: (y,), 45),
+    "expm1": Function(np.expm1, "expm1", lambda y, x: (y + 1.0,), 48),
+    "log": Function(np.log, "log", lambda y, x: (1.0 / x,), 55),
+    "log1p": Function(np.log1p, "log1p", lambda y, x: (1.0 / (1.0 + x),), 60),
+    "sin": Function(np.sin, "sin", lambda y, x: (apply("cos", x),), 50),
+    "cos": Function(np.cos, "cos", lambda y, x: (-apply("sin", x),), 50),
+    "tan": Function(np.tan, "tan", lambda y, x: (1.0 + y * y,), 65),
+    "atan": Function(np.arctan, "atan", lambda y, x: (1.0 / (1.0 + x * x),), 65),
+    "tanh": Function(np.tanh, "tanh", lambda y, x: (1.0 - y * y,), 60),
+    "asin": Function(np.arcsin, "asin", lambda y, x: (1.0 / apply("sqrt", (1.0 - x) * (1.0 + x)),), 160),
+    "acos": Function(np.arccos, "acos", lambda y, x: (-1.0 / apply("sqrt", (1.0 - x) * (1.0 + x)),), 160),
+    "atan2": Function(np.arctan2, "atan2", lambda y, a, b: (b / (a * a + b * b), -(a / (a * a + b * b))), 160),
+    "sinh": Function(np.sinh, "sinh", lambda y, x: (apply("cosh", x),), 160),
+    "cosh": Function(np.cosh, "cosh", lambda y, x: (apply("sinh", x),), 160),
+    "asinh": Function(np.arcsinh, "asinh", lambda y, x: (1.0 / apply("sqrt", 1.0 + x * x),), 160),
+    "acosh": Function(np.arccosh, "acosh", lambda y, x: (1.0 / apply("sqrt", (x - 1.0) * (x + 1.0)),), 160),
+    "atanh": Function(np.arctanh, "atanh", lambda y, x: (1.0 / ((1.0 - x) * (1.0 + x)),), 160),
+    "erf": Function(_special("erf"), "erf", lambda y, x: (_TWO_OVER_ROOT_PI * apply("exp", -(x * x)),), 160),
+    "erfc": Function(_special("erfc"), "erfc", lambda y, x: (-_TWO_OVER_ROOT_PI * apply("exp", -(x * x)),), 160),
+    "lgamma": Function(_special("gammaln"), "lgamma", lambda y, x: (apply("digamma", x),), 160),
+    "digamma": Function(_special("psi"), "digamma", lambda y, x: (apply("trigamma", x),), 160),
+    "trigamma": Function(_trigamma, _trigamma_of_tensors, _no_further, 160),
+}
+# fmt: on
+
+
+def apply(name: str, *args: Any) -> Any:
+    """Return the value of a function of the table, of numbers of any one kind, arrays, tensors or floats."""
+    for x in args:
+        if isinstance(x, Number):
+            return x.apply(name, args)
+    function = FUNCTIONS[name]
+    if all(isinstance(x, float | int | np.ndarray | np.generic) for x in args):
+        return function.numpy(*args)
+    return function.torch(*args)
+
+
+def fma(x: Any, y: Any, z: Any) -> Any:
+    """Return x·y + z, in compiled code rounded once."""
+    return apply("fma", x, y, z)
+
+
+def times(x: Any, y: Any) -> Any:
+    """Return x·y, a product of sums that may be multiplied out."""
+    return apply("times", x, y)
+
+
+def where(condition: Any, x: Any, y: Any) -> Any:
+    """Return x where the condition holds, else y."""
+    return apply("where", condition, x, y)

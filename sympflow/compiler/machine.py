@@ -1,0 +1,162 @@
+"""From text of LLVM IR to machine code: kept in memory and on disk, called without the interpreter's lock."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import threading
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import llvmlite.binding as llvm
+
+from sympflow.compiler import elementary  # noqa: F401  (code of functions, which texts are made of)
+
+__all__ = ["Host", "compiled", "host"]
+
+
+class Host(NamedTuple):
+    """The processor that code is made for.
+
+    Attributes
+    ----------
+    cpu, features : str
+        As LLVM names them.
+    fused : bool
+        True if it multiplies and adds in one instruction.
+    register : int
+        Doubles in one of its registers.
+    """
+
+    cpu: str
+    features: str
+    fused: bool
+    register: int
+
+
+@cache
+def host() -> Host:
+    """Return the processor of this machine."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    has = llvm.get_host_cpu_features()
+    wide = 8 if has.get("avx512f") else 4 if has.get("avx") else 2
+    arm = llvm.get_process_triple().startswith(("aarch64", "arm64"))
+    return Host(llvm.get_host_cpu_name(), has.flatten(), bool(has.get("fma")) or arm, wide)
+
+
+def _target(level: int = 2) -> Any:
+    machine = host()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(cpu=machine.cpu, features=machine.features, opt=level)
+
+
+_LOCK = threading.RLock()
+_LOADED: dict[str, Any] = {}
+
+
+def compiled(text: str, name: str, signature: Any) -> Any:
+    """Return a function of a text of LLVM IR, to be called by ctypes, which lets other threads run meanwhile.
+
+    The machine code is kept in this process, and in a folder for the next one: the first of SYMPFLOW_CACHE_DIR and the
+    user's cache directory that can be written. A file there begins with the digest of the rest.
+
+    Parameters
+    ----------
+    text : str
+    name : str
+        Of the function in the text.
+    signature : ctypes function type
+    """
+    key = hashlib.sha256("\0".join([text, *map(str, host()), llvm.llvm_version_info.__repr__()]).encode()).hexdigest()
+    with _LOCK:
+        engine = _LOADED.get(key)
+        if engine is None:
+            code = _stored(key)
+            if code is None:
+                code = _object_code(text)
+                _store(key, code)
+            engine = _LOADED[key] = _engine(code)
+    return signature(engine.get_function_address(name))
+
+
+def _object_code(text: str) -> bytes:
+    module = llvm.parse_assembly(text)
+    target = _target()
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    options.slp_vectorization = options.loop_vectorization = False
+    options.loop_unrolling = options.loop_interleaving = False
+    builder = llvm.create_pass_builder(target, options)
+    passes = llvm.create_new_function_pass_manager()
+    passes.add_sroa_pass()
+    passes.add_simplify_cfg_pass()
+    for function in module.functions:
+        if not function.is_declaration:
+            passes.run(function, builder)
+    return target.emit_object(module)
+
+
+def _engine(code: bytes) -> Any:
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    return engine
+
+
+def _folder() -> Path | None:
+    """The folder of machine code, if there is one that can be written."""
+    places = [os.environ.get("SYMPFLOW_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME", "~/.cache")]
+    for i, place in enumerate(places):
+        if not place:
+            continue
+        folder = Path(place).expanduser() / ("code" if i == 0 else "sympflow/code")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return None
+
+
+def _stored(key: str) -> bytes | None:
+    folder = _folder()
+    if folder is None:
+        return None
+    try:
+        data = (folder / f"{key}.o").read_bytes()
+    except OSError:
+        return None
+    code = data[32:]
+    return code if hashlib.sha256(code).digest() == data[:32] else None
+
+
+def _store(key: str, code: bytes) -> None:
+    folder = _folder()
+    if folder is None:
+        return
+    part = folder / f"{key}.{os.getpid()}.part"
+    try:
+        part.write_bytes(hashlib.sha256(code).digest() + code)
+        os.replace(part, folder / f"{key}.o")
+    except OSError:
+        part.unlink(missing_ok=True)
+
+
+def _held_across_forks() -> None:
+    """A child that is forked while another thread compiles would wait for ever for llvmlite's own lock."""
+    lock = getattr(getattr(llvm.ffi, "lib", None), "_lock", None)
+    for held in (lock, _LOCK):  # taken from the last to the first
+        if held is not None and hasattr(os, "register_at_fork"):
+            release = held.__exit__
+            os.register_at_fork(
+                before=held.__enter__,
+                after_in_parent=lambda release=release: release(None, None, None),
+                after_in_child=lambda release=release: release(None, None, None),
+            )
+
+
+_held_across_forks()
+VOID, REAL, WHOLE, ADDRESS = None, ctypes.c_double, ctypes.c_int64, ctypes.c_void_p

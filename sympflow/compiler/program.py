@@ -1,0 +1,272 @@
+"""Program: operations recorded in order, shared where they are the same; differentiated, called, printed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from sympflow.compiler.functions import FUNCTIONS, apply
+from sympflow.compiler.numbers import Number
+
+__all__ = ["Program", "Traced", "derivatives", "gradient", "tangent", "traced"]
+
+
+class Traced(Number):
+    """A number of which only its operation is known: of a recording, whose numbers it can be combined with."""
+
+    __slots__ = ("args", "name", "order", "recording")
+
+    def __init__(self, recording: Recording, name: str, args: tuple[Any, ...], order: int) -> None:
+        self.recording, self.name, self.args, self.order = recording, name, args, order
+
+    def apply(self, name: str, args: Sequence[Any]) -> Any:
+        return self.recording.record(name, args)
+
+    def __repr__(self) -> str:
+        return str(self.args[0]) if self.name == "input" else f"v{self.order}"
+
+
+class Recording:
+    """The numbers recorded together; the same operation of the same numbers is the same number."""
+
+    def __init__(self) -> None:
+        self._known: dict[Any, Traced] = {}
+
+    def input(self, name: str) -> Traced:
+        """Return a number that is given when the program is called."""
+        return self._number("input", (name,))
+
+    def record(self, name: str, args: Sequence[Any]) -> Any:
+        """Return the number of an operation, simplified where that is exact."""
+        args = tuple(x if isinstance(x, Traced) else _constant(x) for x in args)
+        for x in args:
+            if isinstance(x, Traced) and x.recording is not self:
+                raise ValueError("numbers of two recordings cannot be combined: trace the functions together.")
+        if not any(isinstance(x, Traced) for x in args):
+            with np.errstate(all="ignore"):
+                return float(FUNCTIONS[name].numpy(*args))
+        simpler = _SIMPLER.get(name)
+        if simpler is not None:
+            found = simpler(*args)
+            if found is not None:
+                return found
+        if name in _COMMUTE:
+            args = tuple(sorted(args, key=_place))
+        return self._number(name, args)
+
+    def _number(self, name: str, args: tuple[Any, ...]) -> Traced:
+        key = name, *(x.order if isinstance(x, Traced) else (x, math.copysign(1.0, x) if x == 0 else 0) for x in args)
+        found = self._known.get(key)
+        if found is None:
+            found = self._known[key] = Traced(self, name, args, len(self._known))
+        return found
+
+
+def _constant(x: Any) -> float:
+    if isinstance(x, float | int | np.generic) and not isinstance(x, complex | np.complexfloating):
+        return float(x)
+    raise TypeError(f"a number that is traced cannot be combined with {type(x).__name__}: give floats.")
+
+
+def _place(x: Any) -> tuple[int, float]:
+    return (1, x.order) if isinstance(x, Traced) else (0, x)
+
+
+MOST_ROOTS = 8.5  # powers that are written as powers of a root
+_COMMUTE = {"add", "mul", "times", "min", "max", "eq", "and", "or"}
+
+
+def _sum(a: Any, b: Any) -> Any:
+    return b if _is(a, 0.0) else a if _is(b, 0.0) else None
+
+
+def _difference(a: Any, b: Any) -> Any:
+    return a if _is(b, 0.0) else -b if _is(a, 0.0) else 0.0 if a is b else None
+
+
+def _product(a: Any, b: Any) -> Any:
+    for x, y in ((a, b), (b, a)):
+        if isinstance(x, float):
+            if x in (0.0, 1.0):
+                return y if x else 0.0
+            if x == -1.0:
+                return -y
+            if isinstance(y, Traced) and y.name == "neg":
+                return -x * y.args[0]
+        if isinstance(x, Traced) and x.name == "neg":
+            return -(x.args[0] * y)
+    return None
+
+
+def _quotient(a: Any, b: Any) -> Any:
+    if isinstance(b, float) and b != 0:
+        return a * (1.0 / b) if math.frexp(b)[0] in (0.5, -0.5) else None  # exact
+    return 0.0 if _is(a, 0.0) else None
+
+
+def _negative(a: Any) -> Any:
+    return a.args[0] if a.name == "neg" else a.args[1] - a.args[0] if a.name == "sub" else None
+
+
+def _power(x: Any, n: Any) -> Any:
+    if not isinstance(n, float) or not isinstance(x, Traced):
+        return None
+    if n in (0.0, 1.0):
+        return x if n else 1.0
+    if n == -1.0:
+        return 1.0 / x
+    if n == 0.5:
+        return apply("sqrt", x)
+    if n % 1 == 0.5 and abs(n) <= MOST_ROOTS:  # of the root or its reciprocal, which other powers share
+        root = apply("sqrt", x)
+        return (root if n > 0 else 1.0 / root) ** abs(2 * n)
+    return (1.0 / x) ** -n if n < 0 and n % 1 == 0 else None
+
+
+def _fused(a: Any, b: Any, c: Any) -> Any:
+    if _is(c, 0.0):
+        return a * b
+    return a * b + c if any(_is(x, n) for x in (a, b) for n in (0.0, 1.0, -1.0)) else None
+
+
+def _choice(condition: Any, a: Any, b: Any) -> Any:
+    if isinstance(condition, float):
+        return a if condition else b
+    return a if a is b or (isinstance(a, float) and isinstance(b, float) and a == b) else None
+
+
+_SIMPLER: dict[str, Callable[..., Any]] = {
+    "add": _sum,
+    "sub": _difference,
+    "mul": _product,
+    "times": _product,
+    "div": _quotient,
+    "neg": _negative,
+    "pow": _power,
+    "fma": _fused,
+    "where": _choice,
+}
+
+
+def _is(x: Any, value: float) -> bool:
+    return isinstance(x, float) and x == value
+
+
+def reached(outputs: Sequence[Any]) -> list[Traced]:
+    """Return the numbers that outputs depend on, themselves too, in an order in which they can be computed."""
+    seen: dict[int, Traced] = {}
+    stack = [x for x in outputs if isinstance(x, Traced)]
+    while stack:
+        x = stack.pop()
+        if x.order not in seen:
+            seen[x.order] = x
+            stack += [a for a in x.args if isinstance(a, Traced)]
+    return [seen[k] for k in sorted(seen)]
+
+
+class Program:
+    """Inputs, the operations on them, and outputs. To be called with numbers of any kind, and printed.
+
+    Parameters
+    ----------
+    inputs : sequence of Traced
+    outputs : sequence of Traced or float
+    """
+
+    def __init__(self, inputs: Sequence[Traced], outputs: Sequence[Any]) -> None:
+        self.inputs, self.outputs = tuple(inputs), tuple(outputs)
+        self.operations = [x for x in reached(self.outputs) if x.name != "input"]
+
+    def __call__(self, *values: Any) -> list[Any]:
+        """Return the outputs for values of the inputs, in their order: arrays, tensors, numbers of one kind."""
+        of = {x.order: value for x, value in zip(self.inputs, values, strict=True)}
+        for x in self.operations:
+            of[x.order] = apply(x.name, *[of[a.order] if isinstance(a, Traced) else a for a in x.args])
+        return [of[x.order] if isinstance(x, Traced) else x for x in self.outputs]
+
+    def __len__(self) -> int:
+        return len(self.operations)
+
+    def __str__(self) -> str:
+        lines = [f"{x!r} = {_written(x)}" for x in self.operations]
+        return "\n".join(
+            [f"({', '.join(map(repr, self.inputs))}) →", *lines, f"→ ({', '.join(map(repr, self.outputs))})"]
+        )
+
+
+def _written(x: Traced) -> str:
+    args = [repr(a) for a in x.args]
+    infix = FUNCTIONS[x.name].infix
+    return f"{args[0]} {infix} {args[1]}" if infix else f"{x.name}({', '.join(args)})"
+
+
+def traced(function: Callable[..., Sequence[Any]], *names: str) -> Program:
+    """Record a function of as many numbers as there are names.
+
+    Parameters
+    ----------
+    function : callable
+        Of numbers, positional; returns a sequence of numbers.
+    names : str
+    """
+    recording = Recording()
+    inputs = [recording.input(name) for name in names]
+    return Program(inputs, list(function(*inputs)))
+
+
+def _partials(x: Traced) -> Iterator[tuple[Traced, Any]]:
+    rule = FUNCTIONS[x.name].partials
+    if rule is None:
+        return
+    for a, slope in zip(x.args, rule(x, *x.args), strict=True):
+        if isinstance(a, Traced) and not _is(slope, 0.0):
+            yield a, slope
+
+
+def gradient(y: Any, x: Sequence[Traced]) -> list[Any]:
+    """Return ∂y/∂x of recorded numbers, in the same recording, by the reverse mode."""
+    if not isinstance(y, Traced):
+        return [0.0] * len(x)
+    moved = _moved([y], x)
+    depends = {number.order for number in moved}
+    slopes: dict[int, Any] = {y.order: 1.0}
+    for number in reversed(moved):
+        slope = slopes.get(number.order)
+        if slope is None or number.name == "input":
+            continue
+        for a, partial in _partials(number):
+            if a.order in depends:
+                slopes[a.order] = slopes.get(a.order, 0.0) + slope * partial
+    return [slopes.get(s.order, 0.0) for s in x]
+
+
+def tangent(outputs: Sequence[Any], x: Sequence[Traced], v: Sequence[Any]) -> list[Any]:
+    """Return Σ ∂y/∂xᵢ vᵢ of each output, in the same recording, by the forward mode."""
+    dots: dict[int, Any] = {a.order: b for a, b in zip(x, v, strict=True)}
+    for number in _moved(outputs, x):
+        if number.order not in dots:
+            total: Any = 0.0
+            for a, partial in _partials(number):
+                if a.order in dots:
+                    total = total + partial * dots[a.order]
+            dots[number.order] = total
+    return [dots.get(y.order, 0.0) if isinstance(y, Traced) else 0.0 for y in outputs]
+
+
+def derivatives(outputs: Sequence[Any], x: Sequence[Traced]) -> list[list[Any]]:
+    """Return the matrix ∂yᵢ/∂xⱼ, in the same recording."""
+    return [gradient(y, x) for y in outputs]
+
+
+def _moved(outputs: Sequence[Any], x: Sequence[Traced]) -> list[Traced]:
+    """The numbers that depend on x among those that outputs depend on."""
+    found = {s.order for s in x}
+    kept = []
+    for number in reached(outputs):
+        if number.order in found or any(isinstance(a, Traced) and a.order in found for a in number.args):
+            found.add(number.order)
+            kept.append(number)
+    return kept

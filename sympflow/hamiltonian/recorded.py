@@ -1,0 +1,132 @@
+"""SymPy expressions as calculations with numbers of any kind: recorded, they are programs of the compiler."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import sympy as sp
+
+from sympflow.compiler.functions import apply, where
+
+__all__ = ["NotRecorded", "can_be_recorded", "evaluator"]
+
+
+class NotRecorded(ValueError):
+    """A function in an expression is in no table of the compiler."""
+
+
+def _reciprocal(name: str) -> Callable[[Any], Any]:
+    return lambda x: 1.0 / apply(name, x)
+
+
+def _folded(name: str) -> Callable[..., Any]:
+    def function(*args: Any) -> Any:
+        value, *rest = args
+        for x in rest:
+            value = apply(name, value, x)
+        return value
+
+    return function
+
+
+# fmt: off
+_RULES: dict[type, Callable[..., Any]] = {
+    sp.exp: lambda x: apply("exp", x), sp.log: lambda x: apply("log", x),
+    sp.sin: lambda x: apply("sin", x), sp.cos: lambda x: apply("cos", x), sp.tan: lambda x: apply("tan", x),
+    sp.cot: _reciprocal("tan"), sp.sec: _reciprocal("cos"), sp.csc: _reciprocal("sin"),
+    sp.asin: lambda x: apply("asin", x), sp.acos: lambda x: apply("acos", x), sp.atan: lambda x: apply("atan", x),
+    sp.acot: lambda x: apply("atan", 1.0 / x), sp.atan2: lambda y, x: apply("atan2", y, x),
+    sp.sinh: lambda x: apply("sinh", x), sp.cosh: lambda x: apply("cosh", x), sp.tanh: lambda x: apply("tanh", x),
+    sp.coth: _reciprocal("tanh"), sp.sech: _reciprocal("cosh"), sp.csch: _reciprocal("sinh"),
+    sp.asinh: lambda x: apply("asinh", x), sp.acosh: lambda x: apply("acosh", x),
+    sp.atanh: lambda x: apply("atanh", x), sp.erf: lambda x: apply("erf", x),
+    sp.erfc: lambda x: apply("erfc", x), sp.Abs: abs, sp.sign: lambda x: apply("sign", x),
+    sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
+    sp.Max: _folded("max"), sp.Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
+    sp.Not: lambda x: apply("not", x),
+    sp.StrictLessThan: lambda x, y: apply("lt", x, y), sp.LessThan: lambda x, y: apply("le", x, y),
+    sp.StrictGreaterThan: lambda x, y: apply("lt", y, x), sp.GreaterThan: lambda x, y: apply("le", y, x),
+    sp.Equality: lambda x, y: apply("eq", x, y), sp.Unequality: lambda x, y: apply("not", apply("eq", x, y)),
+}
+# fmt: on
+
+
+def _heaviside(x: Any, at_zero: Any = 0.5) -> Any:
+    return where(apply("eq", x, 0.0), at_zero, where(x > 0.0, 1.0, 0.0))
+
+
+def can_be_recorded(f: sp.Expr) -> bool:
+    """True if `evaluator` has a rule for every function in an expression."""
+    functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
+    known = (sp.Piecewise, sp.Heaviside, sp.logic.boolalg.BooleanAtom)
+    return all(a.func in _RULES or isinstance(a, known) for a in functions)
+
+
+def evaluator(numbers: Mapping[sp.Symbol, Any]) -> Callable[[sp.Expr], Any]:
+    """Return a function of expressions that calculates with these numbers; common subexpressions once.
+
+    Raises
+    ------
+    NotRecorded
+        From that function, if something in an expression cannot be calculated.
+    """
+    known: dict[sp.Basic, Any] = dict(numbers)
+
+    def value(f: sp.Basic) -> Any:
+        if f not in known:
+            known[f] = _value(f, value)
+        return known[f]
+
+    return value
+
+
+def _value(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
+    if isinstance(f, sp.logic.boolalg.BooleanAtom):
+        return 1.0 if f else 0.0
+    if f.is_number and f.is_extended_real:
+        return float(f)
+    if f.is_Add:
+        return _sum([value(x) for x in f.args])
+    if f.is_Mul:
+        return _product(f, value)
+    if f.is_Pow:
+        base, exponent = f.args
+        if base == sp.E:
+            return apply("exp", value(exponent))
+        return apply("pow", value(base), value(exponent))
+    if isinstance(f, sp.Piecewise):
+        return _piecewise(f, value)
+    if isinstance(f, sp.Heaviside):
+        return _heaviside(*(value(x) for x in f.args))
+    rule = _RULES.get(f.func)
+    if rule is None:
+        raise NotRecorded(f"{f.func.__name__} is in no table of the compiler.")
+    return rule(*(value(x) for x in f.args))
+
+
+def _sum(terms: Sequence[Any]) -> Any:
+    total = terms[0]
+    for x in terms[1:]:
+        total = total + x
+    return total
+
+
+def _product(f: sp.Mul, value: Callable[[sp.Basic], Any]) -> Any:
+    """A product: the factors above and below the line apart, the number last."""
+    number, rest = f.as_coeff_Mul()
+    above: Any = None
+    for x in sp.Mul.make_args(rest):
+        factor = value(x)
+        above = factor if above is None else above * factor
+    return above if number == 1 else float(number) * above
+
+
+def _piecewise(f: sp.Piecewise, value: Callable[[sp.Basic], Any]) -> Any:
+    """The branches from the last to the first; NaN where no condition holds."""
+    *rest, (expression, condition) = f.args
+    last = value(expression)
+    result = last if condition == sp.true else where(value(condition), last, float("nan"))
+    for expression, condition in reversed(rest):
+        result = where(value(condition), value(expression), result)
+    return result

@@ -1,0 +1,123 @@
+"""Sizes of q and p: the factors that make them comparable, whatever units they are written in."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from sympflow.hamiltonian.times import probe_times
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.system import HamiltonianSystem
+
+STATES = 64
+"""States of a domain at which Hessians are taken, where there is no y0."""
+MOST_DENSE = 200
+"""Degrees of freedom of lattices and pairs of which steps and Hessians are matrices."""
+SLOW = 0.1
+"""Radians in a step of the system, the rate where nothing in H gives one."""
+
+_KNOWN: WeakKeyDictionary[HamiltonianSystem, np.ndarray] = WeakKeyDictionary()
+
+
+def natural_scale(system: HamiltonianSystem) -> np.ndarray:
+    """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω).
+
+    s_i⁴ = ∂²H/∂q_i² / ∂²H/∂p_i² at q = p = 0, if both are positive and finite; else s_i² = ω/|∂²H/∂p_i²| at y0, or
+    over the domain, ω being `fastest_rate`. Without a y0 and a domain s_i = 1. Of a driven system it is that at
+    `t_span[0]`. Large lattices and pairs have the ω of a random direction at y0, and their masses.
+    """
+    system = system.between_impulses
+    if system not in _KNOWN:
+        with np.errstate(all="ignore"):
+            try:
+                large = system.local is not None and system.ndof > MOST_DENSE
+                s = _of_large(system) if large else _of_hessians(system)
+            except (ArithmeticError, ValueError, TypeError):  # singular at the origin, or no second derivatives
+                s = np.ones(system.ndof)
+        _KNOWN[system] = np.where(np.isfinite(s) & (s > 0), s, 1.0)
+    return _KNOWN[system].copy()
+
+
+def weights(system: HamiltonianSystem) -> np.ndarray:
+    """[s, 1/s], (2d,): the factors that make a state [q, p] one of numbers of a size."""
+    s = natural_scale(system)
+    return np.concatenate([s, 1 / s])
+
+
+def smallest_size(system: HamiltonianSystem, y0: np.ndarray) -> float:
+    """A size that neither all q nor all p of an orbit from the states y0 (..., 2d) are less than; never 0.
+
+    Of states at 0 it is that of their motion in a step `dt`, 1 where there is none.
+    """
+    system = system.between_impulses
+    scale = weights(system)
+    size = np.abs(scale * y0).max(initial=0.0)
+    if size == 0:
+        slopes = [np.asarray(system.vector_field(y0, float(t))) for t in probe_times(*system.t_span)]
+        size = np.abs(scale * slopes).max(initial=0.0) * system.dt
+    found = float(size / scale.max())
+    return found if 0 < found < np.inf else 1.0
+
+
+def _of_hessians(system: HamiltonianSystem) -> np.ndarray:
+    d, t0 = system.ndof, system.t_span[0]
+    try:
+        diagonal = np.diagonal(np.asarray(system.hessian(np.zeros(2 * d), t0)))
+        s = (diagonal[:d] / diagonal[d:]) ** 0.25
+    except (ZeroDivisionError, OverflowError):  # a Hamiltonian that is singular at the origin
+        s = diagonal = np.full(2 * d, np.nan)
+    good = np.isfinite(s[:d]) & (s[:d] > 0) & (diagonal[d:] > 0)
+    rate = None if good.all() else fastest_rate(system)
+    found = np.empty((0, 0, 0)) if rate is None else _hessians(system, t0)
+    if not len(found):
+        return np.where(good, s[:d], 1.0)
+    curvatures = np.median(np.abs(np.diagonal(found, axis1=-2, axis2=-1)), axis=0)
+    squares = np.where(curvatures[d:] > 0, rate / curvatures[d:], curvatures[:d] / rate)
+    return np.where(good, s[:d], np.sqrt(squares))
+
+
+def _of_large(system: HamiltonianSystem) -> np.ndarray:
+    d = system.ndof
+    if not (system.separable and system.quadratic_kinetic and system.has_hessian_vector):
+        return np.ones(d)
+    inverse_mass = np.ones(d) if system.inverse_mass is None else np.asarray(system.inverse_mass)
+    q = np.zeros(d) if system.y0 is None else system.y0[:d]
+    v = np.sqrt(inverse_mass) * np.random.default_rng(0).standard_normal(d) / np.sqrt(d)
+    rate = np.linalg.norm(np.sqrt(inverse_mass) * np.asarray(system.hessian_vector(q, v, system.t_span[0]))) ** 0.5
+    return np.sqrt((rate or SLOW / system.dt) / inverse_mass)
+
+
+def fastest_rate(system: HamiltonianSystem) -> float | None:
+    """The largest |λ| of J∇²H at y0, or the median over the domain; `SLOW`/dt where that is 0, None without states.
+
+    Where H depends on t, the largest of a few times within its period, or else the system's interval.
+    """
+    if system.y0 is None and system.domain is None:
+        return None
+    t0, t1 = system.t_span
+    times = [t0] if system.autonomous else probe_times(t0, t1 if system.period is None else t0 + system.period)
+    return max(_median_rate(system, float(t)) for t in times) or SLOW / system.dt
+
+
+def _hessians(system: HamiltonianSystem, t: float) -> np.ndarray:
+    """The finite Hessians (n, 2d, 2d) at y0, or at states of the domain."""
+    if system.y0 is not None:
+        y = system.y0[None]
+    else:
+        assert system.domain is not None
+        y = system.domain.sample(STATES, 0)
+    with np.errstate(all="ignore"):
+        S = np.asarray(system.hessian(y, t))
+    return S[np.isfinite(S).all((-1, -2))]
+
+
+def _median_rate(system: HamiltonianSystem, t: float) -> float:
+    """The median over the states of the largest |λ| of J∇²H; 0 where none is finite."""
+    S, d = _hessians(system, t), system.ndof
+    if not len(S):
+        return 0.0
+    rates = np.abs(np.linalg.eigvals(np.concatenate([S[:, d:], -S[:, :d]], axis=1))).max(-1)
+    return float(np.median(rates))

@@ -1,0 +1,504 @@
+"""Kicks and drifts of a symbolic system as stages over traced numbers, and the compiled functions of any scheme.
+
+A kick is p − b∇V + g∇²V v − c∇(½ v·∇²V v) with v = M⁻¹∇V, or p − b∇V − Σ_m e_m ∇q^m; the drift after it q + a∇T. What
+they are made of is recorded once, arranged, and stands in every function that is compiled: runs of one trajectory and
+of many in lanes, maps, single steps.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.compiler.arrange import Arranged, Arrangement
+from sympflow.compiler.control import Value
+from sympflow.compiler.functions import times
+from sympflow.compiler.program import Program, derivatives, gradient, traced
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.recorded import evaluator
+from sympflow.kernels.runs import Numbers, map_function, run_function, step_function
+from sympflow.kernels.stages import kicks_of
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
+__all__ = ["SplittingCode"]
+
+LANES = 16
+"""Trajectories side by side: of two registers or four, so that one need not wait for the other."""
+MOST_TABLES = 64  # that are kept
+AT_ONCE = 4096  # trajectories with tables of their own
+EARLY = -4  # when momenta are known before the positions, in cycles
+
+
+@dataclass(frozen=True)
+class Splitting:
+    """The kicks and drifts of one system, of a level, with what else they have.
+
+    Attributes
+    ----------
+    symbols : SymbolicHamiltonian
+        Separable; its parameters are numbers of a table.
+    level, monomials
+        Of the kicks: see `sympflow.schemes.Scheme`.
+    compensated : bool
+        True if states have the errors of compensated sums.
+    friction : int, optional
+        Dimensions of Γ.
+    """
+
+    symbols: SymbolicHamiltonian
+    level: int
+    monomials: Monomials = ()
+    compensated: bool = False
+    friction: int | None = None
+
+    @property
+    def kick_numbers(self) -> tuple[str, ...]:
+        return kicks_of(self.level, len(self.monomials))[0].numbers
+
+    @property
+    def numbers(self) -> list[str]:
+        """The names of the numbers of a column that are given, in the order of a table's rows."""
+        d = self.symbols.ndof
+        damped = 0 if self.friction is None else d**self.friction
+        of_friction = [f"{name}_{i}" for name in ("mean", "decay") for i in range(damped)]
+        return ["a", *self.kick_numbers, *of_friction, *(s.name for s in self.symbols.parameters)]
+
+    def kinds(self) -> list[Arranged]:
+        """The stages with kicks of one number, of two, …; a polynomial has all of its numbers."""
+        if self.level == POLYNOMIAL:
+            return [self._arranged(1)]
+        return [self._arranged(terms) for terms in range(1, 2 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0))]
+
+    def _arranged(self, terms: int) -> Arranged:
+        """The stage as a program, the shape with the shortest chain and the fewest operations of two."""
+        shapes = [_Shape(self, terms, expand).arranged() for expand in ((True, False) if terms > 1 else (True,))]
+        return min(shapes, key=lambda shape: shape[0])[1]
+
+
+class _Shape:
+    """One way to write a stage: products of sums multiplied out, or left."""
+
+    def __init__(self, splitting: Splitting, terms: int, expand: bool) -> None:
+        symbols = splitting.symbols
+        self.splitting, self.symbols, self.terms, self.d = splitting, symbols, terms, symbols.ndof
+        errors = [f"error_{s}" for s in (*symbols.q, *symbols.p)] if splitting.compensated else []
+        states = [
+            *((s.name, 0) for s in symbols.q),
+            *((s.name, EARLY) for s in symbols.p),
+            *((e, EARLY) for e in errors),
+        ]
+        self.made = made = Arrangement(states, splitting.numbers, expand)
+        self.q, self.p = made.states[: self.d], made.states[self.d : 2 * self.d]
+        self.errors = made.states[2 * self.d :]
+        self.number = dict(zip(splitting.numbers, made.constants, strict=True))
+        self.values = [self.number[s.name] for s in symbols.parameters]
+
+    def arranged(self) -> tuple[int, Arranged]:
+        """The cost of the stage, and its programs."""
+        made, d = self.made, self.d
+        changes = self._changes()
+        errors: list[Any] = []
+        if self.splitting.compensated:
+            momenta, errors_p = self._compensated(self.p, [made.written(x) for x in changes], self.errors[d:])
+            moves = [made.written(x) for x in self._velocity(momenta, self.number["a"])]
+            positions, errors_q = self._compensated(self.q, moves, self.errors[:d])
+            errors = [*errors_q, *errors_p]
+        else:
+            momenta = [made.written(p + x) for p, x in zip(self.p, changes, strict=True)]
+            positions, momenta = self._drifted(momenta)
+        outputs = [*positions, *momenta, *errors]
+        arranged = made.finish(outputs)
+        return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
+
+    def _changes(self) -> list[Any]:
+        """The change of p by a kick."""
+        made, d, symbols = self.made, self.d, self.symbols
+        b, *more = (self.number[name] for name in self.splitting.kick_numbers)
+        orders = [made.number(x) for x in _slopes(symbols, self.terms)(*self.q, *self.values)]
+        slope, hessian = orders[:d], [orders[d + d * i :][:d] for i in range(d)]
+        changes = [-times(b, x) for x in slope]
+        if self.terms > 1:
+            v = self._by_mass(slope)
+            product = [_dot(row, v) for row in hessian]
+            changes = [x + times(more[0], y) for x, y in zip(changes, product, strict=True)]
+        if self.terms > 2:
+            third = np.array(orders[d + d * d :], dtype=object).reshape(d, d, d)
+            again, u = [_dot(row, self._by_mass(product)) for row in hessian], v
+            bent = [_dot([_dot(row, u) for row in rows], u) for rows in third]
+            changes = [x - times(more[1], y + 0.5 * z) for x, y, z in zip(changes, again, bent, strict=True)]
+        for e, powers in zip(more if self.splitting.monomials else (), self.splitting.monomials, strict=True):
+            changes = [x - e * _slope_of_monomial(powers, i, self.q) for i, x in enumerate(changes)]
+        return changes
+
+    def _by_mass(self, v: Sequence[Any]) -> list[Any]:
+        """M⁻¹v."""
+        M, entry = self.symbols.inverse_mass, self._of_parameters
+        assert M is not None
+        return [_dot([entry(M[i, j]) for j in range(self.d)], v) for i in range(self.d)]
+
+    def _of_parameters(self, f: Any) -> Any:
+        return evaluator(dict(zip(self.symbols.parameters, self.values, strict=True)))(f)
+
+    def _velocity(self, momenta: Sequence[Any], a: Any) -> list[Any]:
+        """a∇T of momenta, numbers of the body."""
+        p = [self.made.letter(x) for x in momenta]
+        if self.symbols.inverse_mass is not None:
+            return [self.made.number(a * x) for x in self._by_mass(p)]
+        numbers = zip((*self.symbols.p, *self.symbols.parameters), (*p, *self.values), strict=True)
+        kinetic = evaluator(dict(numbers))
+        assert self.symbols.T is not None
+        return [self.made.number(a * kinetic(self.symbols.T.diff(s))) for s in self.symbols.p]
+
+    def _drifted(self, momenta: list[Any]) -> tuple[list[Any], list[Any]]:
+        """Positions and momenta after the drift."""
+        made, M, d = self.made, self.symbols.inverse_mass, self.d
+        if self.splitting.friction is not None:
+            mean, end = (self._damped(name, momenta) for name in ("mean", "decay"))
+            moves = self._velocity([made.written(x) for x in mean], 1.0)
+            return [made.written(q + x) for q, x in zip(self.q, moves, strict=True)], [made.written(x) for x in end]
+        if M is None:
+            moves = self._velocity(momenta, self.number["a"])
+            return [made.written(q + x) for q, x in zip(self.q, moves, strict=True)], momenta
+        positions = [made.node(q) for q in self.q]
+        for i in range(d):
+            for j in range(d):
+                if M[i, j] != 0:
+                    factor = made.written(made.number(times(self.number["a"], self._of_parameters(M[i, j]))))
+                    positions[i] = made.moved(positions[i], factor, momenta[j])
+        return positions, momenta
+
+    def _damped(self, name: str, momenta: Sequence[Any]) -> list[Any]:
+        """One of the two linear maps of a drift with friction."""
+        d, p = self.d, [self.made.letter(x) for x in momenta]
+        numbers = [x for key, x in self.number.items() if key.startswith(f"{name}_")]
+        if len(numbers) == d * d and self.splitting.friction == 2:
+            return [_dot(numbers[i * d : (i + 1) * d], p) for i in range(d)]
+        return [
+            self.made.number(x * (numbers[0] if self.splitting.friction == 0 else numbers[i])) for i, x in enumerate(p)
+        ]
+
+    def _compensated(
+        self, x: Sequence[Any], changes: Sequence[Any], errors: Sequence[Any]
+    ) -> tuple[list[Any], list[Any]]:
+        """x + change by Kahan's compensated sum, and the new errors."""
+        op, sums, left = self.made.operation, [], []
+        for value, change, error in zip(map(self.made.node, x), changes, map(self.made.node, errors), strict=True):
+            corrected = op("sub", change, error)
+            total = op("add", value, corrected)
+            sums.append(total)
+            left.append(op("sub", op("sub", total, value), corrected))
+        return sums, left
+
+
+def _slopes(symbols: SymbolicHamiltonian, terms: int) -> Program:
+    """∇V, and its second and third derivatives, as many orders as there are terms; rows of the tensors one by one."""
+    given = (*symbols.q, *symbols.parameters)
+    potential = traced(
+        lambda *numbers: [evaluator(dict(zip(given, numbers, strict=True)))(symbols.V)], *(s.name for s in given)
+    )
+    q = potential.inputs[: symbols.ndof]
+    orders = [gradient(potential.outputs[0], q)]
+    for _ in range(1, terms):
+        orders.append([x for row in derivatives(orders[-1], q) for x in row])
+    return Program(potential.inputs, [x for order in orders for x in order])
+
+
+def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
+    """Σ xᵢ yᵢ, products that may be multiplied out."""
+    total: Any = 0.0
+    for a, b in zip(x, y, strict=True):
+        total = total + times(a, b)
+    return total
+
+
+def _slope_of_monomial(powers: Sequence[int], i: int, q: Sequence[Any]) -> Any:
+    """∂/∂qᵢ of Π q^powers."""
+    value: Any = float(powers[i])
+    for j, n in enumerate(powers):
+        if powers[i] and n > (i == j):
+            value = value * q[j] ** (n - (i == j))
+    return value
+
+
+class SplittingCode:
+    """The compiled functions of splitting schemes on one symbolic system: see `LoopFunctions`.
+
+    Parameters
+    ----------
+    splitting : Splitting
+    """
+
+    def __init__(self, splitting: Splitting) -> None:
+        self._splitting = splitting
+        self._lock = threading.RLock()
+        self._functions: dict[Any, Callable[..., None]] = {}
+        self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+        symbols = splitting.symbols
+        self._n_out = 2 * symbols.ndof
+        self._n_values = self._n_out * (1 + splitting.compensated)
+        self._own = len(symbols.parameters)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SplittingCode, (self._splitting,)
+
+    @cached_property
+    def _kinds(self) -> list[Arranged]:
+        return self._splitting.kinds()
+
+    @cached_property
+    def _size(self) -> int:
+        """Numbers of a column that the code reads."""
+        return max(len(kind.table.outputs) for kind in self._kinds)
+
+    def _stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+        """A kick and a drift, of the kind that a column has."""
+        if len(self._kinds) == 1:
+            return self._executed(0, values, numbers)
+        code = values[0].code
+        results = [code.variable(x) for x in values]
+        for k in range(len(self._kinds)):
+            with code.given(code.apply("eq", (kind, k))):
+                for result, x in zip(results, self._executed(k, values, numbers), strict=True):
+                    result.value = x
+        return [x.value for x in results]
+
+    def _executed(self, k: int, values: list[Value], numbers: Numbers) -> list[Value]:
+        table, body = self._kinds[k]
+        return body(*values, *[numbers(i) for i in range(len(table.outputs))])
+
+    def _function(self, name: str, width: int) -> Callable[..., None]:
+        """The function of a name: "run", "run own", "map", "step" or "step own"."""
+        found = self._functions.get((name, width))
+        if found is None:
+            with self._lock:
+                found = self._functions[name, width] = self._made(name, width)
+        return found
+
+    def _made(self, name: str, width: int) -> Callable[..., None]:
+        what, _, own = name.partition(" ")
+        if what == "map":
+            return map_function(self._n_values, self._n_out, self._size, self._stage, width)
+        if what == "run":
+            return run_function(self._n_values, self._n_out, self._size, self._stage, width, bool(own))
+        kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
+        powers = [1, *kick.powers, *(0 for _ in range(self._own))]
+        last = len(self._kinds) - 1
+
+        def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+            return self._executed(last, values, numbers)
+
+        return step_function(
+            self._n_values, self._n_out, powers, self._own if own else 0, self._kinds[last].table, stage, width
+        )
+
+    # tables -------------------------------------------------------------------------------------------------------
+
+    def _prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers (m, size) that the code reads, of a table (n, m) of given ones, and the kinds (m,) of columns."""
+        key = table.tobytes()
+        found = self._tables.get(key)
+        if found is None:
+            if len(self._tables) >= MOST_TABLES:
+                self._tables.clear()
+            kinds = self._kinds_of(table)
+            found = self._tables[key] = self._entries(table, kinds), kinds
+        return found
+
+    def _kinds_of(self, table: np.ndarray) -> np.ndarray:
+        kinds = np.zeros(table.shape[1], dtype=np.int64)
+        for k in range(1, len(self._kinds)):
+            kinds[table[1 + k] != 0] = k
+        return kinds
+
+    def _entries(self, table: Any, kinds: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
+        """The numbers (m, size, *shape) of rows, each (m,) or (m, *shape)."""
+        entries = np.zeros((len(kinds), self._size, *shape))
+        for k, kind in enumerate(self._kinds):
+            with np.errstate(all="ignore"):
+                rows = kind.table(*table)
+            for i, row in enumerate(rows):
+                entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
+        return entries
+
+    def _own_tables(self, table: np.ndarray, values: np.ndarray, kinds: np.ndarray, width: int) -> np.ndarray:
+        """Tables of trajectories with their own values (N, n) of the parameters, `width` of them side by side."""
+        n = len(table) - self._own
+        rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
+        entries = self._entries(rows, kinds, (len(values),))
+        groups = -(-len(values) // width)
+        full = np.concatenate([entries, np.repeat(entries[..., -1:], groups * width - len(values), axis=-1)], axis=-1)
+        return np.ascontiguousarray(full.reshape(*full.shape[:2], groups, width).transpose(2, 0, 1, 3))
+
+    # the functions of `LoopFunctions` -----------------------------------------------------------------------------
+
+    def rollout(
+        self,
+        table: np.ndarray,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+        closed: bool = True,
+    ) -> int:
+        """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``."""
+        finite = np.empty(1, dtype=np.int64)
+        self._run(table, y0[None], n_steps, save, out[None], finite, stop, first, running[None], closed, 1)
+        return int(finite[0])
+
+    def rollout_batch(
+        self,
+        table: np.ndarray,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        n_finite: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+        closed: bool = True,
+    ) -> None:
+        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it."""
+        rest = n_steps, save, stop, first, closed
+        if len(y0) == 1 or y0.shape[1] > self._n_out:
+            size = AT_ONCE if y0.shape[1] > self._n_out else 1
+            for k in range(0, len(y0), size):
+                rows = slice(k, k + size)
+                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], *rest)
+            return
+        self._some(table, y0, out, n_finite, running, *rest)
+
+    def _some(
+        self,
+        table: np.ndarray,
+        y0: np.ndarray,
+        out: np.ndarray,
+        n_finite: np.ndarray,
+        running: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        closed: bool,
+    ) -> None:
+        """Rows side by side; those that end before the last step once more, by themselves, to find that end."""
+        before = running.copy() if first > 0 else running
+        rest = stop, first
+        width = LANES if len(y0) > 1 else 1
+        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width)
+        for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
+            one = slice(i, i + 1)
+            if len(before):
+                running[i] = before[i]
+            self._run(table, y0[one], n_steps, save, out[one], n_finite[one], *rest, running[one], closed, 1)
+
+    def _run(
+        self,
+        table: np.ndarray,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        n_finite: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+        closed: bool,
+        width: int,
+    ) -> None:
+        states = y0[:, : self._n_out]
+        if y0.shape[1] > self._n_out:
+            kinds = self._kinds_of(table)
+            entries = self._own_tables(table, y0[:, self._n_out :], kinds, width)
+            run = self._function("run own", width)
+        else:
+            entries, kinds = self._prepared(table)
+            run = self._function("run", width)
+        begun = int(np.searchsorted(save, 0, side="right")) if len(save) and save[0] <= 0 else 0
+        if begun:
+            out[:, :begun] = states[:, None]
+        later, outputs = save[begun:], out
+        if begun or not out.flags.c_contiguous:
+            outputs = np.empty((len(y0), len(later), self._n_out))
+        if first > 0:
+            start = np.ascontiguousarray(running)
+        elif self._n_values > self._n_out:
+            start = np.concatenate([states, np.zeros_like(states)], axis=1)
+        else:
+            start = np.ascontiguousarray(states)
+        keeps = running.shape[-1] > 0
+        left = np.empty((len(y0), self._n_values)) if keeps else running
+        arrays = entries, kinds, start, later, outputs, n_finite, left, stop
+        table_at, kinds_at, start_at, save_at, out_at, finite_at, left_at, stop_at = (x.ctypes.data for x in arrays)
+        lengths = len(kinds) - 2, int(closed)
+        run(
+            *(table_at, kinds_at, *lengths, start_at, len(y0), first, n_steps, save_at, len(later), out_at),
+            *(finite_at, left_at, int(keeps), stop_at),
+        )
+        if outputs is not out:
+            out[:, begun:] = outputs
+        if keeps:
+            running[:] = left
+        if width == 1:
+            for i in np.flatnonzero(n_finite < n_steps):
+                out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
+                if keeps:
+                    running[i] = np.nan
+
+    def rollout_processed(
+        self, before: np.ndarray, run: np.ndarray, after: np.ndarray, y0: np.ndarray, *rest: Any
+    ) -> int:
+        """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
+        n_steps, save, out, stop, first, running = rest
+        finite = np.empty(1, dtype=np.int64)
+        rows = n_steps, save, out[None], finite, stop, first, running[None]
+        self.rollout_processed_batch(before, run, after, y0[None], *rows)
+        return int(finite[0])
+
+    def rollout_processed_batch(
+        self, before: np.ndarray, run: np.ndarray, after: np.ndarray, y0: np.ndarray, *rest: Any
+    ) -> None:
+        """The same of every row of `y0` (N, 2d)."""
+        n_steps, save, out, n_finite, stop, first, running = rest
+        start = y0
+        if first == 0:
+            start = np.empty_like(y0)
+            self._map(before, y0, start)
+        self.rollout_batch(run, start, n_steps, save, out, n_finite, stop, first, running, False)
+        self._map(after, out.reshape(-1, self._n_out), out.reshape(-1, self._n_out))
+        out[:, : np.searchsorted(save, 0, side="right")] = y0[:, None]
+        good = np.isfinite(out).all(-1)
+        for i in np.flatnonzero(~good.all(-1)):
+            row = int(np.argmin(good[i]))
+            if save[row] <= n_finite[i]:
+                out[i, row:], n_finite[i] = np.nan, save[row] - 1
+
+    def _map(self, table: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
+        if not len(y):
+            return
+        entries, kinds = self._prepared(table)
+        function = self._function("map", 1 if len(y) == 1 else LANES)
+        arrays = entries, kinds, y, out
+        table_at, kinds_at, rows_at, out_at = (x.ctypes.data for x in arrays)
+        function(table_at, kinds_at, len(kinds), kinds_at, 1, rows_at, len(y), out_at)
+
+    def step_rows(
+        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
+        own = " own" if y.shape[1] > self._n_out else ""
+        step = self._function("step" + own, 1 if len(y) == 1 else LANES)
+        table = np.ascontiguousarray(table)
+        table_at, x_at, h_at, t_at, rows_at, out_at = (a.ctypes.data for a in (table, x, h, t, y, out))
+        step(table_at, table.shape[1], table.shape[2], x_at, h_at, t_at, rows_at, len(y), out_at)

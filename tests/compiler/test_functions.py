@@ -1,0 +1,131 @@
+"""The table of functions: values of arrays and tensors, derivatives, machine code of every row."""
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from test_functions_in_code import run
+
+from sympflow.compiler.functions import FUNCTIONS, apply
+from sympflow.compiler.program import derivatives, traced
+
+CONDITIONS = {"lt", "le", "eq", "and", "or", "not"}
+EXACT = {  # by mpmath, of functions that have another name there
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "times": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "neg": lambda a: -a,
+    "fma": lambda a, b, c: a * b + c,
+    "pow": mpmath.power,
+    "abs": abs,
+    "min": min,
+    "max": max,
+    "mod": lambda a, b: a - mpmath.floor(a / b) * b,
+    "lgamma": mpmath.loggamma,
+    "trigamma": lambda a: mpmath.polygamma(1, a),
+}
+POINTS = {  # where the function is smooth
+    "acosh": [(1.3,), (4.0,)],
+    "floor": [(0.3,), (-2.7,)],
+    "lgamma": [(0.7,), (5.2,)],
+    "digamma": [(0.7,), (-2.2,)],
+    "trigamma": [(0.7,), (-2.2,)],
+    "log": [(0.7,), (20.0,)],
+    "sqrt": [(0.7,), (20.0,)],
+    "pow": [(0.7, 1.6), (3.0, -0.4)],
+    "mod": [(7.3, 2.0), (-7.3, 2.0), (7.3, -1.7)],
+}
+PLACES = [(0.4, -0.8, 1.7), (-0.7, 0.3, -2.2)]
+
+
+def points(name):
+    count = {"fma": 3}.get(name) or (2 if name in {"add", "sub", "mul", "times", "div", "min", "max", "atan2"} else 1)
+    return POINTS.get(name) or [place[:count] for place in PLACES]
+
+
+def exact(name):
+    return EXACT.get(name) or getattr(mpmath, name)
+
+
+NUMERIC = [name for name in FUNCTIONS if name not in CONDITIONS | {"where"}]
+
+
+@pytest.mark.parametrize("name", NUMERIC)
+def test_values_of_arrays_tensors_and_machine_code(name):
+    for place in points(name):
+        expected = float(exact(name)(*map(mpmath.mpf, place)))
+        arrays = [np.array([x, x]) for x in place]
+        tensors = [torch.tensor(x, dtype=torch.float64) for x in arrays]
+        close = {"rtol": 2e-15 if name != "digamma" else 1e-14, "atol": 0.0}
+        np.testing.assert_allclose(apply(name, *place), expected, **close)
+        np.testing.assert_allclose(apply(name, *arrays), expected, **close)
+        np.testing.assert_allclose(apply(name, *tensors), expected, **close)
+        np.testing.assert_allclose(run(lambda *x: apply(name, *x), *arrays, width=2), expected, **close)
+        # floats among tensors take their dtype
+        for i in range(len(place)):
+            mixed = [x.float() if j == i else place[j] for j, x in enumerate(tensors)]
+            y = apply(name, *mixed)
+            assert y.dtype == torch.float32
+            np.testing.assert_allclose(y, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", [name for name in NUMERIC if name != "trigamma"])
+def test_derivatives(name):
+    for place in points(name):
+        program = traced(lambda *x: derivatives([apply(name, *x)], x)[0], *"abc"[: len(place)])
+        slopes = program(*place)
+        for i, slope in enumerate(slopes):
+
+            def along(t, i=i, place=place):
+                return exact(name)(*(t if j == i else mpmath.mpf(x) for j, x in enumerate(place)))
+
+            with mpmath.workdps(40):
+                expected = float(mpmath.diff(along, mpmath.mpf(place[i])))
+            assert slope == pytest.approx(expected, rel=1e-13, abs=1e-14)
+
+
+def test_the_derivative_of_a_power_by_its_exponent_and_of_a_constant_power():
+    (slope,) = traced(lambda x: derivatives([x**2.5], [x])[0], "x")(1.3)
+    assert slope == pytest.approx(2.5 * 1.3**1.5, rel=1e-15)
+    by_exponent = traced(lambda n: derivatives([2.0**n], [n])[0], "n")(1.5)[0]
+    assert by_exponent == pytest.approx(2**1.5 * np.log(2), rel=1e-15)
+
+
+def test_the_third_derivative_of_the_logarithm_of_gamma_is_refused():
+    with pytest.raises(NotImplementedError, match="third derivative of lgamma"):
+        traced(lambda x: derivatives([apply("trigamma", x)], [x])[0], "x")
+
+
+def test_conditions_and_choices():
+    def choose(x, y):
+        inside = apply("and", x < y, apply("not", apply("eq", x, 0.0)))
+        return apply("where", apply("or", inside, y <= -2.0), x * y, x - y)
+
+    x, y = np.array([1.0, 0.0, 3.0, -3.0]), np.array([2.0, 1.0, 1.0, -4.0])
+    expected = [2.0, -1.0, 2.0, 12.0]
+    tensors = torch.tensor(x), torch.tensor(y)
+    program = traced(lambda x, y: [choose(x, y), *derivatives([choose(x, y)], [x, y])[0]], "x", "y")
+    for values in ((x, y), tensors):
+        np.testing.assert_array_equal(choose(*values), expected)
+        value, by_x, by_y = program(*values)
+        np.testing.assert_array_equal(value, expected)
+        np.testing.assert_array_equal(by_x, [2.0, 1.0, 1.0, -4.0])
+        np.testing.assert_array_equal(by_y, [1.0, -1.0, -1.0, -3.0])
+    np.testing.assert_array_equal(run(choose, x, y, width=4), expected)
+
+
+@pytest.mark.parametrize("make", [np.array, torch.tensor])
+def test_a_choice_between_two_floats_is_in_double_precision(make):
+    y = apply("where", make([True, False]), 0.1, 0.2)
+    assert [float(v) for v in y] == [0.1, 0.2]
+
+
+def test_not_a_number_goes_through_signs_and_extremes():
+    nan = np.array([np.nan, 1.0])
+    for x in (nan, torch.tensor(nan)):
+        assert np.isnan(float(apply("sign", x)[0]))
+        for name in ("min", "max"):
+            assert np.isnan(float(apply(name, x, 0.0)[0]))
+            assert np.isnan(float(apply(name, 0.0, x)[0]))

@@ -1,0 +1,159 @@
+"""Formulas of all kinds: right values, or an error at once; compiled code has the values of arrays."""
+
+import math
+import random
+
+import numpy as np
+import pytest
+import sympy as sp
+import torch
+from numba import njit
+from scipy.interpolate import CubicSpline
+
+from sympflow import HamiltonianSystem, doubled, solve
+from sympflow.kernels.implicit_loops import gradient_and_hessian_source
+
+made = HamiltonianSystem.from_sympy
+Y = np.array([0.31, 0.47, 0.23, -0.39])
+TIMES = np.linspace(-2, 2, 9)
+HELD = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+q, p = sp.symbols("q p")
+
+
+@njit
+def compiled_H(q, p):
+    return (p**2).sum(-1) / 2 + (q**2).sum(-1) / 2
+
+
+HIDDEN = "hide all that follows"
+REFUSED = [
+    (lambda: made("p**2/2 + q**2/2 # + q**4\n + 5*q**3"), ValueError, f"^`expression` .*{HIDDEN}"),
+    (lambda: HamiltonianSystem.lattice(onsite="q**2 # + q**4", shape=4), ValueError, f"^`onsite` .*{HIDDEN}"),
+    (lambda: HamiltonianSystem.pairs("1/r # + r", masses=[1, 1]), ValueError, f"^`potential` .*{HIDDEN}"),
+    (lambda: doubled(made("p**2/2 + q**2/2"), "-p # q"), ValueError, f"^`force` .*{HIDDEN}"),
+    (lambda: made("p**2/2 + V", params={"V": CubicSpline(TIMES, TIMES**2)}), ValueError, "^`params` has V, a spline"),
+    (lambda: made("p**2/2 + k*q**2", params={"k": HELD}), TypeError, r"^`params\['k'\]` is a tensor.*detach"),
+    (
+        lambda: HamiltonianSystem.lattice(onsite="k*q**2", shape=4, params={"k": HELD}),
+        TypeError,
+        r"^`params\['k'\]` is a tensor.*detach",
+    ),
+    (lambda: HamiltonianSystem.pairs("1/r", masses=HELD.expand(2)), TypeError, "^`masses` is a tensor.*detach"),
+    (lambda: made("p**2/2 + (-0.3)**q"), ValueError, "^`expression` is complex.*positive base"),
+    (lambda: made("p**2/2 + a**q", params={"a": -0.3}), ValueError, "^`params` has a = -0.3"),
+    (lambda: made("p**2/2 + asin(2)*q"), ValueError, "^`expression` is complex"),
+    (lambda: made(sp.Matrix([[p**2, q], [q, p]])), ValueError, r"^`expression` must be a scalar.*\(2, 2\)"),
+    (lambda: made(f"p**2/2 + Max({','.join(f'{i}*q' for i in range(63))})"), ValueError, "Max has 63 arguments"),
+    (lambda: made("p1**2/2 + q99999999999"), ValueError, "^`expression` has 99,999,999,999 coordinates"),
+    (lambda: HamiltonianSystem(hamiltonian=compiled_H, ndof=1), TypeError, "^`hamiltonian` is a Numba function"),
+]
+
+
+@pytest.mark.parametrize(("make", "error", "message"), REFUSED)
+def test_what_has_no_right_value_is_refused(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
+
+
+MICRO, GREEK = "\u00b5", "\u03bc"
+SUM = " + ".join(["q**2/1000"] * 250)
+SAME = [
+    (made(sp.Matrix([[p**2 / 2 + q**2 / 2]])), made("p**2/2 + q**2/2")),
+    *(
+        (made(f"p**2/2 + {text}*q**2", params={name: 2.0}), made("p**2/2 + 2*q**2"))
+        for text in (MICRO, GREEK)
+        for name in (MICRO, GREEK)
+    ),
+    (made(f"p**2/2 + {SUM} + Piecewise((q**2, q <= 1), (1, True))"), made("p**2/2 + q**2/4 + q**2")),
+    (made("p**2/2 + Piecewise((q**2, q < 1))"), made("p**2/2 + q**2")),
+]
+
+
+@pytest.mark.parametrize(("one", "other"), SAME)
+def test_one_formula_in_two_spellings(one, other):
+    y = np.array([[0.3, 0.2], [-0.7, 0.4]])
+    np.testing.assert_allclose(one.hamiltonian(y), other.hamiltonian(y), rtol=1e-13)
+    np.testing.assert_allclose(one.gradient(y), other.gradient(y), rtol=1e-13)
+
+
+def test_special_functions_have_their_values_and_are_undefined_elsewhere():
+    K = made("p**2/2 + elliptic_k(q)").force(np.array([[0.5]]))
+    assert pytest.approx(-float(sp.diff(sp.elliptic_k(q), q).subs(q, 0.5)), rel=1e-13) == K
+    W = made("p**2/2 + LambertW(q)").potential(np.array([[1.0], [-0.5]]))
+    assert W[0] == pytest.approx(float(sp.LambertW(1)), rel=1e-14)
+    assert np.isnan(W[1])
+
+
+@pytest.mark.parametrize(
+    ("text", "more"),
+    [
+        ("p**2/2 + exp(-exp(-q))", {}),
+        ("p**2/2 + Piecewise((q**2*t, q < 1), (q**2, True))", {"time": "t"}),
+        ("p**2/2 + Piecewise((q**2, q < 1))", {}),
+        ("p**2/2 + (q + 1)**300*1e-40", {}),
+    ],
+)
+def test_compiled_steps_are_those_of_arrays(text, more):
+    found, arrays = (
+        solve(made(text, **more), "verlet", (0, 0.05), y0=[0.3, 0.2], dt=0.01, backend=backend)
+        for backend in ("compiled", "array")
+    )
+    np.testing.assert_allclose(found.y, arrays.y, rtol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["verlet", "gauss_legendre4"])
+def test_what_has_no_compiled_form_runs_with_arrays_and_says_so(method):
+    sol = solve(made("p**2/2 + besselj(0, q)"), method, (0, 0.05), y0=[0.3, 0.2], dt=0.01)
+    assert sol.success
+    assert sol.stats["backend"] == "numpy"
+    assert "array operations: `system` has the term" in sol.message
+
+
+@pytest.mark.parametrize("T", ["(p1 + p2)**2/2", "-p1**2/2 - p2**2/2", "p1*p2"])
+def test_linear_parts_need_positive_masses(T):
+    system = made(f"{T} + q1**2 + q2**2", y0=Y)
+    with pytest.raises(ValueError, match=r"^`system` has a kinetic energy.*not positive definite.*'kahan_li8'"):
+        solve(system, "impulse", (0, 0.05), dt=0.01)
+
+
+# random formulas --------------------------------------------------------------------------------------------------
+
+FUNCTIONS = ["sin", "cos", "exp", "tanh", "atan", "sqrt", "log", "Abs", "cosh"]
+FUNCTIONS += ["erf", "asinh", "sech", "tan", "asin", "sinh", "gamma", "acot"]
+
+
+def formula(r: random.Random, depth: int) -> str:
+    """A random expression in q1, p1, q2, p2 and a."""
+    if depth == 0 or r.random() < 0.15:
+        return r.choice(["q1", "p1", "q2", "p2", "a", "2", "0.7", "1/3"])
+    a, b, c, e = (formula(r, depth - 1) for _ in range(4))
+    whole = f"({a} + {b})", f"({a})*({b})", f"({a})/({b})", f"({a})**2.5", f"({a})**17", f"({a})**({b})"
+    chosen = f"Max({a}, {b})", f"Min({a}, {b})", f"Piecewise(({a}, ({b})**2 <= {c}), ({e}, True))"
+    return r.choice([*whole, *chosen, *(f"{r.choice(FUNCTIONS)}({a})" for _ in range(7))])
+
+
+def as_python(source: str, name: str):
+    """A function of generated code, run as it stands."""
+    known = {"math": math, "fast_sin": math.sin, "fast_cos": math.cos, "fast_tanh": math.tanh}
+    exec(source.replace("@njit(**OPTIONS)", ""), known)
+    return known[name]
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_derivatives_of_random_formulas_are_those_of_H_and_of_generated_code(seed):
+    text = formula(random.Random(seed), 2)
+    try:
+        system = made(f"p1**2/2 + p2**2/2 + a*q1 + {text}", params={"a": 0.6})
+    except ValueError:  # of one that is nowhere real
+        pytest.skip("refused")
+    with np.errstate(all="ignore"):
+        g, h = system.gradient(Y), system.hessian(Y)
+        if not (np.isfinite(g).all() and np.isfinite(h).all() and np.abs(h).max() < 1e6):
+            pytest.skip("not defined there")
+        differences = [(system.hamiltonian(Y + d) - system.hamiltonian(Y - d)) / 2e-5 for d in 1e-5 * np.eye(4)]
+    np.testing.assert_allclose(g, differences, rtol=1e-4, atol=1e-5)
+    found, found_h = np.zeros(4), np.zeros((4, 4))
+    code = as_python(gradient_and_hessian_source(system.symbols), "gradient_and_hessian")
+    code(Y.tolist(), found, found_h, 0.0)
+    np.testing.assert_allclose(found, g, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found_h, h, rtol=1e-9, atol=1e-9)

@@ -1,0 +1,424 @@
+"""Jumps, impulses and periods that are read from the expression of H."""
+
+import math
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import sympy as sp
+import torch
+from scipy.interpolate import CubicSpline
+
+import sympflow
+from sympflow import HamiltonianSystem, solve
+from sympflow.hamiltonian.times import check_period
+
+q, p, t = sp.symbols("q p t", real=True)
+PI = math.pi
+
+
+def driven(drive, **scene):
+    """A free body under a force of t."""
+    return HamiltonianSystem.from_sympy(p**2 / 2 - q * drive, time="t", **scene)
+
+
+# impulses ------------------------------------------------------------------------------------------
+
+COMB = HamiltonianSystem.from_sympy(
+    p**2 / 2 + q**2 / 2 - q * sum(sp.DiracDelta(t - k * sp.pi) for k in range(1, 21)), time="t", y0=[0, 0]
+)
+TIMES = np.unique(np.concatenate([np.linspace(0, 70, 351), PI * np.arange(21)]))
+
+
+def comb(times):
+    """Σ Θ(t − kπ) sin(t − kπ), and its derivative, continuous from the right."""
+    since = times[:, None] - PI * np.arange(1, 21)
+    on = since > -1e-12
+    return np.stack([(on * np.sin(since)).sum(1), (on * np.cos(since)).sum(1)])
+
+
+@pytest.mark.parametrize("method", ["kahan_li8", "gauss_legendre6", "tao8", "linear_kahan_li8", "dop853", "dopri5"])
+def test_an_oscillator_under_impulses_is_a_sum_of_sines(method):
+    """There and back, at given times and at the steps, by the dense output and in a batch."""
+    adaptive = method in ("dop853", "dopri5")
+    options = {"rtol": 1e-11, "atol": 1e-13} if adaptive else {"backend": "array"}
+    near = {"rtol": 0, "atol": 1e-8 if adaptive else 1e-11}
+    end = comb(TIMES[-1:])[:, 0]
+    for span, y0 in (((0.0, 70.0), [0.0, 0.0]), ((70.0, 0.0), end)):
+        sign = 1 if span[1] else -1
+        sol = solve(COMB, method, span, y0, t_eval=TIMES[::sign], dense_output=True, **options)
+        assert sol.success
+        assert sol.stats["impulses"] == 20
+        np.testing.assert_array_equal(sol.t, TIMES[::sign])
+        np.testing.assert_allclose(sol.y, comb(TIMES)[:, ::sign], **near)
+        np.testing.assert_allclose(pickle.loads(pickle.dumps(sol.sol))(TIMES), comb(TIMES), **near)
+        np.testing.assert_allclose(sol.sol(70.0), end, **near)
+        steps = solve(COMB, method, span, y0, **options)
+        assert (np.diff(steps.t) * sign > 0).all()
+        np.testing.assert_allclose(steps.y, comb(steps.t), **near)
+    if method == "kahan_li8":
+        many = solve(COMB, method, (0, 70), np.array([[0.0, 0.0], [1.0, 0.5]]), t_eval=TIMES, **options)
+        free = np.stack([np.cos(TIMES) + 0.5 * np.sin(TIMES), 0.5 * np.cos(TIMES) - np.sin(TIMES)])
+        np.testing.assert_allclose(many.y, comb(TIMES) + np.stack([0 * free, free]), **near)
+
+
+def test_an_impulse_belongs_to_the_interval_that_ends_with_it():
+    first = solve(COMB, "kahan_li8", (0, PI), backend="array")
+    np.testing.assert_allclose(first.y[:, -1], [0, 1], atol=1e-12)
+    again = solve(COMB, "kahan_li8", (PI, 2 * PI), first.y[:, -1], backend="array")
+    np.testing.assert_allclose(again.y[:, -1], [0, 0], atol=1e-12)
+    assert again.stats["impulses"] == 1
+    back = solve(COMB, "kahan_li8", (PI, 0), first.y[:, -1], backend="array")
+    np.testing.assert_allclose(back.y[:, -1], [0, 0], atol=1e-12)
+    assert solve(COMB, "kahan_li8", (0, 3), backend="array").stats["impulses"] == 0
+
+
+def test_the_kicked_rotor_is_the_standard_map():
+    """δ(sin πt) has the weight 1/π; with other parameters for each trajectory, gradients, and in an ensemble."""
+    rotor = HamiltonianSystem.from_sympy(
+        "p**2/2 + pi*K*cos(q)*DiracDelta(sin(pi*t))", params={"K": 1.1}, time="t", period=1.0, y0=[1.0, 0.3], dt=0.5
+    )
+
+    def mapped(K, n=12):
+        x, v = 1.0, 0.3
+        for _ in range(n):
+            x += v
+            v += K * math.sin(x)
+        return [x, v]
+
+    pair = solve(rotor, "leapfrog", (0, 12), params={"K": np.array([1.1, 0.4])}, backend="array")
+    np.testing.assert_allclose(pair.y[..., -1], [mapped(1.1), mapped(0.4)], rtol=1e-11)
+    np.testing.assert_allclose(solve(rotor, "leapfrog", (0, 12)).y[:, -1], mapped(1.1), rtol=1e-11)  # compiled
+    y0 = torch.tensor([1.0, 0.3], dtype=torch.float64, requires_grad=True)
+    end = solve(pickle.loads(pickle.dumps(rotor)), "leapfrog", (0, 12), y0).y[:, -1]
+    M = torch.stack([torch.autograd.grad(x, y0, retain_graph=True)[0] for x in end])
+    assert float(torch.linalg.det(M)) == pytest.approx(1.0, abs=1e-8)
+    kept = sympflow.ensemble(rotor, "leapfrog", y0=np.tile(rotor.y0, (3, 1)), t_span=(0, 12), reduce="final")
+    np.testing.assert_allclose(kept.final[0], mapped(1.1), rtol=1e-11)
+
+
+def test_impulses_of_a_damped_body_with_events():
+    """p' = −γp + δ(t − 1) + 2δ(2t − 6): p jumps by 1 at 1 and at 3, and decays between."""
+    body = HamiltonianSystem.from_sympy(
+        "p**2/2 - q*DiracDelta(t - 1) - 2*q*DiracDelta(2*t - 6)", time="t", damping=0.5, y0=[0, 0]
+    )
+    times = np.array([0.5, 1.0, 2.0, 3.0, 4.0])
+    sol = solve(body, "verlet", (0, 4), t_eval=times, backend="array", events=lambda s, y: y[0] - 1.0)
+    decayed = [(s >= a) * math.exp(-0.5 * (s - a)) for a in (1, 3) for s in times]
+    np.testing.assert_allclose(sol.y[1], np.reshape(decayed, (2, 5)).sum(0), rtol=1e-12)
+    np.testing.assert_allclose(sol.t_events[0], [1 + 2 * math.log(2)], rtol=1e-10)
+    body.between_impulses.check_impulses("", "")
+    assert body.between_impulses.autonomous
+    assert [kick.t for kick in body.kicks(0, 4)] == [1.0, 3.0]
+
+
+REFUSED = {
+    "a force": lambda: COMB.force(np.zeros(1), 0.0),
+    "an energy": lambda: COMB.hamiltonian(np.zeros(2), 0.0),
+    "multipliers": lambda: sympflow.floquet_multipliers(COMB, period=PI),
+    "exponents": lambda: sympflow.lyapunov(COMB),
+    "indicators": lambda: sympflow.ensemble(COMB, "verlet", (0, 4), np.zeros((2, 2)), reduce="sali"),
+    "a balance": lambda: sympflow.energy_balance_error(solve(COMB, "verlet", (0, 4), backend="array")),
+    "symplecticity": lambda: sympflow.symplecticity_defect(solve(COMB, "verlet", (0, 4), backend="array")),
+    "a store": lambda: solve(COMB, "verlet", (0, 4), store="never.zarr"),
+    "no end": lambda: solve(COMB, "verlet", (0, math.inf), events=ends),
+    "copies": lambda: solve(COMB, "tao2", (0, 4), events=ends),
+}
+
+
+def ends(s, y):
+    return y[0] - 1e9
+
+
+ends.terminal = True
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_takes_no_impulses_says_so(what):
+    with pytest.raises(
+        ValueError, match=r"^`system` 'custom' has impulses, DiracDelta in H, .*: .*(solve|store|use|end|give)"
+    ):
+        REFUSED[what]()
+
+
+def test_studies_of_impulses_compare_solutions():
+    short = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - q*DiracDelta(t - 1)", time="t", y0=[0, 0], t_span=(0, 3))
+    rows = sympflow.compare(short, ["leapfrog", "kahan_li8"], dt=0.1, backend="array", repeats=1).rows
+    errors = [row.error for row in rows]
+    assert 1e-5 < errors[0] < 1e-2
+    assert errors[1] < 1e-10
+
+
+@pytest.mark.parametrize(
+    ("H", "words"),
+    [
+        (p**2 / 2 + sp.DiracDelta(q - 1), r"`expression` holds DiracDelta\(q1 - 1\), and only impulses"),
+        (p**2 / 2 + q * sp.DiracDelta(t - 1, 1), "a derivative of a delta function"),
+        (p**2 / 2 + q * sp.DiracDelta(t - 1) ** 2, "not linear in a delta function"),
+        (p**2 / 2 + q * sp.exp(sp.DiracDelta(t - 1)), "not linear in a delta function"),
+        (p**2 / 2 + p * q * sp.DiracDelta(t - 1), "without p1"),
+        (p**2 / 2 + sp.DiracDelta(q - t), "and only impulses"),
+    ],
+)
+def test_other_delta_functions_are_refused(H, words):
+    with pytest.raises(ValueError, match=words):
+        HamiltonianSystem.from_sympy(H, **({"time": "t"} if H.has(t) else {}))
+    with pytest.raises(ValueError, match=r"^`force` holds DiracDelta\(q1\)"):
+        sympflow.doubled(HamiltonianSystem.from_sympy("p**2/2 + q**2/2"), ["DiracDelta(q)"])
+
+
+@pytest.mark.parametrize(
+    ("H", "words"),
+    [
+        ("p**2/2 - q*Heaviside(t - 1)*DiracDelta(t - 1)", "a factor that jumps at one: leave that out"),
+        ("p**2/2 - q*DiracDelta((t - 1)**3)", r"a double zero: write it as DiracDelta\(t - a\)"),
+    ],
+)
+def test_impulses_without_a_meaning_are_refused_where_a_run_meets_them(H, words):
+    system = HamiltonianSystem.from_sympy(H, time="t", y0=[0, 0])
+    with pytest.raises(ValueError, match=rf"^`t_span` .* has impulses DiracDelta.*{words}"):
+        solve(system, "leapfrog", (0, 3), backend="array")
+    assert solve(system, "leapfrog", (0, 0.5), backend="array").success
+
+
+# jumps in states -----------------------------------------------------------------------------------
+
+NEAR_LJ = "Piecewise((4*(r**-12 - r**-6) + s, r < 2.5), (0, True))"
+JUMPING = {
+    "step": "p**2/2 + 5*Heaviside(q - 1)",
+    "pieces": "p**2/2 + Piecewise((0, q < 1), (5, True))",
+    "sign": "p**2/2 + sign(q)",
+    "quotient": "p**2/2 + q/abs(q)",
+    "acot": "p**2/2 + acot(q)",
+    "atan": "p**2/2 + atan(1/q)",
+    "angle": "p1**2/2 + p2**2/2 + atan2(q2, q1)",
+    "far": "p**2/2 + sign(q**2 - 3e22)",
+    "small": "p**2/2 + 1e-30*Heaviside(q - 1e-12)",
+    "radius": "p1**2/2 + p2**2/2 + Heaviside(sqrt(q1**2 + q2**2) - 1e11)",
+    "narrow": "p**2/2 + Piecewise((1, (q - 1)**2 < 1e-6), (0, True))",
+    "barrier": "p**2/2 + Piecewise((1, abs(q - 5) < 0.001), (0, True))",
+    "elsewhere": "p1**2/2 + p2**2/2 + Heaviside(q1 - 1)*Max(q2 - 3, 0)",
+    "waves": "p**2/2 + Heaviside(cos(q))",
+    "momentum": "p**2/2 + Heaviside(p - 1) + q**2",
+    "not separable": "p**2*(1 + Heaviside(q))",
+    "floor": p**2 / 2 + sp.floor(q),
+    "ceiling": p**2 / 2 + sp.ceiling(q),
+    "frac": p**2 / 2 + sp.frac(q),
+    "Mod": p**2 / 2 + sp.Mod(q, 2),
+}
+CONTINUOUS = {
+    "wall": "p**2/2 + Max(q - 3, 0)**2",
+    "pieces": "p**2/2 + Piecewise((q**2/2, q < 1), (q - 1/2, True))",
+    "seven figures": "p**2/2 + Piecewise((0.1*q**2, q < 3), (0.9000001, True))",
+    "three": "p**2/2 + Piecewise((0, q < 1), (7.3*(q - 1)**3, q < 2), (7.3*(3*q - 5), True))",
+    "kink": "p**2/2 + Abs(q - 0.1)",
+    "far kink": "p**2/2 + Abs(q**2 - 3e22)/1e22",
+    "one side": "p**2/2 + q**2*Heaviside(q)",
+    "odd": "p**2/2 + sign(q)*q**3",
+    "waves": "p**2/2 + sin(q)*sign(sin(q))",
+    "angle": "p1**2/2 + p2**2/2 + cos(3*atan2(q2, q1))*(q1**2 + q2**2)**2",
+    "ring": "p1**2/2 + p2**2/2 + Max(sqrt(q1**2 + q2**2) - 2, 0)**2",
+    "well": "p**2/2 + Piecewise((1e9*((q - 1)**2 - 1e-6)**2, (q - 1)**2 < 1e-6), (0, True))",
+    "pole": "p**2/2 + 1/abs(q)",
+    "gate": "p**2/2 + exp(-1/q**2)",
+}
+
+
+@pytest.mark.parametrize("name", JUMPING)
+def test_a_potential_that_jumps_is_refused(name):
+    with pytest.raises(ValueError, match=r"^`expression` jumps where .* = 0, at [qp]\d? = .* reflect p\.$"):
+        HamiltonianSystem.from_sympy(JUMPING[name])
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_a_potential_with_kinks_stays(name):
+    HamiltonianSystem.from_sympy(CONTINUOUS[name])
+
+
+def test_jumps_of_lattices_pairs_and_parameters():
+    site = np.linspace(1, 2, 8)
+    refused = (
+        ("`bond` jumps where r - 1 = 0", lambda: HamiltonianSystem.lattice(shape=8, bond="r**2/2 + Heaviside(r - 1)")),
+        (
+            "`onsite` jumps where a - u = 0",
+            lambda: HamiltonianSystem.lattice(
+                shape=8, onsite="Piecewise((1, u < a), (0, True))", fields="u", params={"a": site}
+            ),
+        ),
+        (
+            "`potential` jumps where r - 2.5 = 0",
+            lambda: HamiltonianSystem.pairs(NEAR_LJ, masses=np.ones(3), params={"s": 0.01}),
+        ),
+        (
+            "`expression` jumps",
+            lambda: HamiltonianSystem.from_sympy("p**2/2 + V*Heaviside(q)", params={"V": 0.0}).with_params(V=1.0),
+        ),
+    )
+    for words, make in refused:
+        with pytest.raises(ValueError, match=f"^{words}"):
+            make()
+    HamiltonianSystem.lattice(shape=8, bond="r**2/2 + Max(r - 1, 0)**2")
+    HamiltonianSystem.pairs(NEAR_LJ, masses=np.ones(3), params={"s": 0.016316891136})
+    friction = sympflow.doubled(HamiltonianSystem.from_sympy("p**2/2 + q**2/2"), ["-0.1*sign(p)"])
+    assert friction.ndof == 2
+
+
+# jumps in t ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("drive", "times"),
+    [
+        ((t - 1.03) / sp.Abs(t - 1.03), [1.03]),
+        (sp.acot(t - 1.03), [1.03]),
+        (sp.atan(1 / (t - 1.03)), [1.03]),
+        (sp.atan2(sp.sin(t), sp.cos(t)), [PI]),
+        (sp.sign(sp.cos(t)), [PI / 2, 3 * PI / 2]),
+        (sp.floor(t / sp.Float(1.7)), [1.7, 3.4]),
+        (sp.frac(t / 2), [2, 4]),
+        (sp.Mod(t, 2), [2, 4]),
+        (sp.Piecewise((1, sp.Mod(t, 2) < 0.5), (0, True)), [0.5, 2, 2.5, 4, 4.5]),
+        (sp.Piecewise((1, (t > 1) & (t < 2)), (0, True)), [1, 2]),
+        (sp.Heaviside(t**2 - 4), [2]),
+        (sp.Heaviside(2 * t - 2) - sp.Heaviside(1 - t), [1]),
+        (sp.Heaviside(t - 1) + sp.Heaviside(1 - t), []),
+        ((t - 1.2) * sp.Heaviside(t - 1.2), []),
+        (sp.Abs(sp.sin(t)), []),
+        (sp.sin(t) * sp.sign(sp.sin(t)), []),
+        (sp.Piecewise((t**2, t < 1.3), (1.69 + 2.6 * (t - 1.3), True)), []),
+        (sp.exp(-sp.Abs(t - 2)), []),
+        (sp.cos(t), []),
+    ],
+)
+def test_jumps_are_read_from_the_expression(drive, times):
+    system = driven(drive)
+    np.testing.assert_allclose(system.jump_times(0, 5, 0.01), times, rtol=1e-14)
+    assert system.symbols.jumps == bool(times)
+
+
+def test_jumps_at_states_and_times_of_any_size():
+    wall = HamiltonianSystem.from_sympy(p**2 / 2 + sp.Heaviside(t - 1.03) * sp.Max(q - 3, 0) ** 2, time="t")
+    for _ in range(2):
+        assert wall.jump_times(0, 5, 0.01).tolist() == [1.03]
+    distant = HamiltonianSystem.from_sympy(p**2 / 2 + sp.Heaviside(t - 1.03) * sp.Max(q - 1e9, 0) ** 2, time="t")
+    assert distant.jump_times(0, 5, 0.01).tolist() == [1.03]
+    assert driven(sp.Heaviside(t - 1e6)).symbols.jumps
+    laser = driven(1e-20 * sp.sign(sp.cos(t * 1e15)))
+    np.testing.assert_allclose(laser.jump_times(0, 5e-15, 1e-17), [PI / 2 * 1e-15, 3 * PI / 2 * 1e-15])
+    with pytest.warns(RuntimeWarning, match="jumps within a step, at t = 1.03"):
+        solve(wall, "kahan_li8", (0, 2), [5.0, 0.0], dt=0.1, backend="array")
+
+
+SWITCHED = HamiltonianSystem.from_sympy(
+    p**2 / 2 + q**2 / 2 - q * sp.Piecewise((0, t < 1), (1, True)), time="t", y0=[0.5, 0.1]
+)
+
+
+@pytest.mark.parametrize(
+    ("method", "order"),
+    [
+        ("leapfrog", 2),
+        ("chin4c", 4),
+        ("gauss_legendre4", 4),
+        ("linear_aba864", None),
+        ("verlet", 1),
+        ("rk4", 1),
+        ("tao2", 1),
+        ("tao8", 1),
+        ("impulse", 1),
+        ("mollified_impulse", 1),
+        ("linear_srkn11b", 1),
+        ("strang_parts", 1),
+        ("kahan_li8_parts", 1),
+    ],
+)
+def test_a_method_keeps_its_order_at_the_jumps_that_its_steps_meet_or_warns(method, order):
+    """The measured order is 1 where a force is taken at the ends of steps, and then it is said."""
+    errors = []
+    for n in (8, 16):
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            sol = solve(SWITCHED, method, (0, 3), dt=1 / n, backend="array")
+        since = np.maximum(sol.t - 1, 0)
+        exact = 0.5 * np.cos(sol.t) + 0.1 * np.sin(sol.t) + 1 - np.cos(since)
+        errors.append(np.abs(sol.y[0] - exact).max())
+        assert [str(w.message)[:70] for w in told] == [
+            f"`method` {method!r} takes forces at the ends of its steps, and H of 'custom'"[:70]
+        ] * (order == 1)
+    assert errors[1] < 1e-13 if order is None else math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("drive", "span", "warns"),
+    [
+        (sp.Heaviside(t), (0, 2), True),  # ½ at t = 0
+        (sp.Piecewise((0, t < 0), (1, True)), (0, 2), False),
+        (sp.Piecewise((0, t < 2), (1, True)), (0, 2), True),
+        (sp.Piecewise((0, t < 2), (1, True)), (2, 0), True),
+        (sp.Piecewise((0, t <= 2), (1, True)), (2, 0), False),
+    ],
+)
+def test_the_value_of_a_jump_at_an_end_of_the_run(drive, span, warns):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        solve(driven(drive, y0=[0.5, 0.1]), "verlet", span, dt=0.25, backend="array")
+    assert bool(told) == warns
+
+
+# periods -------------------------------------------------------------------------------------------
+
+SPLINE = CubicSpline(np.linspace(0, 2, 21), np.cos(np.linspace(0, 2 * PI, 21)), bc_type="periodic")
+
+
+@pytest.mark.parametrize(
+    ("V", "period", "other"),
+    [
+        (q * sp.cos(t), 2 * PI, PI),
+        (q * sp.cos(t), 4 * PI, 6.28),
+        (q * sp.cos(t) ** 2, PI, 2.0),
+        (q * (sp.cos(2 * t) + sp.sin(3 * t)), 2 * PI, PI),
+        (sp.cos(q - t), 2 * PI, PI),
+        (q * sp.sign(sp.sin(t)), 2 * PI, PI),
+        (q * sp.Heaviside(sp.sin(2 * sp.pi * t)), 1.0, 0.5),  # an edge at t = 0
+        (q * sp.Piecewise((1, sp.Mod(t, 2) < 1), (0, True)), 2.0, 1.0),
+        (q * (t - sp.floor(t)), 1.0, 0.5),
+        (q * sp.DiracDelta(sp.sin(t)), PI, PI / 2),
+        (sp.Max(q - 1e9, 0) * sp.cos(t) ** 2, PI, 2.0),  # far states
+        (q**2 + 1e-12 * q * sp.cos(t), 2 * PI, 2.0),  # a small drive
+        (q * sp.exp(sp.cos(1e15 * t)), 2e-15 * PI, 1e-15),
+        (q * sp.Symbol("a"), 2.0, 1.0),
+        (q * sp.exp(-((t - 1000) ** 2)), None, 1.0),  # a late pulse
+        (q * sp.Heaviside(t - 100), None, 1.0),
+        (q * t, None, 1.0),
+    ],
+)
+def test_the_period_is_that_of_the_expression(V, period, other):
+    params = {"a": SPLINE} if V.has(sp.Symbol("a")) else None
+    if period is not None:
+        assert HamiltonianSystem.from_sympy(p**2 / 2 + V, time="t", period=period, params=params).period == period
+    with pytest.raises(ValueError, match=r"^`period` .* is none of H"):
+        HamiltonianSystem.from_sympy(p**2 / 2 + V, time="t", period=other, params=params)
+
+
+@pytest.mark.parametrize(
+    ("V", "period", "is_one"),
+    [
+        (lambda s, x: x * np.cos(s), 2 * PI, True),
+        (lambda s, x: x * np.sign(np.sin(s)), 2 * PI, True),
+        (lambda s, x: x * (s % 1.0 < 0.5), 1.0, True),
+        (lambda s, x: x**4 + x * np.cos(1e15 * s), 2e-15 * PI, True),
+        (lambda s, x: x**2 / 2 + 1e-9 * x * np.cos(s), 3.0, False),
+        (lambda s, x: np.maximum(x - 50, 0) * np.cos(s), 3.0, False),
+        (lambda s, x: x * np.exp(-((s - 40) ** 2) / 100), 1.0, False),
+    ],
+)
+def test_the_period_of_functions_is_tried_at_states_and_times_of_all_sizes(V, period, is_one):
+    def H(y, s):
+        return y[..., 1] ** 2 / 2 + V(s, y[..., 0])
+
+    if is_one:
+        check_period(H, 1, None, period)
+        return
+    with pytest.raises(ValueError, match=r"^`period` .* is none of H"):
+        check_period(H, 1, None, period)

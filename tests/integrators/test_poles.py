@@ -1,0 +1,167 @@
+"""Runs over places at which H is infinite or no number, and runs near them."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import sympflow as sf
+from sympflow import HamiltonianSystem
+
+CROSSED = {
+    "-1/Abs(q)": ([1.0, 0.0], 0.01, 2.0),
+    "1/q": ([1.0, -5.0], 0.3, 1.0),
+    "4*(q**-12 - q**-6)": ([3.0, -20.0], 0.3, 1.0),
+    "log(q)": ([1.0, 0.0], 0.03, 2.0),
+    "log(q**2)": ([1.0, 0.0], 0.03, 2.0),
+    "csch(q)**2": ([1.0, -30.0], 0.1, 1.0),
+    "coth(q)": ([1.0, -30.0], 0.1, 1.0),
+    "atanh(q/10)": ([9.0, 8.0], 0.1, 1.0),
+    "1/(1 - cos(q))": ([1.0, -30.0], 0.1, 0.3),
+    "1/(1 + sin(q))/1e6": ([1.0, -30.0], 0.1, 0.3),
+    "1/(q**2 - 1)": ([2.0, -40.0], 0.1, 0.3),
+    "tan(q)": ([0.0, 30.0], 0.2, 0.4),
+    "1/(exp(q) - 1 - q)": ([1.0, -30.0], 0.1, 0.3),
+    "exp(-1/q)": ([1.0, -1.0], 0.1, 2.0),
+    "q**2/2 + 1e-9/q**2": ([1.0, 0.0], 0.07, 2.0),
+}
+"""V, a start, a step, and an end, in which the step leaps over a pole."""
+
+SILENT = {
+    "1/(1 + q**2)": [3.0, -2.0],
+    "sqrt(q**2 + 1e-20)": [1.0, 0.3],
+    "log(1 + q**2)": [1.0, 0.0],
+    "sin(q)/q": [1.0, -3.0],
+    "(cosh(q) - 1)/q**2": [1.0, -3.0],
+    "Abs(q)": [1.0, 0.0],
+    "Abs(q)**1.5": [1.0, 0.0],
+    "-q*cot(q)": [0.5, -1.5],
+    "4*(q**-12 - q**-6)": [1.5, 0.0],
+    "exp(-1/q**2)": [1.0, -3.0],
+    "cbrt(q**2)": [1.0, -3.0],
+}
+"""V that are finite along a run, of which some divisors vanish."""
+
+
+def solved(*arguments, **options):
+    """A solution, and the warnings of poles."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sol = sf.solve(*arguments, **options)
+    return sol, [str(w.message) for w in caught if "infinite" in str(w.message)]
+
+
+def in_units(V, s):
+    """½p² + V(q) with q in units of s, and p in those of 1/s."""
+    return HamiltonianSystem.from_sympy(
+        f"p**2*s**2/2 + {V.replace('q', '(q/s)').replace('s(q/s)rt', 'sqrt')}", params={"s": s}
+    )
+
+
+@pytest.mark.parametrize("V", CROSSED)
+def test_a_run_over_a_pole_ends_before_it(V):
+    (y0, dt, t1), system = CROSSED[V], HamiltonianSystem.from_sympy(f"p**2/2 + {V}")
+    sol, _ = solved(system, "verlet", (0, t1), y0, dt=dt)
+    last, _ = solved(system, "verlet", (0, t1), y0, dt=dt, t_eval=[t1])
+    assert sol.status == last.status == -1
+    assert "where H is infinite or no number: no solution does. Reduce `dt`" in sol.message
+    assert sol.stats["failed_at"] == pytest.approx(last.stats["failed_at"])
+    assert sol.t[-1] == sol.stats["failed_at"]
+    assert last.t.size == 0
+
+
+@pytest.mark.parametrize("V", SILENT)
+@pytest.mark.parametrize("method", ["verlet", "rk45"])
+def test_a_run_over_none_is_left_alone(V, method):
+    sol, told = solved(
+        HamiltonianSystem.from_sympy(f"p**2/2 + {V}"),
+        method,
+        (0, 3),
+        SILENT[V],
+        **{"dt": 0.03} if method == "verlet" else {},
+    )
+    assert sol.success
+    assert not told
+
+
+@pytest.mark.parametrize("s", [1e-10, 1e10])
+@pytest.mark.parametrize("V", ["-1/Abs(q)", "1/(q**2 - 1)", "log(q)", "1/(1 - cos(q))"])
+def test_the_verdict_does_not_depend_on_units(V, s):
+    (q, p), dt, t1 = CROSSED[V]
+    one = sf.solve(in_units(V, 1.0), "verlet", (0, t1), [q, p], dt=dt)
+    other = sf.solve(in_units(V, s), "verlet", (0, t1), [q * s, p / s], dt=dt)
+    assert one.status == other.status == -1
+    assert one.stats["failed_at"] == other.stats["failed_at"]
+
+
+@pytest.mark.parametrize("s", [1e-10, 1.0, 1e10])
+def test_a_centre_that_is_passed_nearly_head_on_is_warned_of(s):
+    kepler = HamiltonianSystem.from_sympy("(p1**2 + p2**2)*s**2/2 - s/sqrt(q1**2 + q2**2)", params={"s": s})
+    _, told = solved(kepler, "verlet", (0, 3), [s, 0, 0, 0.05 / s], dt=0.01)
+    assert len(told) == 1
+    assert "q1**2 + q2**2 = 0" in told[0]
+    _, told = solved(kepler, "verlet", (0, 20), [1.9 * s, 0, 0, np.sqrt(0.1 / 1.9) / s], dt=0.01)
+    assert not told
+
+
+@pytest.mark.parametrize("method", ["tao2", "leapfrog", "rk4", "rk45", "gauss_legendre4", "kahan_li8"])
+def test_every_method_is_looked_after(method):
+    system = HamiltonianSystem.from_sympy("p**2/2 + 1/q", y0=[1, 0])
+    adaptive = method == "rk45"
+    sol, told = solved(
+        system, method, (0, 0.5), [1.0, -30.0], **{"rtol": 1.0, "atol": 1e3} if adaptive else {"dt": 0.5}
+    )
+    assert sol.status == -1 or told
+    assert "Reduce `rtol` and `atol`" in sol.message if adaptive else "Reduce `dt`" in sol.message + "".join(told)
+
+
+def test_of_a_batch_the_trajectories_that_pass_a_pole_end():
+    system = HamiltonianSystem.from_sympy("p**2/2 - 1/Abs(q)")
+    y0 = np.array([[1.0, 0.0], [1.0, 2.0], [-1.0, 0.0], [4.0, 0.0]])
+    sol = sf.solve(system, "verlet", (0, 1.3), y0, dt=0.01)
+    np.testing.assert_array_equal(sol.status, [-1, 0, -1, 0])
+    np.testing.assert_allclose(sol.stats["failed_at"], [1.11, np.nan, 1.11, np.nan])
+    for row in range(4):
+        np.testing.assert_array_equal(np.isfinite(sol.y[row]).all(0), sol.t <= (1.111 if row in (0, 2) else 2))
+    assert "trajectory 0, the first of 2," in sol.message
+    np.testing.assert_allclose(sol.stats["blow_up_time"][0], np.pi / 2**1.5)
+
+
+@pytest.mark.parametrize(
+    ("H", "options", "span"),
+    [
+        ("p**2/2 - 1/Abs(q)", {}, (0, -2)),
+        ("p**2/2 - 1/Abs(q)", {"damping": 0.1}, (0, 2)),
+        ("p**2/2 - 1/Abs(q) + q*cos(t)/10", {"time": "t"}, (0, 2)),
+        ("p**2/2 + q/(t - 1)", {"time": "t"}, (0, 2)),
+        ("p**2/2 - 1/Abs(q)", {}, (5, 7)),
+    ],
+)
+def test_backwards_damped_and_driven(H, options, span):
+    sol, _ = solved(HamiltonianSystem.from_sympy(H, **options), "verlet", span, [1.0, 0.0], dt=0.03, t_eval=[span[1]])
+    assert sol.status == -1
+    assert "where H is infinite" in sol.message
+
+
+def test_where_the_way_over_a_divisor_of_zero_is_finite_a_run_goes_on():
+    pendulum = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/(2*sin(q1)**2) - cos(q1)")
+    sol, told = solved(pendulum, "gauss_legendre4", (0, 20), [1.0, 0, 0, 0], dt=0.05)
+    assert sol.success
+    assert not told
+    assert np.sign(sol.y[0]).min() == -1
+    assert sf.solve(pendulum, "gauss_legendre4", (0, 1), [1.0, 0, -20, 1e-3], dt=0.2).status == -1
+
+
+def test_two_bodies_on_a_line_do_not_pass_each_other():
+    system = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + 1/(q1 - q2)**2")
+    sol = sf.solve(system, "verlet", (0, 1), [-1, 1, 30, -20], dt=0.1)
+    assert sol.status == -1
+    assert "passed q1 - q2 = 0" in sol.message
+
+
+def test_a_start_without_h_is_told():
+    system = HamiltonianSystem.from_sympy("p**2/2 + log(q)")
+    sol = sf.solve(system, "verlet", (0, 1), [[1.0, 0.0], [-1.0, 0.0]], dt=0.03)
+    np.testing.assert_array_equal(sol.status, [0, -1])
+    assert sol.message == "H of trajectory 1 is infinite, or no number, at `y0`: start elsewhere."
+    assert sf.solve(system, "verlet", (0, 1), [-1.0, 0.0], dt=0.03, diagnose=False).success
