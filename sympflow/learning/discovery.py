@@ -401,7 +401,7 @@ class _Search:
         self.doubt = self._doubted()
         if self.doubt is not None:
             chosen = self._first(DOUBTED, SKETCHED)
-            record = self._record(chosen, self._met(chosen))
+            record = self._record(chosen, [chosen])
             if not (record.explains or record.unseen):
                 return record
             self.doubt = None

@@ -749,7 +749,7 @@ class Search:
     def unseen(self) -> list[Any]:
         """Functions that are the same along all orbits, and that the chosen model could depend on in any way."""
         model, d, states = self.winner[0].model, self.data.ndof, self.final.states
-        if not np.isfinite(states).all():
+        if not np.isfinite(states).all() or (self.final.sigma > SILENT * self.data.scales).any():
             return []
         q, p = range(d), range(d, 2 * d)
         groups: list[tuple[range, Part | None]] = []

@@ -28,6 +28,8 @@ RADIUS = 0.1
 def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part: Part | None = None) -> list[sp.Expr]:
     """Functions of some coordinates that are the same at all states: linear ones, or else quadratic ones.
 
+    Of q and p together only linear ones: of few orbits some sum of the integrals of motion always has one value.
+
     Parameters
     ----------
     states : ndarray of shape (n, 2d)
@@ -46,7 +48,7 @@ def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part:
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-9 * np.abs(x).max(axis=1) + np.finfo(float).tiny)
     if part is not None:
         return _same(part, x, errors[[*columns]], names, np.zeros(len(x)), half)
-    for degree in (1, 2) if 1 < len(x) <= MOST_SQUARES else (1,):
+    for degree in (1, 2) if 1 < len(x) <= min(d, MOST_SQUARES) else (1,):
         found = _same(Polynomial.up_to(degree, "y", half), x, errors[[*columns]], names, middle, half)
         if found:
             return found

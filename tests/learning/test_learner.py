@@ -437,6 +437,7 @@ def test_friction_below_0_is_0_and_one_that_is_no_chance_is_told(clean):
     np.testing.assert_allclose(without_growth(shifted).theta, conservative, rtol=0.02, atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_flow_of_data_that_do_not_tell_h_is_of_these_data():
     """Circular orbits of one radius: V may be any function with one slope there."""
     t = np.linspace(0, 6, 31)
