@@ -24,7 +24,8 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import build, check_applies
-from sympflow.kernels.modules import at_most, compiling_alone
+from sympflow.kernels.modules import compiling_alone
+from sympflow.kernels.threads import at_most
 from sympflow.solver import check_backend, check_own_parameters
 from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
 

@@ -16,9 +16,10 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels import terms
 from sympflow.kernels.codegen import statements
-from sympflow.kernels.modules import constants_source, given, load_algebra, template
+from sympflow.kernels.modules import constants_source, load_algebra, template
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
 from sympflow.kernels.terms import is_large
+from sympflow.kernels.threads import given
 
 __all__ = ["ImplicitKernel", "implicit_kernel"]
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
+from sympflow.kernels.modules import OPTIONS, load_module, template
+from sympflow.kernels.threads import run_rows
 
 __all__ = ["BENDING", "NetworkTangents", "TrainedNetwork"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.carry import Carry
-from sympflow.kernels.modules import given, run_one, run_rows
+from sympflow.kernels.threads import given, run_one, run_rows
 
 __all__ = ["Carry", "Kernel", "Run", "Steps", "run_state", "run_states"]
 

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sympflow.kernels.modules import NEVER, given, threads_for
 from sympflow.kernels.protocol import NOTHING
+from sympflow.kernels.threads import NEVER, given, threads_for
 
 __all__ = ["SizedLoops", "Team"]
 

@@ -23,9 +23,9 @@ from sympflow.kernels.loop_functions import (
     symbolic_loops,
     takes_values,
 )
-from sympflow.kernels.modules import given
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.stages import StageTable, run_table, step_table
+from sympflow.kernels.threads import given
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:

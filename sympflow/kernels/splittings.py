@@ -7,7 +7,6 @@ of many in lanes, maps, single steps.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +20,8 @@ from sympflow.compiler.functions import times
 from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
-from sympflow.kernels.runs import Numbers, map_function, run_function, step_function
+from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
@@ -30,10 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["SplittingCode"]
 
-LANES = 16
-"""Trajectories side by side: of two registers or four, so that one need not wait for the other."""
 MOST_TABLES = 64  # that are kept
-AT_ONCE = 4096  # trajectories with tables of their own
 EARLY = -4  # when momenta are known before the positions, in cycles
 
 
@@ -228,8 +225,8 @@ def _slope_of_monomial(powers: Sequence[int], i: int, q: Sequence[Any]) -> Any:
     return value
 
 
-class SplittingCode:
-    """The compiled functions of splitting schemes on one symbolic system: see `LoopFunctions`.
+class SplittingCode(Rollouts):
+    """The compiled functions of splitting schemes on one symbolic system.
 
     Parameters
     ----------
@@ -238,12 +235,9 @@ class SplittingCode:
 
     def __init__(self, splitting: Splitting) -> None:
         self._splitting = splitting
-        self._lock = threading.RLock()
-        self._functions: dict[Any, Callable[..., None]] = {}
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         symbols = splitting.symbols
-        self._n_out = 2 * symbols.ndof
-        self._n_values = self._n_out * (1 + splitting.compensated)
+        super().__init__(2 * symbols.ndof * (1 + splitting.compensated), 2 * symbols.ndof)
         self._own = len(symbols.parameters)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -254,11 +248,11 @@ class SplittingCode:
         return self._splitting.kinds()
 
     @cached_property
-    def _size(self) -> int:
+    def size(self) -> int:
         """Numbers of a column that the code reads."""
         return max(len(kind.table.outputs) for kind in self._kinds)
 
-    def _stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+    def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """A kick and a drift, of the kind that a column has."""
         if len(self._kinds) == 1:
             return self._executed(0, values, numbers)
@@ -274,20 +268,11 @@ class SplittingCode:
         table, body = self._kinds[k]
         return body(*values, *[numbers(i) for i in range(len(table.outputs))])
 
-    def _function(self, name: str, width: int) -> Callable[..., None]:
-        """The function of a name: "run", "run own", "map", "step" or "step own"."""
-        found = self._functions.get((name, width))
-        if found is None:
-            with self._lock:
-                found = self._functions[name, width] = self._made(name, width)
-        return found
-
-    def _made(self, name: str, width: int) -> Callable[..., None]:
+    def made(self, name: str, width: int) -> Callable[..., None]:
+        """Compile the function of a name: "step" and "step own" too."""
         what, _, own = name.partition(" ")
-        if what == "map":
-            return map_function(self._n_values, self._n_out, self._size, self._stage, width)
-        if what == "run":
-            return run_function(self._n_values, self._n_out, self._size, self._stage, width, bool(own))
+        if what != "step":
+            return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
         powers = [1, *kick.powers, *(0 for _ in range(self._own))]
         last = len(self._kinds) - 1
@@ -296,12 +281,12 @@ class SplittingCode:
             return self._executed(last, values, numbers)
 
         return step_function(
-            self._n_values, self._n_out, powers, self._own if own else 0, self._kinds[last].table, stage, width
+            self.n_values, self.n_out, powers, self._own if own else 0, self._kinds[last].table, stage, width
         )
 
     # tables -------------------------------------------------------------------------------------------------------
 
-    def _prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The numbers (m, size) that the code reads, of a table (n, m) of given ones, and the kinds (m,) of columns."""
         key = table.tobytes()
         found = self._tables.get(key)
@@ -320,7 +305,7 @@ class SplittingCode:
 
     def _entries(self, table: Any, kinds: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
         """The numbers (m, size, *shape) of rows, each (m,) or (m, *shape)."""
-        entries = np.zeros((len(kinds), self._size, *shape))
+        entries = np.zeros((len(kinds), self.size, *shape))
         for k, kind in enumerate(self._kinds):
             with np.errstate(all="ignore"):
                 rows = kind.table(*table)
@@ -328,177 +313,21 @@ class SplittingCode:
                 entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
         return entries
 
-    def _own_tables(self, table: np.ndarray, values: np.ndarray, kinds: np.ndarray, width: int) -> np.ndarray:
-        """Tables of trajectories with their own values (N, n) of the parameters, `width` of them side by side."""
-        n = len(table) - self._own
+    def own_columns(self, table: np.ndarray, values: np.ndarray, width: int) -> Columns:
+        """The columns of trajectories with their own values (N, n) of the parameters."""
+        kinds, n = self._kinds_of(table), len(table) - self._own
         rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
         entries = self._entries(rows, kinds, (len(values),))
         groups = -(-len(values) // width)
         full = np.concatenate([entries, np.repeat(entries[..., -1:], groups * width - len(values), axis=-1)], axis=-1)
-        return np.ascontiguousarray(full.reshape(*full.shape[:2], groups, width).transpose(2, 0, 1, 3))
-
-    # the functions of `LoopFunctions` -----------------------------------------------------------------------------
-
-    def rollout(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool = True,
-    ) -> int:
-        """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``."""
-        finite = np.empty(1, dtype=np.int64)
-        self._run(table, y0[None], n_steps, save, out[None], finite, stop, first, running[None], closed, 1)
-        return int(finite[0])
-
-    def rollout_batch(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool = True,
-    ) -> None:
-        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it."""
-        rest = n_steps, save, stop, first, closed
-        if len(y0) == 1 or y0.shape[1] > self._n_out:
-            size = AT_ONCE if y0.shape[1] > self._n_out else 1
-            for k in range(0, len(y0), size):
-                rows = slice(k, k + size)
-                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], *rest)
-            return
-        self._some(table, y0, out, n_finite, running, *rest)
-
-    def _some(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        running: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        closed: bool,
-    ) -> None:
-        """Rows side by side; those that end before the last step once more, by themselves, to find that end."""
-        before = running.copy() if first > 0 else running
-        rest = stop, first
-        width = LANES if len(y0) > 1 else 1
-        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width)
-        for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
-            one = slice(i, i + 1)
-            if len(before):
-                running[i] = before[i]
-            self._run(table, y0[one], n_steps, save, out[one], n_finite[one], *rest, running[one], closed, 1)
-
-    def _run(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool,
-        width: int,
-    ) -> None:
-        states = y0[:, : self._n_out]
-        if y0.shape[1] > self._n_out:
-            kinds = self._kinds_of(table)
-            entries = self._own_tables(table, y0[:, self._n_out :], kinds, width)
-            run = self._function("run own", width)
-        else:
-            entries, kinds = self._prepared(table)
-            run = self._function("run", width)
-        begun = int(np.searchsorted(save, 0, side="right")) if len(save) and save[0] <= 0 else 0
-        if begun:
-            out[:, :begun] = states[:, None]
-        later, outputs = save[begun:], out
-        if begun or not out.flags.c_contiguous:
-            outputs = np.empty((len(y0), len(later), self._n_out))
-        if first > 0:
-            start = np.ascontiguousarray(running)
-        elif self._n_values > self._n_out:
-            start = np.concatenate([states, np.zeros_like(states)], axis=1)
-        else:
-            start = np.ascontiguousarray(states)
-        keeps = running.shape[-1] > 0
-        left = np.empty((len(y0), self._n_values)) if keeps else running
-        arrays = entries, kinds, start, later, outputs, n_finite, left, stop
-        table_at, kinds_at, start_at, save_at, out_at, finite_at, left_at, stop_at = (x.ctypes.data for x in arrays)
-        lengths = len(kinds) - 2, int(closed)
-        run(
-            *(table_at, kinds_at, *lengths, start_at, len(y0), first, n_steps, save_at, len(later), out_at),
-            *(finite_at, left_at, int(keeps), stop_at),
-        )
-        if outputs is not out:
-            out[:, begun:] = outputs
-        if keeps:
-            running[:] = left
-        if width == 1:
-            for i in np.flatnonzero(n_finite < n_steps):
-                out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
-                if keeps:
-                    running[i] = np.nan
-
-    def rollout_processed(
-        self, before: np.ndarray, run: np.ndarray, after: np.ndarray, y0: np.ndarray, *rest: Any
-    ) -> int:
-        """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
-        n_steps, save, out, stop, first, running = rest
-        finite = np.empty(1, dtype=np.int64)
-        rows = n_steps, save, out[None], finite, stop, first, running[None]
-        self.rollout_processed_batch(before, run, after, y0[None], *rows)
-        return int(finite[0])
-
-    def rollout_processed_batch(
-        self, before: np.ndarray, run: np.ndarray, after: np.ndarray, y0: np.ndarray, *rest: Any
-    ) -> None:
-        """The same of every row of `y0` (N, 2d)."""
-        n_steps, save, out, n_finite, stop, first, running = rest
-        start = y0
-        if first == 0:
-            start = np.empty_like(y0)
-            self._map(before, y0, start)
-        self.rollout_batch(run, start, n_steps, save, out, n_finite, stop, first, running, False)
-        self._map(after, out.reshape(-1, self._n_out), out.reshape(-1, self._n_out))
-        out[:, : np.searchsorted(save, 0, side="right")] = y0[:, None]
-        good = np.isfinite(out).all(-1)
-        for i in np.flatnonzero(~good.all(-1)):
-            row = int(np.argmin(good[i]))
-            if save[row] <= n_finite[i]:
-                out[i, row:], n_finite[i] = np.nan, save[row] - 1
-
-    def _map(self, table: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-        if not len(y):
-            return
-        entries, kinds = self._prepared(table)
-        function = self._function("map", 1 if len(y) == 1 else LANES)
-        arrays = entries, kinds, y, out
-        table_at, kinds_at, rows_at, out_at = (x.ctypes.data for x in arrays)
-        function(table_at, kinds_at, len(kinds), kinds_at, 1, rows_at, len(y), out_at)
+        return np.ascontiguousarray(full.reshape(*full.shape[:2], groups, width).transpose(2, 0, 1, 3)), kinds
 
     def step_rows(
         self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
     ) -> None:
         """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
-        own = " own" if y.shape[1] > self._n_out else ""
-        step = self._function("step" + own, 1 if len(y) == 1 else LANES)
+        own = " own" if y.shape[1] > self.n_out else ""
+        step = self.function("step" + own, 1 if len(y) == 1 else self.lanes)
         table = np.ascontiguousarray(table)
         table_at, x_at, h_at, t_at, rows_at, out_at = (a.ctypes.data for a in (table, x, h, t, y, out))
         step(table_at, table.shape[1], table.shape[2], x_at, h_at, t_at, rows_at, len(y), out_at)

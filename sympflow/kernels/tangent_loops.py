@@ -12,9 +12,10 @@ import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.loop_functions import damped_drift, shared_by_lanes, takes_values
-from sympflow.kernels.modules import load_algebra, run_rows
+from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.splitting_loops import damped_table, splitting_loops
 from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source, two_stages_source
+from sympflow.kernels.threads import run_rows
 from sympflow.schemes import Scheme
 
 if TYPE_CHECKING:

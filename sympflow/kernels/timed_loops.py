@@ -13,9 +13,10 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import algebra_source, statements
 from sympflow.kernels.loop_functions import symbolic_module
-from sympflow.kernels.modules import load_algebra, run_one, run_rows
+from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.stages import run_table, step_table
 from sympflow.kernels.terms import is_large
+from sympflow.kernels.threads import run_one, run_rows
 from sympflow.schemes import Scheme
 
 __all__ = ["lifted_rows", "reach_times"]

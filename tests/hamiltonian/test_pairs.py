@@ -9,8 +9,8 @@ import torch
 
 from sympflow import HamiltonianSystem, solve, splitting_method
 from sympflow.kernels import pair_forces
-from sympflow.kernels.modules import at_most
 from sympflow.kernels.pair_forces import PairForces
+from sympflow.kernels.threads import at_most
 from sympflow.schemes import SCHEMES
 from sympflow.training.table_step import ArrayForces
 
