@@ -284,10 +284,12 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     outcome.stats["wall_time"] = time.perf_counter() - start
     passed = False
     if system.poles is not None and problem.diagnosed and problem.letters is None and problem.store is None:
-        from sympflow.integrators.diagnosis import note_poles
+        from sympflow.integrators.diagnosis import note_poles, warn_of_cancelling
 
         if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
             passed = note_poles(outcome, integrator, problem, stacklevel=4)
+        if stopped is None and readable(outcome.y):
+            warn_of_cancelling(outcome, problem, stacklevel=4)
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
     if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
         from sympflow.integrators.diagnosis import note_singularities

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakSet
 
 import numpy as np
 
@@ -32,6 +33,12 @@ H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
 
 
+FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
+"""The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
+that share of errors there is told."""
+_TOLD: WeakSet[Any] = WeakSet()
+
+
 class Passage(NamedTuple):
     """The times between which a trajectory passed a pole, its column, and True if no solution does."""
 
@@ -54,7 +61,7 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
     Returns True if the run, or a trajectory of it, was ended.
     """
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
-    if poles is None or not n:
+    if poles is None or not poles.watched or not n:
         return False
     starts = to_numpy(problem.y0).reshape(-1, width)
     outputs = to_numpy(outcome.y).reshape(n, -1, width)
@@ -93,6 +100,35 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
             stacklevel=stacklevel + 1,
         )
     return bool(certain)
+
+
+def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> None:
+    """Warn, once for a system, of a run about a value of q or p near which terms of H cancel until digits are lost."""
+    poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
+    if poles is None or not poles.cancelling or poles in _TOLD:
+        return
+    starts = to_numpy(problem.y0).reshape(-1, width)
+    every = slice(None, None, max(1, n // LOOKED_AT))
+    y = np.concatenate([starts[None], to_numpy(outcome.y).reshape(n, len(starts), width)[every]])
+    for each in poles.cancelling:
+        x = y[..., each.column] - each.at
+        about = np.fmin.reduce(x) <= 0
+        about &= np.fmax.reduce(x) >= 0
+        if not about.any():
+            continue
+        reach = float(np.fmax.reduce(np.abs(x[:, about]), axis=None))
+        steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
+        if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, y[:, about, each.column].ravel()) > LOST_DIGITS:
+            continue
+        _TOLD.add(poles)
+        warnings.warn(
+            f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in "
+            "many digits, and at it no number. Write them by sinc, which is sin(x)/x without that, or near it by their "
+            "series, in a Piecewise.",
+            RuntimeWarning,
+            stacklevel=stacklevel + 1,
+        )
+        return
 
 
 def _look(system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
