@@ -7,7 +7,9 @@ With directions e_j of x and the velocity ẋ at the rate 1 of t, dots for deriv
 
 The reverse sweep of w · ż_j meets r for ż_j, ṙ for z_j, A for ż and C for z; that of w · z_j meets r for z_j and A for
 z. A state is moved by differences between t and 0. The derivatives P of what is fitted by the state after a layer, and
-M by its velocity, are pulled back from layer to layer. Points are the lanes of registers, all else is loops over memory.
+M by its velocity, are pulled back from layer to layer.
+
+Points are the lanes of registers, all else is loops over memory.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -201,7 +204,7 @@ class _Sizes(NamedTuple):
         h, (K, k, w, b, W, _) = self.h, self.starts
         rows = [K + np.arange(widths[0] * self.inputs), k + np.arange(widths[0]), w + np.arange(widths[-1])]
         rows += [b + level * h + np.arange(width) for level, width in enumerate(widths)]
-        for level, (below, above) in enumerate(zip(widths[:-1], widths[1:], strict=True)):
+        for level, (below, above) in enumerate(pairwise(widths)):
             rows.append((W + (level * h + np.arange(above)[:, None]) * h + np.arange(below)).ravel())
         return np.concatenate(rows)
 
