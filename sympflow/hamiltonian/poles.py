@@ -95,7 +95,8 @@ class SymbolicPoles:
         if not self._places:
             return
         T = symbols.T if symbols.separable else sp.Add(*[sp.Abs(s * sp.diff(symbols.H, s)) for s in letters])
-        self._look = symbols.evaluated("cells", [*(place.cell for place, _ in self._places), symbols.H, T])
+        cells = [sp.S.Zero if place.g.is_nonnegative else place.cell for place, _ in self._places]
+        self._look = symbols.evaluated("cells", [*cells, symbols.H, T])
         self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
 
     def __bool__(self) -> bool:

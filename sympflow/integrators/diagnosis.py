@@ -70,11 +70,12 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
     t = np.concatenate([[problem.t0], outcome.t[every][::-1]])
     with np.errstate(all="ignore"):
         try:
-            odd, scale = _look(problem.system, poles, t, y)
+            looked = _look(problem.system, poles, t, y)
         except TypeError:  # a function that takes no arrays
             return False
-        if not odd.any():
+        if looked is None:
             return False
+        odd, scale = looked
         held = (np.atleast_1d(np.asarray(outcome.status)) >= 0).reshape(-1)
         rows = np.flatnonzero(odd.any(0) & held)
         found: dict[int, Passage] = {}
@@ -118,7 +119,8 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> N
             continue
         reach = float(np.fmax.reduce(np.abs(x[:, about]), axis=None))
         steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
-        if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, y[:, about, each.column].ravel()) > LOST_DIGITS:
+        visited = y[:, about, each.column].ravel()
+        if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, visited) > LOST_DIGITS:
             continue
         _TOLD.add(poles)
         warnings.warn(
@@ -131,12 +133,16 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> N
         return
 
 
-def _look(system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _look(
+    system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
     """True for states y (n, N, 2d) with signs or H unlike the first ones, and for a start without H: (n, N).
 
-    Also the largest kinetic energy, or change of the potential one, beside which H is judged: (N,).
+    Also the largest kinetic energy, or change of the potential one, beside which H is judged: (N,). None if there is no such state.
     """
     cells, H, T = poles.look(y, t[:, None])
+    if T is not None and (cells == cells[0]).all() and (H.max(0) - H.min(0) <= OFF * np.abs(T).max(0)).all():
+        return None
     odd = (cells != cells[0]).any(-1)
     scale = np.full(y.shape[1], np.inf)
     if T is not None:
@@ -144,7 +150,7 @@ def _look(system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray)
         scale = np.fmax.reduce(np.maximum(np.abs(T), np.abs(V - V[0])), axis=0)
         odd |= ~(np.abs(H - H[0]) <= (OFF if system.conservative and system.autonomous else FAR_OFF) * scale)
     odd[0] = ~np.isfinite(H[0])
-    return odd, scale
+    return (odd, scale) if odd.any() else None
 
 
 def _steps_of(

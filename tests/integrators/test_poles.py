@@ -177,7 +177,7 @@ CANCELLING = {
     "exp(-1/q**2)": ([1.0, -3.0], 10_000, False),
     "csch(q) + 1/q": ([1.0, 1.0], 1000, False),
 }
-"""V, a start, the steps in a time of 10, and True if its terms cancel there until the force has less than nine digits."""
+"""V, a start, the steps in a time of 10, and True if the force loses digits, as its terms cancel there."""
 
 
 @pytest.mark.parametrize("V", CANCELLING)
