@@ -12,7 +12,8 @@ from safetensors.torch import load_file, save_file
 import sympflow
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, solve, systems
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
-from sympflow.flow.files import KEY, SUM, load, text_checksum
+from sympflow.flow.files import load
+from sympflow.flow.records import KEY, SUM, text_checksum
 from sympflow.flow.shipped import named, shipped
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
