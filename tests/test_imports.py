@@ -32,7 +32,7 @@ def test_a_verlet_solve_loads_no_torch(backend):
     assert not loaded_after(code) & {"torch", "matplotlib", "torchdiffeq", "safetensors"}
 
 
-@pytest.mark.parametrize("scene", ["henon_heiles", "pendulum", "fput_beta", "duffing"])
+@pytest.mark.parametrize("scene", ["henon_heiles", "pendulum", "fput_beta", "driven_pendulum"])
 def test_a_primed_flow_that_ships_loads_no_torch(scene):
     code = (
         "import sympflow\n"

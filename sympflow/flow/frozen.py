@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
+from sympflow.arrays import untransformed
 from sympflow.flow.known import KnownFlow
 from sympflow.flow.records import Description, Refused, numbers_checksum, read
 from sympflow.flow.tables import PrimedShape, Tables, free_numbers, substeps_of
@@ -182,7 +183,8 @@ class FrozenFlow(PrimedKnown):
         """The flow itself, a module of torch."""
         from sympflow.flow.files import load
 
-        return load(self.path, system=self._system)
+        with untransformed():  # what is kept must not be a tensor of a transform that ends
+            return load(self.path, system=self._system)
 
     def step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
         return self.thawed.step_of_arrays(h, y, t)

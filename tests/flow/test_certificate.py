@@ -167,7 +167,7 @@ def test_the_measured_errors_are_those_of_solve():
 
 def test_long_runs_go_piece_by_piece(monkeypatch):
     whole = primed().certificate(HH, **QUICK)
-    monkeypatch.setattr("sympflow.flow.certificate.SAVED_VALUES", 20 * 4 * 7)
+    monkeypatch.setattr("sympflow.flow.certification.SAVED_VALUES", 20 * 4 * 7)
     pieces = primed().certificate(HH, **QUICK)
     assert pieces.left == whole.left
     # the rounding of a chaotic orbit differs where a piece begins
