@@ -20,7 +20,6 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:
-    from sympflow.flow.primed import PrimedFlow
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.kernels.flow_loops import PrimedFlowKernel
 
@@ -179,7 +178,7 @@ class FrozenFlow(PrimedKnown):
         return self._system
 
     @cached_property
-    def thawed(self) -> PrimedFlow:
+    def thawed(self) -> Any:
         """The flow itself, a module of torch."""
         from sympflow.flow.files import load
 
