@@ -11,7 +11,7 @@ import torch
 from watchdog import watched
 
 from sympflow import HamiltonianSystem, SympFlow, load, solve, systems
-from sympflow.flow.files import KEY, SUM, text_checksum
+from sympflow.flow.records import KEY, SUM, text_checksum
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.removable import sinc
 
