@@ -138,7 +138,8 @@ def _look(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """True for states y (n, N, 2d) with signs or H unlike the first ones, and for a start without H: (n, N).
 
-    Also the largest kinetic energy, or change of the potential one, beside which H is judged: (N,). None if there is no such state.
+    Also the largest kinetic energy, or change of the potential one, beside which H is judged: (N,).
+    None if there is no such state.
     """
     cells, H, T = poles.look(y, t[:, None])
     if T is not None and (cells == cells[0]).all() and (H.max(0) - H.min(0) <= OFF * np.abs(T).max(0)).all():
