@@ -56,9 +56,13 @@ class Cancelling(NamedTuple):
 class Poles(Protocol):
     """The places at which H of a system may be infinite, in columns."""
 
-    cancelling: Sequence[Cancelling]
-    watched: bool
-    """False if H has cancelling terms alone."""
+    @property
+    def cancelling(self) -> Sequence[Cancelling]:
+        """Terms of H that cancel where each is infinite."""
+
+    @property
+    def watched(self) -> bool:
+        """False if H has cancelling terms alone."""
 
     def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Numbers (..., m) that differ on the two sides of a place, H and T: states (..., 2d), times (...).
@@ -154,13 +158,13 @@ class LatticePoles:
 
     def __init__(self, lattice: _Lattice) -> None:
         self._lattice = lattice
-        self.cancelling: list[Cancelling] = []
 
     def __bool__(self) -> bool:
         lattice = self._lattice
         terms = [(lattice.U, lattice.x), *((V, lattice.r) for V in lattice.bonds.values())]
         return any(places(f, x) for f, x in terms)
 
+    cancelling: Sequence[Cancelling] = ()
     watched = True
 
     def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, None]:
