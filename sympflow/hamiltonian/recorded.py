@@ -9,7 +9,7 @@ import sympy as sp
 
 from sympflow.compiler.functions import apply, where
 
-__all__ = ["NotRecorded", "can_be_recorded", "evaluator"]
+__all__ = ["NotRecorded", "check_recorded", "evaluator"]
 
 
 class NotRecorded(ValueError):
@@ -56,11 +56,22 @@ def _heaviside(x: Any, at_zero: Any = 0.5) -> Any:
     return where(apply("eq", x, 0.0), at_zero, where(x > 0.0, 1.0, 0.0))
 
 
-def can_be_recorded(f: sp.Expr) -> bool:
-    """True if `evaluator` has a rule for every function in an expression."""
-    functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
+def check_recorded(*expressions: sp.Expr) -> None:
+    """Refuse expressions with a function for which `evaluator` has no rule.
+
+    Raises
+    ------
+    NotRecorded
+        A ValueError, about the system.
+    """
     known = (sp.Piecewise, sp.Heaviside, sp.logic.boolalg.BooleanAtom)
-    return all(a.func in _RULES or isinstance(a, known) for a in functions)
+    for f in expressions:
+        functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
+        for a in functions:
+            if a.func not in _RULES and not isinstance(a, known):
+                raise NotRecorded(
+                    f"`system` has the term {a}, for which there is no compiled function: use backend='array'."
+                )
 
 
 def evaluator(numbers: Mapping[sp.Symbol, Any]) -> Callable[[sp.Expr], Any]:

@@ -214,6 +214,12 @@ class Rollouts:
             if save[row] <= n_finite[i]:
                 out[i, row:], n_finite[i] = np.nan, save[row] - 1
 
+    def step_rows(
+        self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
+        raise NotImplementedError
+
     def mapped(self, table: Any, y: np.ndarray, out: np.ndarray) -> None:
         """All columns of a table, applied to rows `y` (N, 2d); `out` may be `y`."""
         if not len(y):

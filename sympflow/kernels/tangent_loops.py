@@ -11,10 +11,19 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.loop_functions import damped_drift, shared_by_lanes, takes_values
+from sympflow.kernels.loop_functions import shared_by_lanes
 from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.splitting_loops import damped_table, splitting_loops
-from sympflow.kernels.stages import DampedDrift, kicks_of, lanes_source, run_table, stages_source, two_stages_source
+from sympflow.kernels.stages import (
+    DampedDrift,
+    damped_drift,
+    kicks_of,
+    lanes_source,
+    run_table,
+    stages_source,
+    takes_values,
+    two_stages_source,
+)
 from sympflow.kernels.threads import run_rows
 from sympflow.schemes import Scheme
 
