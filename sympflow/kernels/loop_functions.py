@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.sized_loops import SizedLoops
     from sympflow.kernels.stage_times import Driving
 
+
 @dataclass(frozen=True)
 class LoopFunctions:
     """The compiled functions of one variant (what kicks have, with or without compensated sums)."""

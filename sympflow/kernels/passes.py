@@ -9,9 +9,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.compiler.control import BOOL, INT, POINTER, Module
-from sympflow.compiler.machine import host
-from sympflow.kernels.runs import Lanes, finished
+from sympflow.compiler.control import BOOL, INT, POINTER, Module, Value
+from sympflow.compiler.machine import address, host
+from sympflow.kernels.runs import Lanes, finished, groups
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.domain import Box, EnergySublevel
@@ -50,7 +50,7 @@ def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: 
     if within is None:
         return False
     rows, inside = np.ascontiguousarray(states), np.zeros(1, dtype=np.int64)
-    within(rows.ctypes.data, rows.size // width, low.ctypes.data, high.ctypes.data, inside.ctypes.data)
+    within(address(rows), rows.size // width, address(low), address(high), address(inside))
     return bool(inside[0])
 
 
@@ -79,7 +79,7 @@ def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..
     rows, n_rows, low, high, result = code.arguments
     lanes = Lanes(code, n, LANES)
     inside = code.variable(code.constant(1, BOOL))
-    with code.over(lanes.groups(n_rows)) as group:
+    with code.over(groups(code, n_rows, LANES)) as group:
         x = lanes.loaded(rows, group * LANES, n_rows)
         least, most = ([code.load(bound, i) for i in range(n if symbols is None else n + 2)] for bound in (low, high))
         outside = [~((a <= value) & (value <= b)) for a, value, b in zip(least, x, most, strict=False)]
@@ -87,10 +87,10 @@ def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..
             from sympflow.hamiltonian.recorded import evaluator
 
             H = evaluator(dict(zip(symbols.q + symbols.p, x, strict=True)))(symbols.H)
-            outside.append(~((least[n] < H) & (H < most[n])))
+            outside.append(~((least[n] < H) & (most[n] > H)))
         if symbols is not None and n == 4:
             L = abs(x[0] * x[3] - x[1] * x[2])
-            outside.append(~((least[5] <= L) & (L <= most[5])))
+            outside.append(~((least[5] <= L) & (most[5] >= L)))
         any_out = outside[0]
         for each in outside[1:]:
             any_out = any_out | each
@@ -104,7 +104,7 @@ def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
     rows, matrix = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(A)
     out = np.empty_like(rows)
     n = rows.shape[-1]
-    _products_function()(matrix.ctypes.data, n, rows.ctypes.data, rows.size // n, out.ctypes.data)
+    _products_function()(address(matrix), n, address(rows), rows.size // n, address(out))
     return out
 
 
@@ -116,7 +116,7 @@ def _products_function() -> Callable[..., None]:
     with code.over(n_rows) as i, code.over(n) as j:
         row, start = code.at(A, j * n), code.at(x, i * n)
 
-        def added(k, total):
+        def added(k: Value, total: list[Value], row: Value = row, start: Value = start) -> list[Value]:
             return [total[0] + code.load(row, k) * code.load(start, k)]
 
         (total,) = code.loop(n, [code.constant(0.0)], added)

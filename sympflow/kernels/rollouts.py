@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import Value
+from sympflow.compiler.machine import address
 from sympflow.kernels.runs import BLOCK, Numbers, map_function, run_function
 
 __all__ = ["Columns", "Rollouts"]
@@ -95,10 +96,9 @@ class Rollouts:
         """Call the compiled function of a name with arrays and integers."""
         if self.room is not None:
             work = np.empty((3 * self.n_values + self.room) * width)
-            places = np.array([x.ctypes.data for x in self.data], dtype=np.int64)
+            places = np.array([address(x) for x in self.data], dtype=np.int64)
             arguments = *arguments, self.n_values, self.n_out, work, places
-        given = (x.ctypes.data if isinstance(x, np.ndarray) else x for x in arguments)
-        self.function(name, width)(*given)
+        self.function(name, width)(*[address(x) if type(x) is np.ndarray else x for x in arguments])
 
     def rollout(
         self,
@@ -153,7 +153,7 @@ class Rollouts:
         first: int,
         closed: bool,
     ) -> None:
-        """Rows side by side; those that end before the last step once more, by themselves, to find that end."""
+        """One row, or rows side by side; those that end before the last step once more, by themselves, to find that end."""
         before = running.copy() if first > 0 else running
         rest = stop, first
         width = self.lanes if len(y0) > 1 else 1
@@ -183,12 +183,13 @@ class Rollouts:
             name, (entries, kinds) = "run own", self.own_columns(table, y0[:, self.n_out :], width)
         else:
             name, (entries, kinds) = "run", self.prepared(table)
-        begun = int(np.searchsorted(save, 0, side="right")) if len(save) and save[0] <= 0 else 0
+        begun = int(save.searchsorted(0, "right")) if len(save) and save[0] <= 0 else 0
         if begun:
             out[:, :begun] = states[:, None]
-        later, outputs = save[begun:], out
-        if begun or not out.flags.c_contiguous:
-            outputs = np.empty((len(y0), len(later), self.n_out))
+        later, outputs = save[begun:], out[:, begun:]
+        apart = not outputs.flags.c_contiguous
+        if apart:
+            outputs = np.empty(outputs.shape)
         if first > 0:
             start = np.ascontiguousarray(running)
         elif self.n_values > self.n_out:
@@ -199,15 +200,14 @@ class Rollouts:
         left = np.empty((len(y0), self.n_values)) if keeps else running
         given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps, later, len(later)
         self.call(name, width, *given, outputs, n_finite, left, int(keeps), stop)
-        if outputs is not out:
+        if apart:
             out[:, begun:] = outputs
         if keeps:
             running[:] = left
-        if width == 1:
-            for i in np.flatnonzero(n_finite < n_steps):
-                out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
-                if keeps:
-                    running[i] = np.nan
+        if width == 1 and n_finite[0] < n_steps:
+            out[0, np.searchsorted(save, n_finite[0], side="right") :] = np.nan
+            if keeps:
+                running[0] = np.nan
 
     def rollout_processed(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> int:
         """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
