@@ -153,7 +153,7 @@ class Rollouts:
         first: int,
         closed: bool,
     ) -> None:
-        """One row, or rows side by side; those that end before the last step once more, by themselves, to find that end."""
+        """One row, or rows side by side; those that end early once more, by themselves, to find that end."""
         before = running.copy() if first > 0 else running
         rest = stop, first
         width = self.lanes if len(y0) > 1 else 1
