@@ -35,19 +35,16 @@ def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: 
     from sympflow.hamiltonian.domain import Box
 
     symbols, width = system.symbols, states.shape[-1]
-    is_box = isinstance(domain, Box)
-    low, high = domain.bounds if isinstance(domain, Box) else domain.limits(slack)
-    if states.dtype != np.float64 or len(low) != (width if is_box else width + 2):
-        return False
-    if is_box:
-        within: Callable[..., None] | None = _box_function(width)
-    elif symbols is None or (domain.hamiltonian is not None and domain.hamiltonian != system.hamiltonian):
-        return False
+    within: Callable[..., None] | None = None
+    if isinstance(domain, Box):
+        (low, high), within = domain.bounds, _box_function(width)
     else:
-        if symbols not in _SUBLEVELS:
-            _SUBLEVELS[symbols] = _sublevel_function(symbols)
-        within = _SUBLEVELS[symbols]
-    if within is None:
+        low, high = domain.limits(slack)
+        if symbols is not None and (domain.hamiltonian is None or domain.hamiltonian == system.hamiltonian):
+            if symbols not in _SUBLEVELS:
+                _SUBLEVELS[symbols] = _sublevel_function(symbols)
+            within = _SUBLEVELS[symbols]
+    if within is None or states.dtype != np.float64 or len(low) != width + 2 * (not isinstance(domain, Box)):
         return False
     rows, inside = np.ascontiguousarray(states), np.zeros(1, dtype=np.int64)
     within(address(rows), rows.size // width, address(low), address(high), address(inside))
