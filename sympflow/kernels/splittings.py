@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["SplittingCode"]
 
 MOST_TABLES = 64  # that are kept
+LONG = 64  # operations of a stage, beyond which products of sums may better be left
 EARLY = -4  # when momenta are known before the positions, in cycles
 
 
@@ -78,9 +79,12 @@ class Splitting:
         return [self._arranged(terms) for terms in self.terms]
 
     def _arranged(self, terms: int) -> Arranged:
-        """The stage as a program, the shape with the shortest chain and the fewest operations of two."""
-        shapes = [_Shape(self, terms, expand).arranged() for expand in ((True, False) if terms > 1 else (True,))]
-        return min(shapes, key=lambda shape: shape[0])[1]
+        """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
+        cost, shape = _Shape(self, terms, True).arranged()
+        if terms > 1 and len(shape.body) > LONG:
+            other_cost, other = _Shape(self, terms, False).arranged()
+            return shape if cost <= other_cost else other
+        return shape
 
 
 class _Shape:
