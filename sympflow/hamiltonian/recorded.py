@@ -8,6 +8,7 @@ from typing import Any
 import sympy as sp
 
 from sympflow.compiler.functions import apply, where
+from sympflow.hamiltonian.removable import sinc
 
 __all__ = ["NotRecorded", "check_recorded", "evaluator"]
 
@@ -64,7 +65,7 @@ def check_recorded(*expressions: sp.Expr) -> None:
     NotRecorded
         A ValueError, about the system.
     """
-    known = (sp.Piecewise, sp.Heaviside, sp.logic.boolalg.BooleanAtom)
+    known = (sp.Piecewise, sp.Heaviside, sinc, sp.logic.boolalg.BooleanAtom)
     for f in expressions:
         functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
         for a in functions:
@@ -108,6 +109,8 @@ def _value(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
         return apply("pow", value(base), value(exponent))
     if isinstance(f, sp.Piecewise):
         return _piecewise(f, value)
+    if isinstance(f, sinc):
+        return value(f.written_out)
     if isinstance(f, sp.Heaviside):
         return _heaviside(*(value(x) for x in f.args))
     rule = _RULES.get(f.func)

@@ -13,12 +13,19 @@ from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.runs import BLOCK, Numbers, map_function, run_function
 
-__all__ = ["Columns", "Rollouts"]
+__all__ = ["Columns", "Rollouts", "aligned"]
 
+LINE = 8  # numbers in a line of memory
 AT_ONCE = 4096  # trajectories with tables of their own
 
 Columns = tuple[np.ndarray, np.ndarray]
 """The numbers (m, size) of columns and their kinds (m,), as compiled code reads them: see `run_function`."""
+
+
+def aligned(n: int) -> np.ndarray:
+    """Numbers in memory, of any values, that begin with a line of it."""
+    memory = np.empty(n + LINE)
+    return memory[-(memory.ctypes.data // 8) % LINE :][:n]
 
 
 class Rollouts:
@@ -33,6 +40,8 @@ class Rollouts:
     lanes : int
         Trajectories of a batch that run side by side: of two registers or four, so that one need not wait for the
         other.
+    fewest : int
+        Trajectories that run in lanes rather than one after the other.
     room : int, optional
         Where states are in memory, how many numbers more stages need there; None where they are in registers.
     data : sequence of ndarray
@@ -42,6 +51,7 @@ class Rollouts:
     """
 
     lanes = 16
+    fewest = 2
     room: int | None = None
     data: Sequence[np.ndarray] = ()
     every: int | None = None
@@ -95,10 +105,10 @@ class Rollouts:
     def call(self, name: str, width: int, *arguments: Any) -> None:
         """Call the compiled function of a name with arrays and integers."""
         if self.room is not None:
-            work = np.empty((3 * self.n_values + self.room) * width)
-            places = np.array([address(x) for x in self.data], dtype=np.int64)
+            work = aligned((3 * self.n_values + self.room) * width)
+            places = np.array([*map(address, self.data)], dtype=np.int64)
             arguments = *arguments, self.n_values, self.n_out, work, places
-        self.function(name, width)(*[address(x) if type(x) is np.ndarray else x for x in arguments])
+        self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
 
     def rollout(
         self,
@@ -156,7 +166,7 @@ class Rollouts:
         """One row, or rows side by side; those that end early once more, by themselves, to find that end."""
         before = running.copy() if first > 0 else running
         rest = stop, first
-        width = self.lanes if len(y0) > 1 else 1
+        width = self.lanes if len(y0) >= self.fewest else 1
         self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width)
         for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
             one = slice(i, i + 1)
