@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import Value
-from sympflow.kernels.runs import Numbers, map_function, run_function
+from sympflow.kernels.runs import BLOCK, Numbers, map_function, run_function
 
 __all__ = ["Columns", "Rollouts"]
 
+NONE = np.empty(0)
 AT_ONCE = 4096  # trajectories with tables of their own
 
 Columns = tuple[np.ndarray, np.ndarray]
@@ -32,9 +33,15 @@ class Rollouts:
     lanes : int
         Trajectories of a batch that run side by side: of two registers or four, so that one need not wait for the
         other.
+    counted : bool
+        True if a stage has one more value, a count.
+    block : int
+        Steps between two looks for a state that is not finite, or a stop.
     """
 
     lanes = 16
+    counted = False
+    block = BLOCK
 
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
@@ -72,7 +79,8 @@ class Rollouts:
         """Compile the function of a name: "run", "run own" or "map"."""
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width)
-        return run_function(self.n_values, self.n_out, self.size, self.stage, width, name == "run own")
+        own = name == "run own"
+        return run_function(self.n_values, self.n_out, self.size, self.stage, width, own, self.counted, self.block)
 
     def rollout(
         self,
@@ -103,16 +111,20 @@ class Rollouts:
         first: int,
         running: np.ndarray,
         closed: bool = True,
+        counts: np.ndarray = NONE,
     ) -> None:
-        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it."""
+        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it.
+
+        The counts (N,) of stages that count go into `counts`.
+        """
         rest = n_steps, save, stop, first, closed
         if len(y0) == 1 or y0.shape[1] > self.n_out:
             size = AT_ONCE if y0.shape[1] > self.n_out else 1
             for k in range(0, len(y0), size):
                 rows = slice(k, k + size)
-                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], *rest)
+                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], counts[rows], *rest)
             return
-        self._some(table, y0, out, n_finite, running, *rest)
+        self._some(table, y0, out, n_finite, running, counts, *rest)
 
     def _some(
         self,
@@ -121,6 +133,7 @@ class Rollouts:
         out: np.ndarray,
         n_finite: np.ndarray,
         running: np.ndarray,
+        counts: np.ndarray,
         n_steps: int,
         save: np.ndarray,
         stop: np.ndarray,
@@ -131,12 +144,13 @@ class Rollouts:
         before = running.copy() if first > 0 else running
         rest = stop, first
         width = self.lanes if len(y0) > 1 else 1
-        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width)
+        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width, counts)
         for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
             one = slice(i, i + 1)
             if len(before):
                 running[i] = before[i]
-            self._run(table, y0[one], n_steps, save, out[one], n_finite[one], *rest, running[one], closed, 1)
+            row = running[one], closed, 1, counts[one]
+            self._run(table, y0[one], n_steps, save, out[one], n_finite[one], *rest, *row)
 
     def _run(
         self,
@@ -151,6 +165,7 @@ class Rollouts:
         running: np.ndarray,
         closed: bool,
         width: int,
+        counts: np.ndarray = NONE,
     ) -> None:
         states = y0[:, : self.n_out]
         if y0.shape[1] > self.n_out:
@@ -168,7 +183,7 @@ class Rollouts:
         if first > 0:
             start = np.ascontiguousarray(running)
         elif self.n_values > self.n_out:
-            start = np.concatenate([states, np.zeros_like(states)], axis=1)
+            start = np.concatenate([states, np.zeros((len(y0), self.n_values - self.n_out))], axis=1)
         else:
             start = np.ascontiguousarray(states)
         keeps = running.shape[-1] > 0
@@ -179,6 +194,7 @@ class Rollouts:
         run(
             *(table_at, kinds_at, *lengths, start_at, len(y0), first, n_steps, save_at, len(later), out_at),
             *(finite_at, left_at, int(keeps), stop_at),
+            *((counts.ctypes.data,) if self.counted else ()),
         )
         if outputs is not out:
             out[:, begun:] = outputs

@@ -18,7 +18,7 @@ from sympflow.compiler.machine import compiled, host
 
 __all__ = ["Numbers", "Stage", "map_function", "run_function", "step_function"]
 
-BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
+BLOCK = 1024  # steps between two looks
 
 Numbers = Callable[[int], Any]
 """The number of an index, of one column."""
@@ -28,7 +28,14 @@ Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 
 
 def run_function(
-    n_values: int, n_out: int, size: int, stage: Stage, width: int = 1, own: bool = False
+    n_values: int,
+    n_out: int,
+    size: int,
+    stage: Stage,
+    width: int = 1,
+    own: bool = False,
+    counted: bool = False,
+    block: int = BLOCK,
 ) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side.
 
@@ -42,12 +49,16 @@ def run_function(
     width : int
     own : bool
         True if each trajectory has a table of its own.
+    counted : bool
+        True if a stage has one more value, a count, which begins as 0 and is no part of the state.
+    block : int
+        Steps between two looks for a state that is not finite, or a stop, where nothing is saved.
 
     Returns
     -------
     callable
         Of addresses and integers (table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite,
-        running, keeps, stop).
+        running, keeps, stop) and, if `counted`, of the address `counts`.
 
         The table holds columns, in each of these `size` numbers or, for tables of their own, `size` times `width`, a
         table for every `width` trajectories. `rows` (n_rows, n_values) are the states to begin with, those of the run
@@ -58,18 +69,33 @@ def run_function(
     """
     module = Module(host().fused)
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
-    code = module.function("run", types)
-    table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite, running, keeps, stop = (
-        code.arguments
-    )
+    code = module.function("run", types + [POINTER] * counted)
+    (
+        table,
+        kinds,
+        link,
+        closes,
+        rows,
+        n_rows,
+        first,
+        n_steps,
+        save,
+        n_saved,
+        out,
+        finite,
+        running,
+        keeps,
+        stop,
+        *counts,
+    ) = code.arguments
     one, zero = code.constant(1, INT), code.constant(0, INT)
     lanes = Lanes(code, n_values, width)
     with code.over(lanes.groups(n_rows)) as group:
         begin = group * width
         place = code.at(table, group * (link + 2) * (size * width)) if own else table
         column = _column(code, place, kinds, size, width if own else 1, width, stage)
-        state = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
-        n, saved, longest = code.variable(first), code.variable(zero), code.variable(code.constant(BLOCK, INT))
+        state = _opened(code, lanes.loaded(rows, begin, n_rows), n_values + counted)
+        n, saved, longest = code.variable(first), code.variable(zero), code.variable(code.constant(block, INT))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
         alive = code.variable(code.constant(1, Type("i1", width)))
         going = code.variable(first < n_steps)
@@ -106,8 +132,10 @@ def run_function(
         else:
             lanes.mark(alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
-            lanes.store([x.value for x in state], running, begin, n_rows, one, zero)
-    return _finished(code, types)
+            lanes.store([x.value for x in state[:n_values]], running, begin, n_rows, one, zero)
+        for place in counts:
+            lanes.store([state[-1].value], place, begin, n_rows, one, zero)
+    return _finished(code, types + [POINTER] * counted)
 
 
 def map_function(n_values: int, n_out: int, size: int, stage: Stage, width: int = 1) -> Callable[..., None]:

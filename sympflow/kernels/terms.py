@@ -20,6 +20,7 @@ from sympflow.kernels.codegen import statements
 __all__ = [
     "bend_source",
     "energy_source",
+    "families",
     "gradient_and_hessian_source",
     "gradient_source",
     "is_large",
