@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -33,15 +33,24 @@ class Rollouts:
     lanes : int
         Trajectories of a batch that run side by side: of two registers or four, so that one need not wait for the
         other.
-    counted : bool
-        True if a stage has one more value, a count.
+    room : int, optional
+        Where states are in memory, how many numbers more stages need there; None where they are in registers.
+    data : sequence of ndarray
+        Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
+    every : int, optional
+        Steps after which `look` changes the running state.
     block : int
-        Steps between two looks for a state that is not finite, or a stop.
+        Steps between two looks for a state that is not finite, or a stop, where nothing is saved.
+    counted : bool
+        True if the last of `n_values` is a count, which is no part of the running state.
     """
 
     lanes = 16
-    counted = False
+    room: int | None = None
+    data: Sequence[np.ndarray] = ()
+    every: int | None = None
     block = BLOCK
+    counted = False
 
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
@@ -50,6 +59,10 @@ class Rollouts:
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
+        raise NotImplementedError
+
+    def look(self, values: Any) -> Any:
+        """The running state changed, where there is `every`: see `sympflow.kernels.runs.run_function`."""
         raise NotImplementedError
 
     @cached_property
@@ -77,10 +90,22 @@ class Rollouts:
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "run", "run own" or "map"."""
+        memory = self.room is not None
         if name == "map":
-            return map_function(self.n_values, self.n_out, self.size, self.stage, width)
-        own = name == "run own"
-        return run_function(self.n_values, self.n_out, self.size, self.stage, width, own, self.counted, self.block)
+            return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory)
+        look, every = (None, self.block) if self.every is None else (self.look, self.every)
+        return run_function(
+            self.n_values, self.n_out, self.size, self.stage, width, name == "run own", memory, look, every
+        )
+
+    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
+        """Call the compiled function of a name with arrays and integers."""
+        if self.room is not None:
+            work = np.empty((3 * self.n_values + self.room) * width)
+            places = np.array([x.ctypes.data for x in self.data], dtype=np.int64)
+            arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, places
+        given = (x.ctypes.data if isinstance(x, np.ndarray) else x for x in arguments)
+        self.function(name, width)(*given)
 
     def rollout(
         self,
@@ -169,35 +194,26 @@ class Rollouts:
     ) -> None:
         states = y0[:, : self.n_out]
         if y0.shape[1] > self.n_out:
-            entries, kinds = self.own_columns(table, y0[:, self.n_out :], width)
-            run = self.function("run own", width)
+            name, (entries, kinds) = "run own", self.own_columns(table, y0[:, self.n_out :], width)
         else:
-            entries, kinds = self.prepared(table)
-            run = self.function("run", width)
+            name, (entries, kinds) = "run", self.prepared(table)
         begun = int(np.searchsorted(save, 0, side="right")) if len(save) and save[0] <= 0 else 0
         if begun:
             out[:, :begun] = states[:, None]
         later, outputs = save[begun:], out
         if begun or not out.flags.c_contiguous:
             outputs = np.empty((len(y0), len(later), self.n_out))
-        if first > 0:
-            start = np.ascontiguousarray(running)
-        elif self.n_values > self.n_out:
-            start = np.concatenate([states, np.zeros((len(y0), self.n_values - self.n_out))], axis=1)
-        else:
-            start = np.ascontiguousarray(states)
+        start = np.ascontiguousarray(running if first > 0 else states)
+        if self.n_values > start.shape[1]:
+            start = np.concatenate([start, np.zeros((len(states), self.n_values - start.shape[1]))], axis=1)
         keeps = running.shape[-1] > 0
-        left = np.empty((len(y0), self.n_values)) if keeps else running
-        arrays = entries, kinds, start, later, outputs, n_finite, left, stop
-        table_at, kinds_at, start_at, save_at, out_at, finite_at, left_at, stop_at = (x.ctypes.data for x in arrays)
-        lengths = len(kinds) - 2, int(closed)
-        run(
-            *(table_at, kinds_at, *lengths, start_at, len(y0), first, n_steps, save_at, len(later), out_at),
-            *(finite_at, left_at, int(keeps), stop_at),
-            *((counts.ctypes.data,) if self.counted else ()),
-        )
+        left = np.empty((len(y0), self.n_values)) if keeps or self.counted else running
+        given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps, later, len(later)
+        self.call(name, width, *given, outputs, n_finite, left, int(keeps or self.counted), stop)
         if outputs is not out:
             out[:, begun:] = outputs
+        if self.counted:
+            counts[:], left = left[:, -1], left[:, :-1]
         if keeps:
             running[:] = left
         if width == 1:
@@ -235,7 +251,5 @@ class Rollouts:
         if not len(y):
             return
         entries, kinds = self.prepared(table)
-        function = self.function("map", 1 if len(y) == 1 else self.lanes)
-        arrays = entries, kinds, y, out
-        table_at, kinds_at, rows_at, out_at = (x.ctypes.data for x in arrays)
-        function(table_at, kinds_at, len(kinds), kinds_at, 1, rows_at, len(y), out_at)
+        width = 1 if len(y) == 1 else self.lanes
+        self.call("map", width, entries, kinds, len(kinds), kinds, 1, y, len(y), out)

@@ -327,7 +327,5 @@ class SplittingCode(Rollouts):
     ) -> None:
         """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
         own = " own" if y.shape[1] > self.n_out else ""
-        step = self.function("step" + own, 1 if len(y) == 1 else self.lanes)
-        table = np.ascontiguousarray(table)
-        table_at, x_at, h_at, t_at, rows_at, out_at = (a.ctypes.data for a in (table, x, h, t, y, out))
-        step(table_at, table.shape[1], table.shape[2], x_at, h_at, t_at, rows_at, len(y), out_at)
+        table, width = np.ascontiguousarray(table), 1 if len(y) == 1 else self.lanes
+        self.call("step" + own, width, table, table.shape[1], table.shape[2], x, h, t, y, len(y), out)
