@@ -8,7 +8,7 @@ reassociates or fuses: a scalar and every lane of a register get the same operat
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -371,10 +371,10 @@ class Code:
         self._entry.append(f"  {name} = alloca [{count} x {type}], align 64")
         return Value(self, POINTER, name)
 
-    def array(self, name: str, values: Sequence[Any], type: Type = DOUBLE) -> Value:
+    def array(self, name: str, values: Iterable[Any], type: Type = DOUBLE) -> Value:
         """The address of numbers that stand in the module, under a name of it."""
-        numbers = ", ".join(f"{type} {literal(x, type)}" for x in values)
-        self.module.declare(name, f'@"{name}" = internal constant [{len(values)} x {type}] [{numbers}]')
+        numbers = [f"{type} {literal(x, type)}" for x in values]
+        self.module.declare(name, f'@"{name}" = internal constant [{len(numbers)} x {type}] [{", ".join(numbers)}]')
         return Value(self, POINTER, f'@"{name}"')
 
     def variable(self, x: Value) -> Variable:

@@ -122,10 +122,11 @@ class ImplicitKernel(Kernel):
         carry: Carry | None,
     ) -> Run:
         code, counts = self._code, np.zeros(len(y0))
+        rollout: Any = code.rollout_batch
         columns = np.repeat(self._numbers(np.array([h]), np.array([t0])), 3, axis=0), np.zeros(3, dtype=np.int64)
 
         def rows(i: slice, *rest: Any) -> None:
-            code.rollout_batch(columns, *rest, False, counts[i])
+            rollout(columns, *rest, closed=False, counts=counts[i])
 
         Y, n_finite, _ = run_states(rows, y0, n_steps, save, threads, carry, code.n_values - 1, code.work)
         return Run(Y, n_finite, int(counts.sum()))

@@ -133,7 +133,7 @@ class NewtonCode(Rollouts):
         return [t.code.operand(x, t.type) for x in _recorded(expressions, inputs)(t, *parameters, *values)]
 
     @cached_property
-    def _slopes(self) -> Program:
+    def slopes(self) -> Program:
         """∇H and the upper triangle of ∇²H, row by row, from q, p, the parameters and the letters."""
         H, letters = self._lettered
         program = _recorded([H], (*self._symbols.q, *self._symbols.p, *self._symbols.parameters, *letters))
@@ -184,11 +184,11 @@ class _InRegisters(NewtonCode):
         start = self.size + stage * letters
         given = [*column[1 : 1 + self._parameters], *column[start : start + letters]]
         if not self._damped:
-            return self._square(self._slopes(*Y, *given))
+            return self._square(self.slopes(*Y, *given))
         growths = column[self.size - 2 * d * (self.stages + 1) :]
         grown, shrunk = (growths[d * (i * (self.stages + 1) + stage) :][:d] for i in range(2))
         Y = [*Y[:d], *(P * e for P, e in zip(Y[d:], shrunk, strict=True))]
-        g, S = self._square(self._slopes(*Y, *given))
+        g, S = self._square(self.slopes(*Y, *given))
         row, entry = [*grown, *[1.0] * d], [*[1.0] * d, *shrunk]
         g = [a * x for a, x in zip(row, g, strict=True)]
         return g, [[row[i] * S[i][j] * entry[j] for j in range(n)] for i in range(n)]
@@ -372,8 +372,8 @@ class _InMemory(NewtonCode):
                 unknown = i * n + m
                 row = code.at(M, unknown * wide)
                 code.store(code.load(K, unknown) - signed * code.load(g, other), row, N)
-                for k in range(N + 1, wide):
-                    code.store(code.constant(0.0), row, k)
+                for filling in range(N + 1, wide):
+                    code.store(code.constant(0.0), row, filling)
                 with code.over(self.stages) as j:
                     entry = -(signed * code.load(A, i * self.stages + j))
                     type = Type("double", ABREAST if n % ABREAST == 0 else 2)
@@ -402,7 +402,7 @@ class _InMemory(NewtonCode):
         if self._large:
             self._add_terms(code, given, Y, g, S, data)
             return
-        slope, hessian = self._square(self._slopes(*(code.load(Y, m) for m in range(n)), *given))
+        slope, hessian = self._square(self.slopes(*(code.load(Y, m) for m in range(n)), *given))
         for m, x in enumerate(slope):
             code.store(code.operand(x, DOUBLE), g, m)
         for j, row in enumerate(hessian):

@@ -174,8 +174,8 @@ class Rollouts:
             one = slice(i, i + 1)
             if len(before):
                 running[i] = before[i]
-            row = running[one], closed, 1, counts[one]
-            self._run(table, y0[one], n_steps, save, out[one], n_finite[one], *rest, *row)
+            found = out[one], n_finite[one]
+            self._run(table, y0[one], n_steps, save, *found, *rest, running[one], closed, 1, counts[one])
 
     def _run(
         self,
