@@ -11,7 +11,7 @@ import sympy as sp
 from sympflow.compiler.functions import apply, where
 from sympflow.hamiltonian.removable import sinc
 
-__all__ = ["NotRecorded", "can_be_recorded", "evaluator"]
+__all__ = ["NotRecorded", "can_be_recorded", "check_recorded", "evaluator"]
 
 
 class NotRecorded(ValueError):
@@ -73,6 +73,15 @@ def can_be_recorded(f: sp.Expr) -> bool:
     functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
     known = (sp.Piecewise, sp.Heaviside, sinc, sp.logic.boolalg.BooleanAtom)
     return all(a.func in _RULES or isinstance(a, known) for a in functions)
+
+
+def check_recorded(f: sp.Expr) -> None:
+    """Raise a ValueError with the term of an expression of which `evaluator` has no rule for a function."""
+    for term in sp.Add.make_args(f):
+        if not can_be_recorded(term):
+            raise ValueError(
+                f"`system` has the term {term}, for which there is no compiled function: use backend='array'."
+            )
 
 
 def evaluator(numbers: Mapping[sp.Symbol, Any]) -> Callable[[sp.Expr], Any]:

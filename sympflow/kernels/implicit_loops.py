@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.collocation import Tableau, stage_nodes
+from sympflow.hamiltonian.driving import with_letters
+from sympflow.hamiltonian.recorded import check_recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.newton import newton_code
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
@@ -69,6 +71,7 @@ class ImplicitKernel(Kernel):
         symbols = system.symbols if is_large(system.symbols) else system.symbols.parametric
         for name in symbols.samples:
             check_samples(symbols.samples[name])
+        check_recorded(with_letters([symbols.H])[0][0])
         self._values, self._driven = symbols.values, symbols.time is not None
         self._code, self._single = (
             newton_code(symbols, tableau, sums, friction is not None) for sums in (compensated, False)

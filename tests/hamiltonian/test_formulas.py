@@ -2,6 +2,7 @@
 
 import random
 
+import mpmath
 import numpy as np
 import pytest
 import sympy as sp
@@ -130,6 +131,16 @@ def formula(r: random.Random, depth: int) -> str:
     whole = f"({a} + {b})", f"({a})*({b})", f"({a})/({b})", f"({a})**2.5", f"({a})**17", f"({a})**({b})"
     chosen = f"Max({a}, {b})", f"Min({a}, {b})", f"Piecewise(({a}, ({b})**2 <= {c}), ({e}, True))"
     return r.choice([*whole, *chosen, *(f"{r.choice(FUNCTIONS)}({a})" for _ in range(7))])
+
+
+@pytest.mark.parametrize("q", [0.0, 1e-9, 1e-4, 0.999, 1.001, 30.0])
+def test_the_compiled_derivatives_of_sinc_do_not_cancel(q):
+    found = newton_code(made("p**2/2 + sinc(q)").symbols, gauss_legendre(1), False, False).slopes(q, 0.0)
+    with mpmath.workdps(60):
+        x = mpmath.mpf(q or 1e-20)
+        sin, cos = mpmath.sin(x), mpmath.cos(x)
+        exact = [(x * cos - sin) / x**2, -sin / x - 2 * cos / x**2 + 2 * sin / x**3]
+    assert [found[0], found[2]] == pytest.approx([float(e) for e in exact], rel=1e-13, abs=1e-19)
 
 
 @pytest.mark.parametrize("seed", range(25))
