@@ -60,13 +60,11 @@ def _sublevel_function(symbols: SymbolicHamiltonian) -> Callable[..., None] | No
     """The test of an H; None if that cannot be recorded or is long."""
     import sympy as sp
 
-    from sympflow.hamiltonian.recorded import NotRecorded, check_recorded
+    from sympflow.hamiltonian.recorded import can_be_recorded
 
-    try:
-        check_recorded(symbols.H)
-    except NotRecorded:
+    if not can_be_recorded(symbols.H) or sp.count_ops(symbols.H) > MOST_OPERATIONS:
         return None
-    return None if sp.count_ops(symbols.H) > MOST_OPERATIONS else _within_function(2 * symbols.ndof, symbols)
+    return _within_function(2 * symbols.ndof, symbols)
 
 
 def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..., None]:

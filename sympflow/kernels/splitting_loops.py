@@ -103,7 +103,8 @@ class SplittingLoops:
                 self._compile = partial(driven_loops, driving, damped_drift(system, False))
             else:
                 V = system.symbols.V
-                check_recorded(V, system.symbols.T)
+                check_recorded(V)
+                check_recorded(system.symbols.T)
                 damped_drift(system, False)
                 self.values = system.symbols.parametric.values
                 self._has_ranges = self.traced = True
