@@ -21,6 +21,7 @@ _HOME = {
     "time_transformed": "hamiltonian.time_transformation",
     "doubled": "hamiltonian.doubling",
     "solve": "solver",
+    "choose_step": "integrators.choosing",
     "ensemble": "ensembles.sweep",
     "Solution": "solution",
     "Interrupted": "integrators.contract",
@@ -80,6 +81,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.doubling import doubled as doubled
     from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
+    from sympflow.integrators.choosing import choose_step as choose_step
     from sympflow.integrators.contract import Interrupted as Interrupted
     from sympflow.integrators.registry import available as available
     from sympflow.integrators.registry import get as get
