@@ -186,12 +186,13 @@ def check_tolerance(tol: Any, tol_of: Any) -> None:
 def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str = "energy") -> float:
     """The step of `choose_step` for a problem."""
     check_tolerance(tol, tol_of)
-    if not isinstance(integrator, FixedStep) or integrator.trained or integrator.dt is not None:
-        has = f"has `dt` = {integrator.dt:g}" if isinstance(integrator, FixedStep) and integrator.dt else "has none"
+    if not isinstance(integrator, FixedStep) or integrator.trained:
         raise TypeError(
-            f"`tol` chooses the step of a method with fixed steps, and {integrator.label!r} {has}: give 'srkn11b', for "
-            "instance; or `rtol` and `atol` for an adaptive method."
+            f"`tol` chooses the step of a method with fixed steps, and {integrator.label!r} has none: give 'srkn11b', "
+            "for instance; or `rtol` and `atol` for an adaptive method, `flow` without `tol` for a flow of your own."
         )
+    if integrator.dt is not None:
+        raise ValueError(f"`tol` chooses the step, but `dt` is given, {integrator.dt:g}: leave out one of them.")
     system = problem.system.between_impulses
     states = to_numpy(problem.y0).astype(float)
     if states.ndim > 1:
