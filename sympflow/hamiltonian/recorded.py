@@ -8,6 +8,7 @@ from typing import Any
 import sympy as sp
 
 from sympflow.compiler.functions import apply, where
+from sympflow.hamiltonian.removable import sinc
 
 __all__ = ["NotRecorded", "can_be_recorded", "evaluator"]
 
@@ -59,7 +60,7 @@ def _heaviside(x: Any, at_zero: Any = 0.5) -> Any:
 def can_be_recorded(f: sp.Expr) -> bool:
     """True if `evaluator` has a rule for every function in an expression."""
     functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
-    known = (sp.Piecewise, sp.Heaviside, sp.logic.boolalg.BooleanAtom)
+    known = (sp.Piecewise, sp.Heaviside, sinc, sp.logic.boolalg.BooleanAtom)
     return all(a.func in _RULES or isinstance(a, known) for a in functions)
 
 
@@ -97,6 +98,8 @@ def _value(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
         return apply("pow", value(base), value(exponent))
     if isinstance(f, sp.Piecewise):
         return _piecewise(f, value)
+    if isinstance(f, sinc):
+        return value(f.written_out)
     if isinstance(f, sp.Heaviside):
         return _heaviside(*(value(x) for x in f.args))
     rule = _RULES.get(f.func)

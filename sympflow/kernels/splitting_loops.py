@@ -453,11 +453,6 @@ def _damped_stages(scheme: Scheme, h: float, friction: Friction) -> StageTable:
     return _with_friction(run_table(scheme, h), friction)
 
 
-def damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
-    """The table of a run with the rows of `DampedDrift`."""
-    return _damped_stages(scheme, h, friction).packed
-
-
 def _with_friction(table: StageTable, friction: Friction) -> StageTable:
     """A table with the rows of `DampedDrift`."""
     mean, decay = friction.factors(table.drifts)

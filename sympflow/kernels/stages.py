@@ -27,7 +27,6 @@ __all__ = [
     "step_constants",
     "step_table",
     "time_lines",
-    "two_stages_source",
     "with_last_stage",
 ]
 
@@ -289,14 +288,11 @@ class DampedDrift:
     ndof : int
     in_place : bool
         True if states are arrays, changed in place, as in the text `array_states`.
-    copies : int
-        States of `ndof` that a state is made of, one after the other: an orbit, and its deviation vectors.
     """
 
     ndim: int
     ndof: int
     in_place: bool
-    copies: int = 1
 
     @property
     def size(self) -> int:
@@ -330,11 +326,10 @@ def damped(p, a):
     return p"""
 
         def times(offset: int) -> str:
-            places = [(c * d, i) for c in range(self.copies) for i in range(d)]
             if self.ndim == 2:
-                sums = (" + ".join(f"a[{offset + d * i + k}]*p[{c + k}]" for k in range(d)) for c, i in places)
+                sums = (" + ".join(f"a[{offset + d * i + k}]*p[{k}]" for k in range(d)) for i in range(d))
             else:
-                sums = (f"a[{offset + (i if self.ndim else 0)}]*p[{c + i}]" for c, i in places)
+                sums = (f"a[{offset + (i if self.ndim else 0)}]*p[{i}]" for i in range(d))
             return "(" + "".join(f"{each}, " for each in sums) + ")"
 
         return f"""@njit(**OPTIONS, forceinline=True)
@@ -504,20 +499,6 @@ def stages_source(
 def _rows_before_values(kinds: Sequence[Kick], friction: DampedDrift | None) -> int:
     """The rows of a table before those of the values of a system's parameters."""
     return 1 + len(kinds[0].numbers) + (0 if friction is None else 2 * friction.size)
-
-
-def two_stages_source(kinds: Sequence[Kick], friction: DampedDrift | None = None, n_parameters: int = 0) -> str:
-    """``two_stages_lanes``, as ``stage_lanes`` twice; of one kind of kick in one pass, where kicks are scheduled."""
-    head = """@njit(**OPTIONS, inline="always")
-def two_stages_lanes(Y, error, width, numbers_1, a_1, numbers_2, a_2):
-    """
-    if len(kinds) > 1:
-        return head + "\n    ".join(f"stage_lanes(Y, error, width, numbers_{i}, a_{i})" for i in (1, 2))
-    lines = []
-    for i in (1, 2):
-        kicked = kinds[0].application(True, lane=True)
-        lines += [f"numbers, a = numbers_{i}, a_{i}", *kicked, *_drifted_lane(friction, n_parameters)]
-    return head + "\n    ".join(_over_lanes(lines))
 
 
 def _drifted_lane(friction: DampedDrift | None, n_parameters: int) -> list[str]:
