@@ -270,9 +270,7 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
         error = float(np.max(np.abs(energy_change(sol)), initial=0.0))
     sol.stats["energy_error"] = error
     if error > tol:
-        note = (
-            f"The relative energy error of the run is {error:.2g}, and `tol` is {tol:g}: pass a smaller `tol` or `dt`."
-        )
+        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
         sol.message += f" {note}"
         warnings.warn(note, RuntimeWarning, stacklevel=3)
 

@@ -36,7 +36,7 @@ def test_the_method_suits_the_system(make, y0, options, name):
 
 
 def test_an_option_that_no_method_takes_is_refused():
-    with pytest.raises(TypeError, match="^`tolerance` is not an option"):
+    with pytest.raises(TypeError, match=r"^`tolerance` is not an option"):
         solve(text("p**2/2 + q**4/4"), t_span=(0, 1), y0=[1, 0], tolerance=1)
 
 
