@@ -232,6 +232,11 @@ class Code:
         given = ", ".join(f"{a.type} {a.name}" for a in args)
         return self._new(result, f"call {result or 'void'} @{name}({given})")
 
+    def call_address(self, address: Value, args: Sequence[Value], result: Type | None = None) -> Value:
+        """Write a call of a function at an address."""
+        given = ", ".join(f"{a.type} {a.name}" for a in args)
+        return self._new(result, f"call {result or 'void'} {address.name}({given})")
+
     def outlined(
         self,
         name: str,
@@ -268,14 +273,17 @@ class Code:
     def unpack(self, packed: Value, types: Sequence[Type]) -> list[Value]:
         return [self._new(t, f"extractvalue {packed.type} {packed.name}, {i}") for i, t in enumerate(types)]
 
+    def lane(self, x: Value, k: int) -> Value:
+        """The number in one lane."""
+        return self._new(Type(x.type.scalar), f"extractelement {x.type} {x.name}, i64 {k}")
+
     def lanes(self, function: Callable[..., Value], args: Sequence[Value], result: Type) -> Value:
         """Call a function of scalars with one lane after the other."""
         if result.width == 1:
             return function(*args)
         total = Value(self, result, "poison")
         for k in range(result.width):
-            lane = [self._new(Type(a.type.scalar), f"extractelement {a.type} {a.name}, i64 {k}") for a in args]
-            y = function(*lane)
+            y = function(*(self.lane(a, k) for a in args))
             total = self._new(result, f"insertelement {result} {total.name}, {y.type} {y.name}, i64 {k}")
         return total
 
