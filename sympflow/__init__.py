@@ -63,6 +63,18 @@ _HOME = {
     "time_reversal_error": "metrics.accuracy",
 }
 _MODULES = ("systems", "interop")
+_ROOMS = (
+    "ensembles",
+    "flow",
+    "hamiltonian",
+    "integrators",
+    "learning",
+    "metrics",
+    "schemes",
+    "storage",
+    "studies",
+    "testing",
+)
 
 __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 
@@ -124,7 +136,7 @@ if FORMER_PATHS not in sys.meta_path:
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
+    if name in (*_MODULES, *_ROOMS):
         return import_module(f"sympflow.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'sympflow' has no attribute {name!r}")

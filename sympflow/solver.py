@@ -44,6 +44,7 @@ from sympflow.integrators.impulses import run_between_impulses
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, get, naming_plugin
 from sympflow.solution import Solution, StoredSolution, energy_change, joined
+from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -85,6 +86,7 @@ def solve(
     Parameters
     ----------
     system : HamiltonianSystem
+        Or the name of a scene, such as "henon-heiles", or H as a formula, such as "p**2/2 + q**4/4".
     method : str, Integrator, or trained flow, optional
         A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow. By
         default one that suits the system, the first of these that applies: a flow that ships for it ("sympflow");
@@ -183,8 +185,7 @@ def solve(
     """
     if is_tensor(y0):
         check_not_traced("solve")
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    system = given_system(system)
     given, chosen = options, None
     if tol is not None:
         check_tolerance(tol, tol_of)

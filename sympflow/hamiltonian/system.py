@@ -157,6 +157,11 @@ class HamiltonianSystem(Hamiltonian):
     ) -> None:
         from sympflow.hamiltonian.callables import CallableHamiltonian, DrivenCallables
 
+        for argument, H in (("potential", potential), ("hamiltonian", hamiltonian)):
+            if isinstance(H, str):
+                raise TypeError(
+                    f"`{argument}` must be a function; got the text {H!r}: HamiltonianSystem.from_sympy takes it."
+                )
         number = isinstance(ndof, int | float | np.number) and not isinstance(ndof, bool) and 1 <= ndof <= MOST_DEGREES
         if ndof is None or not number or int(ndof) != ndof:
             raise ValueError(
@@ -187,6 +192,8 @@ class HamiltonianSystem(Hamiltonian):
         cls,
         expression: str | sympy.Expr,
         *,
+        q: Sequence[Any] | None = None,
+        p: Sequence[Any] | None = None,
         params: Mapping[str, Any] | None = None,
         time: str | sympy.Symbol | None = None,
         period: float | None = None,
@@ -208,6 +215,9 @@ class HamiltonianSystem(Hamiltonian):
         expression : str or sympy.Expr
             In a text `pi` is a constant and every other name that is no function a symbol: so are `E` and `I`;
             Euler's number is exp(1).
+        q, p : sequence of str, sympy.Symbol or functions of the time, optional
+            The names that coordinates and momenta have in the expression, such as ``q=["x", "y"], p=["px", "py"]`` or
+            `dynamicsymbols`; in the system they are q1 … qd and p1 … pd.
         params : mapping of str to float, optional
             Values of the other symbols: finite real numbers. A name that is given here is a symbol whatever it means
             otherwise. `system.params` holds them, to be read only. A spline of SciPy, such as `CubicSpline(t, a)` or
@@ -228,8 +238,10 @@ class HamiltonianSystem(Hamiltonian):
             impulses DiracDelta(t − a)·W(q), which are kicks p −= ∇W(q) at the time a; if `damping` is not symmetric,
             has negative rates, or another shape.
         """
-        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params
+        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params, renamed
 
+        if q is not None or p is not None:
+            expression = renamed(expression, q, p)
         params = checked_params(params)
         symbols = SymbolicHamiltonian(expression, params, time)
         if cls._continuous:
