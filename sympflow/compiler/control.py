@@ -8,7 +8,7 @@ reassociates or fuses: a scalar and every lane of a register get the same operat
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -379,6 +379,12 @@ class Code:
         self._entry.append(f"  {name} = alloca [{count} x {type}], align 64")
         return Value(self, POINTER, name)
 
+    def array(self, name: str, values: Iterable[Any], type: Type = DOUBLE) -> Value:
+        """The address of numbers that stand in the module, under a name of it."""
+        numbers = [f"{type} {literal(x, type)}" for x in values]
+        self.module.declare(name, f'@"{name}" = internal constant [{len(numbers)} x {type}] [{", ".join(numbers)}]')
+        return Value(self, POINTER, f'@"{name}"')
+
     def variable(self, x: Value) -> Variable:
         """A variable with this value; the machine keeps it in a register."""
         return Variable(self, x)
@@ -388,6 +394,7 @@ class Code:
     @contextmanager
     def over(self, count: Any) -> Iterator[Value]:
         """Execute what is written inside for k = 0 … count − 1, none if the count is not positive."""
+        count = self.operand(count, INT)
         k = self.variable(self.constant(0, INT))
         with self.during(lambda: k.value < count):
             yield k.value
