@@ -212,13 +212,14 @@ class SplittingLoops:
 
     def _traced(self, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
         """The functions over traced numbers, which serve batches with own values too."""
-        from sympflow.kernels.splittings import Splitting, SplittingCode
+        from sympflow.kernels.splittings import Splitting, SplittingCode, shared
 
         key = level, compensated, monomials
         if key not in self._codes:
             assert self._symbols is not None
             ndim = None if self.friction is None else self.friction.damping.ndim
-            code = SplittingCode(Splitting(self._symbols.parametric, level, monomials, compensated, ndim))
+            splitting = Splitting(self._symbols.parametric, level, monomials, compensated, ndim)
+            code = shared(splitting.key, lambda: SplittingCode(splitting))
             processed = code.rollout_processed, code.rollout_processed_batch
             self._codes[key] = LoopFunctions(code.rollout, code.rollout_batch, *processed, code.step_rows)
         return self._codes[key]

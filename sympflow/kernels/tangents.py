@@ -24,7 +24,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, run_states
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.kernels.splittings import EARLY, Splitting, SplittingCode
+from sympflow.kernels.splittings import EARLY, Splitting, SplittingCode, shared
 from sympflow.kernels.stages import StageTable, run_table
 from sympflow.kernels.threads import given
 from sympflow.schemes import POLYNOMIAL, Scheme
@@ -439,9 +439,7 @@ def _looks(save: np.ndarray, n_steps: int, limit: float) -> np.ndarray:
     return np.concatenate([[*range(a + EVERY, b, EVERY), b] for a, b in pairwise([0, *ends.tolist()])])
 
 
-def tangent_code(
-    system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool
-) -> TangentCode:
+def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool) -> TangentCode:
     """The compiled functions of splittings of a system with k vectors, made once.
 
     Raises
@@ -456,7 +454,7 @@ def tangent_code(
             assert system.symbols is not None
             ndim = None if system.friction is None else system.friction.damping.ndim
             splitting = Splitting(system.symbols.parametric, level, monomials, friction=ndim)
-            codes[key] = TangentCode(splitting, vectors, grows)
+            codes[key] = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
     found = codes[key]
     if isinstance(found, str):
         raise ValueError(found)
