@@ -191,7 +191,7 @@ class PrimedFlowKernel(Kernel):
         for back, rows in ((False, h > 0), (True, h < 0)):
             if rows.any():
                 t = np.abs(h[rows])
-                table = tables.kept(("polynomials", back), lambda back=back: tables.polynomials(back))
+                table = tables.kept(("polynomials", back), partial(tables.polynomials, back))
                 found = step_tangents(self.system, table, tables.variable(t), t, y[rows], tables.monomials)
                 if found is None:
                     return None

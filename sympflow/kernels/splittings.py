@@ -307,9 +307,9 @@ class SplittingCode(Rollouts):
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
             return self._executed(last, values, numbers)
 
-        return step_function(
-            self.n_values, self.n_out, powers, self._own if own else 0, self._kinds[last].table, stage, width
-        )
+        own_numbers, memory = self._own if own else 0, self.room is not None
+        table = self._kinds[last].table
+        return step_function(self.n_values, self.n_out, powers, own_numbers, table, stage, width, memory)
 
     # tables -------------------------------------------------------------------------------------------------------
 

@@ -465,14 +465,14 @@ def _lacks(system: HamiltonianSystem) -> str:
     """The reason why a system has no compiled vectors, "" if it has."""
     from sympflow.kernels.terms import is_large
 
+    if not system.autonomous:
+        return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
     symbols = system.symbols
     if symbols is None or is_large(symbols) or not splitting_loops(system).traced:
         return (
             f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "
             "few terms: use backend='auto'."
         )
-    if not system.autonomous:
-        return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
     return ""
 
 
