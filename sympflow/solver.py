@@ -273,7 +273,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     elif problem.store is not None:
         run = partial(_run_stored, action=action)
     else:
-        check_memory(integrator, replace(problem, system=between))
+        check_memory(integrator, problem if between is system else replace(problem, system=between))
 
     start, stopped = time.perf_counter(), None
     with naming_plugin(integrator):
