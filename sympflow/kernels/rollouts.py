@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from ctypes import addressof, c_char
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from sympflow.compiler.control import Value
+from sympflow.compiler.machine import address
 from sympflow.kernels.runs import BLOCK, Numbers, map_function, run_function
 
 __all__ = ["Columns", "Rollouts", "aligned"]
@@ -27,11 +27,6 @@ def aligned(n: int) -> np.ndarray:
     """Numbers in memory, of any values, that begin with a line of it."""
     memory = np.empty(n + LINE)
     return memory[-(memory.ctypes.data // 8) % LINE :][:n]
-
-
-def _address(x: np.ndarray) -> int:
-    """Where an array begins, in a third of the time that `ctypes.data` takes."""
-    return addressof(c_char.from_buffer(x.data)) if x.size and x.flags.writeable else int(x.ctypes.data)
 
 
 class Rollouts:
@@ -122,9 +117,9 @@ class Rollouts:
         """Call the compiled function of a name with arrays and integers."""
         if self.room is not None:
             work = aligned((3 * self.n_values + self.room) * width)
-            places = np.array([*map(_address, self.data)], dtype=np.int64)
+            places = np.array([*map(address, self.data)], dtype=np.int64)
             arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, places
-        self.function(name, width)(*[_address(x) if isinstance(x, np.ndarray) else x for x in arguments])
+        self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
 
     def rollout(
         self,
@@ -184,7 +179,7 @@ class Rollouts:
         first: int,
         closed: bool,
     ) -> None:
-        """Rows side by side; those that end before the last step once more, by themselves, to find that end."""
+        """One row, or rows side by side; those that end early once more, by themselves, to find that end."""
         before = running.copy() if first > 0 else running
         rest = stop, first
         width = self.lanes if len(y0) >= self.fewest else 1
@@ -216,12 +211,13 @@ class Rollouts:
             name, (entries, kinds) = "run own", self.own_columns(table, y0[:, self.n_out :], width)
         else:
             name, (entries, kinds) = "run", self.prepared(table)
-        begun = int(np.searchsorted(save, 0, side="right")) if len(save) and save[0] <= 0 else 0
+        begun = int(save.searchsorted(0, "right")) if len(save) and save[0] <= 0 else 0
         if begun:
             out[:, :begun] = states[:, None]
-        later, outputs = save[begun:], out
-        if begun or not out.flags.c_contiguous:
-            outputs = np.empty((len(y0), len(later), self.n_out))
+        later, outputs = save[begun:], out[:, begun:]
+        apart = not outputs.flags.c_contiguous
+        if apart:
+            outputs = np.empty(outputs.shape)
         start = np.ascontiguousarray(running if first > 0 else states)
         if self.n_values > start.shape[1]:
             start = np.concatenate([start, np.zeros((len(states), self.n_values - start.shape[1]))], axis=1)
@@ -229,17 +225,16 @@ class Rollouts:
         left = np.empty((len(y0), self.n_values)) if keeps or self.counted else running
         given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps, later, len(later)
         self.call(name, width, *given, outputs, n_finite, left, int(keeps or self.counted), stop)
-        if outputs is not out:
+        if apart:
             out[:, begun:] = outputs
         if self.counted:
             counts[:], left = left[:, -1], left[:, :-1]
         if keeps:
             running[:] = left
-        if width == 1:
-            for i in np.flatnonzero(n_finite < n_steps):
-                out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
-                if keeps:
-                    running[i] = np.nan
+        if width == 1 and n_finite[0] < n_steps:
+            out[0, np.searchsorted(save, n_finite[0], side="right") :] = np.nan
+            if keeps:
+                running[0] = np.nan
 
     def rollout_processed(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> int:
         """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
@@ -264,6 +259,12 @@ class Rollouts:
             row = int(np.argmin(good[i]))
             if save[row] <= n_finite[i]:
                 out[i, row:], n_finite[i] = np.nan, save[row] - 1
+
+    def step_rows(
+        self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
+        raise NotImplementedError
 
     def mapped(self, table: Any, y: np.ndarray, out: np.ndarray) -> None:
         """All columns of a table, applied to rows `y` (N, 2d); `out` may be `y`."""

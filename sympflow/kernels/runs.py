@@ -16,7 +16,7 @@ from typing import Any
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Numbers", "Room", "Stage", "map_function", "run_function", "step_function"]
+__all__ = ["Lanes", "Numbers", "Room", "Stage", "finished", "groups", "map_function", "run_function", "step_function"]
 
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
@@ -85,7 +85,7 @@ def run_function(
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
     state = _state(code, n_values, n_out, width, code.arguments[15:], before=width == 1)
-    with code.over(_groups(code, n_rows, width)) as group:
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         place = code.at(table, group * (link + 2) * (size * width)) if own else table
         column = _column(code, place, kinds, size, width if own else 1, width, stage)
@@ -136,7 +136,7 @@ def run_function(
             _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
             state.keep(running, begin, n_rows)
-    return _finished(code, types)
+    return finished(code, types)
 
 
 def map_function(
@@ -155,7 +155,7 @@ def map_function(
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
     state = _state(code, n_values, n_out, width, code.arguments[8:])
     column = _column(code, table, kinds, size, 1, width, stage)
-    with code.over(_groups(code, n_rows, width)) as group:
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         state.open(rows, begin, n_rows, n_out)
         step = code.load(steps, code.op("srem", INT, begin, n_steps), INT)
@@ -163,7 +163,7 @@ def map_function(
             state.change(column, j, step)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return _finished(code, types)
+    return finished(code, types)
 
 
 def step_function(
@@ -198,7 +198,7 @@ def step_function(
     table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments[:9]
     state = _state(code, n_values, n_out, width, code.arguments[9:])
     alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
-    with code.over(_groups(code, n_rows, width)) as group:
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         (at,), (length,) = alone.loaded(x, begin, n_rows), alone.loaded(h, begin, n_rows)
         state.open(rows, begin, n_rows, n_out, own)
@@ -216,7 +216,7 @@ def step_function(
             state.change(lambda j, x, step, entries=entries: stage(x, entries.__getitem__, j, step), j, j)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return _finished(code, types)
+    return finished(code, types)
 
 
 MEMORY = [INT, INT, POINTER, POINTER]
@@ -379,7 +379,8 @@ def _state(
     return _Memory(code, width, memory, before) if memory else _Registers(code, n_values, n_out, width)
 
 
-def _groups(code: Code, n_rows: Value, width: int) -> Value:
+def groups(code: Code, n_rows: Value, width: int) -> Value:
+    """How often `width` rows are begun side by side."""
     if width == 1:
         return n_rows
     return code.op("sdiv", INT, n_rows + (width - 1), code.constant(width, INT))
@@ -470,6 +471,7 @@ def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) 
 _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
 
 
-def _finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+def finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+    """End the code of a function, and compile it."""
     code.give()
     return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *[_C[t.scalar] for t in types]))

@@ -19,7 +19,6 @@ from sympflow.kernels.codegen import statements
 
 __all__ = [
     "bend_source",
-    "energy_source",
     "families",
     "gradient_source",
     "is_large",
@@ -177,19 +176,6 @@ def _constant(f: sp.Basic) -> _Tree | None:
 
 
 # derivatives as loops ---------------------------------------------------------------------------------------------
-
-
-def energy_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
-    """``name(q)``: the value of f.
-
-    Raises
-    ------
-    ValueError
-        As `sympflow.kernels.codegen.statements`.
-    """
-    constant = f.as_independent(*variables, as_Add=True)[0]
-    before, after = f"total = {float(constant)!r}", "return total"
-    return _source(f, variables, name, "q", before, lambda family: {"total": family.f}, after)
 
 
 def gradient_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
