@@ -48,6 +48,7 @@ from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
+    from sympflow.storage.runs import RunStore
 
 BACKENDS = ("auto", "compiled", "array", "cuda")
 MAX_EVENT_SAMPLES = 100_000_000
@@ -298,8 +299,8 @@ def _answered(integrator: Integrator, problem: Problem, action: str, rows: Param
     return _solved_rows(integrator, problem, action, rows)
 
 
-def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
-    """The solution of a validated problem."""
+def _solved(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None = None) -> Solution:
+    """The solution of a validated problem; `rows` are the parameters of its trajectories, where they have some."""
     system, y_start = problem.system, problem.y0
     n_times = 0 if problem.t_eval is None else len(problem.t_eval)
     between = system.between_impulses
@@ -335,10 +336,10 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     passed = False
-    if system.poles is not None and problem.diagnosed and problem.letters is None and problem.store is None:
+    if (system.poles is not None or problem.letters is not None) and problem.diagnosed and problem.store is None:
         if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
-            passed = note_poles(outcome, integrator, problem, stacklevel=4)
-        if stopped is None and readable(outcome.y):
+            passed = note_poles(outcome, integrator, problem, rows, stacklevel=4 + (rows is not None))
+        if stopped is None and problem.letters is None and readable(outcome.y):
             warn_of_cancelling(outcome, problem, stacklevel=4)
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
     if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
@@ -397,7 +398,7 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     pieces: list[tuple[np.ndarray, Solution]] = []
     try:
         for index, part in groups:
-            sol = _solved(integrator, part, action)
+            sol = _solved(integrator, part, action, rows.taken(index))
             pieces.append((index, sol))
             if problem.diagnosed and part.letters is not None and not sol.success:
                 _note_singularities(sol, integrator, part, rows.taken(index))
@@ -478,6 +479,7 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
     expected = steps + 2 if problem.t_eval is None else problem.t_eval.size
     store.prepare(known, provenance(system, integrator, (problem.t0, problem.t1)), y0, int(min(expected, 1e9)))
     compiled = {"backend": "compiled"}  # by which states are looked at in a compiled pass
+    before: Problem | None = None
 
     def look(t: np.ndarray, y: np.ndarray) -> None:
         """Check the outputs of a window, as `_solved` checks all outputs."""
@@ -486,6 +488,14 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
             system.check_functions_along(y)
         if integrator.trained:
             check_system_along(piece, integrator, system, y0)
+        if problem.diagnosed and system.poles is not None:
+            nonlocal before
+            if before is None:
+                before = replace(problem, store=None, progress=None, diagnosed=False)
+                if n := store.length:  # which holds what was before
+                    before = replace(before, t0=float(store.times(n - 1)[0]), y0=store.states(n - 1)[..., 0])
+            _look_for_poles(store, Outcome(t, y, 0, "", {}), integrator, before)
+            before = replace(before, t0=float(t[-1]), y0=y[-1])
         if action != "ignore" and "domain_exit" not in store.noted:
             check_domain(piece, integrator, system, action)
             if "domain_exit" in piece.stats:
@@ -493,6 +503,15 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
 
     store.look = look
     return integrator.run(problem), problem
+
+
+def _look_for_poles(store: RunStore, piece: Outcome, integrator: Integrator, before: Problem) -> None:
+    """Note that a run passed a pole between outputs of a window, and the state before them; of each trajectory once."""
+    known = np.array(store.noted.get("failed_at", np.full(before.y0.shape[:-1], np.nan)), dtype=float)
+    piece.status = np.where(np.isnan(known), 0, -1) if known.ndim else 0 if np.isnan(known) else -1
+    if note_poles(piece, integrator, before, None, stacklevel=6):
+        at = np.where(np.isnan(known), piece.stats["failed_at"], known)
+        store.noted |= {"failed_at": at.tolist(), "passed": store.noted.get("passed", piece.message)}
 
 
 def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> None:

@@ -388,7 +388,10 @@ class SymbolicHamiltonian(Definition):
         return self._scalar("Ht")(y, t)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
-        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
+        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name.
+
+        Of a `parametric` form it takes `numbers`, values of the parameters.
+        """
         return self._function(name, lambda: expressions, assemble)
 
     def potential(self, q: Array, *t: Array) -> Array:
@@ -473,19 +476,21 @@ class SymbolicHamiltonian(Definition):
         generated: dict[str, Callable[..., list[Any]]] = {}
         values_of_samples: list[tuple[sampled, Callable[..., Any]]] = []
 
-        def function(x: Array, *times: Array) -> Array:
+        def function(x: Array, *times: Array, numbers: Sequence[Any] = ()) -> Array:
             library = "torch" if is_tensor(x) else "numpy"
             if library not in generated:
                 wanted, letters = with_letters([printable(f) for f in expressions()])
                 values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in letters]
-                generated[library] = generate(wanted, (*variables, *moving, *letters.values()), library)
+                generated[library] = generate(
+                    wanted, (*variables, *moving, *self.parameters, *letters.values()), library
+                )
             columns = [x[..., i] for i in range(n)]
             times = times[: len(moving)]
             if library == "torch" and moving:
                 times = _doubles(times, x)
             sampled_values = [self.samples[a.name_of_samples](at(*times), a.order) for a, at in values_of_samples]
             try:
-                values = generated[library](*columns, *times, *sampled_values)
+                values = generated[library](*columns, *times, *numbers, *sampled_values)
             except (NameError, AttributeError, TypeError) as error:
                 raise TypeError(
                     f"`expression` cannot be evaluated with {library} ({error}): write it with functions that "
