@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import Value
-from sympflow.kernels.runs import Numbers, map_function, run_function
+from sympflow.kernels.runs import Memory, Numbers, map_function, run_function
+from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts"]
 
@@ -35,6 +36,8 @@ class Rollouts:
     """
 
     lanes = 16
+    memory: Memory | None = None
+    """Where states stand that are too long for registers."""
 
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
@@ -71,8 +74,14 @@ class Rollouts:
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "run", "run own" or "map"."""
         if name == "map":
-            return map_function(self.n_values, self.n_out, self.size, self.stage, width)
-        return run_function(self.n_values, self.n_out, self.size, self.stage, width, name == "run own")
+            return map_function(self.n_values, self.n_out, self.size, self.stage, width, self.memory)
+        return run_function(self.n_values, self.n_out, self.size, self.stage, width, name == "run own", self.memory)
+
+    def called(
+        self, function: Callable[..., None], n_rows: int, n_columns: int, stop: np.ndarray, arguments: tuple[int, ...]
+    ) -> None:
+        """Call a compiled run or map of so many columns; one whose states are in memory is given its context."""
+        function(*arguments)
 
     def rollout(
         self,
@@ -153,6 +162,7 @@ class Rollouts:
         width: int,
     ) -> None:
         states = y0[:, : self.n_out]
+        stop = np.zeros(1, dtype=np.int64) if stop is NEVER else stop  # that a thread which fails may set
         if y0.shape[1] > self.n_out:
             entries, kinds = self.own_columns(table, y0[:, self.n_out :], width)
             run = self.function("run own", width)
@@ -176,10 +186,9 @@ class Rollouts:
         arrays = entries, kinds, start, later, outputs, n_finite, left, stop
         table_at, kinds_at, start_at, save_at, out_at, finite_at, left_at, stop_at = (x.ctypes.data for x in arrays)
         lengths = len(kinds) - 2, int(closed)
-        run(
-            *(table_at, kinds_at, *lengths, start_at, len(y0), first, n_steps, save_at, len(later), out_at),
-            *(finite_at, left_at, int(keeps), stop_at),
-        )
+        of_rows = table_at, kinds_at, *lengths, start_at, len(y0), first, n_steps, save_at, len(later), out_at
+        columns = lengths[0] * (n_steps - first)
+        self.called(run, len(y0), columns, stop, (*of_rows, finite_at, left_at, int(keeps), stop_at))
         if outputs is not out:
             out[:, begun:] = outputs
         if keeps:
@@ -222,4 +231,5 @@ class Rollouts:
         function = self.function("map", 1 if len(y) == 1 else self.lanes)
         arrays = entries, kinds, y, out
         table_at, kinds_at, rows_at, out_at = (x.ctypes.data for x in arrays)
-        function(table_at, kinds_at, len(kinds), kinds_at, 1, rows_at, len(y), out_at)
+        arguments = table_at, kinds_at, len(kinds), kinds_at, 1, rows_at, len(y), out_at
+        self.called(function, len(y), len(kinds), np.zeros(1, dtype=np.int64), arguments)

@@ -9,14 +9,15 @@ closing column is applied. One function is the run of a single trajectory, and o
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Numbers", "Stage", "map_function", "run_function", "step_function"]
+__all__ = ["LONGEST", "NUMBERS", "ROOM", "ROW", "WHOLE", "Memory", "Numbers", "Stage", "map_function", "run_function", "step_function"]
 
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
@@ -28,7 +29,13 @@ Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 
 
 def run_function(
-    n_values: int, n_out: int, size: int, stage: Stage, width: int = 1, own: bool = False
+    n_values: int,
+    n_out: int,
+    size: int,
+    stage: Stage,
+    width: int = 1,
+    own: bool = False,
+    memory: Memory | None = None,
 ) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side.
 
@@ -42,6 +49,8 @@ def run_function(
     width : int
     own : bool
         True if each trajectory has a table of its own.
+    memory : Memory, optional
+        Where states stand that are too long for registers.
 
     Returns
     -------
@@ -54,22 +63,23 @@ def run_function(
         where it goes on after `first` steps. Outputs are made after ``save[i]`` steps, later than `first`, with the
         closing column where `closes` is 1. `finite[i]` becomes the last step of row i that ends in a finite state; of
         trajectories side by side only whether it is `n_steps`, else −1. Where `keeps` is 1, `running` is left with the
-        state of the run. Ends soon if ``stop[0]`` becomes 1.
+        state of the run. Ends soon if ``stop[0]`` becomes 1. With `memory` there is one more address, of its context.
     """
     module = Module(host().fused)
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
+    types += [POINTER] * (memory is not None)
     code = module.function("run", types)
     table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite, running, keeps, stop = (
-        code.arguments
+        code.arguments[:15]
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
-    lanes = Lanes(code, n_values, width)
+    lanes = Lanes(code, n_values, n_values, width) if memory is None else Room(code, memory, code.arguments[15], n_out, n_values)
     with code.over(lanes.groups(n_rows)) as group:
         begin = group * width
         place = code.at(table, group * (link + 2) * (size * width)) if own else table
         column = _column(code, place, kinds, size, width if own else 1, width, stage)
-        state = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
-        n, saved, longest = code.variable(first), code.variable(zero), code.variable(code.constant(BLOCK, INT))
+        state = lanes.opened(rows, begin, n_rows)
+        n, saved, longest = code.variable(first), code.variable(zero), code.variable(lanes.block)
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
         alive = code.variable(code.constant(1, Type("i1", width)))
         going = code.variable(first < n_steps)
@@ -78,27 +88,27 @@ def run_function(
             left = saved.value < n_saved
             following = code.load(save, code.select(left, saved.value, zero), INT) - n.value
             k = code.select(left, code.apply("min", (k, following)), k)
-            before, j_before, step_before = [x.value for x in state], j.value, step.value
+            before, j_before, step_before = lanes.copied(state, 1), j.value, step.value
             with code.over(k * link):
                 at = j.value
-                _set(state, column(at, [x.value for x in state], step.value))
+                lanes.set(state, column(at, lanes.values(state), step.value))
                 j.value = code.select(code.apply("eq", (at, link)), one, at + 1)
                 step.value = code.select(code.apply("eq", (j.value, link)), step.value + 1, step.value)
-            end = [code.variable(x.value) for x in state]
+            end = lanes.copied(state, 2)
             with code.over(closes):
-                _set(end, column(link + 1, [x.value for x in end], step.value))
-            alive.value = alive.value & _finite(code, [x.value for x in end])
+                lanes.set(end, column(link + 1, lanes.values(end), step.value))
+            alive.value = alive.value & lanes.finite(end)
             good = code.any(alive.value)
             going.value = good & code.apply("eq", (code.load(stop, 0, INT, shared=True), zero))
             with code.given(good):
                 n.value = n.value + k
                 going.value = going.value & (n.value < n_steps)
                 with code.during(partial(_due, code, save, n_saved, saved, n)):
-                    lanes.store([x.value for x in end[:n_out]], out, begin, n_rows, n_saved, saved.value)
+                    lanes.kept(end, n_out, out, begin, n_rows, n_saved, saved.value)
                     saved.value = saved.value + 1
             if width == 1:  # again, step by step
                 with code.given(~good & (one < k)):
-                    _set(state, before)
+                    lanes.set(state, lanes.values(before))
                     j.value, step.value, longest.value = j_before, step_before, one
                     alive.value, going.value = code.constant(1, Type("i1")), code.constant(1, Type("i1"))
         if width == 1:
@@ -106,11 +116,13 @@ def run_function(
         else:
             lanes.mark(alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
-            lanes.store([x.value for x in state], running, begin, n_rows, one, zero)
+            lanes.kept(state, n_values, running, begin, n_rows, one, zero)
     return _finished(code, types)
 
 
-def map_function(n_values: int, n_out: int, size: int, stage: Stage, width: int = 1) -> Callable[..., None]:
+def map_function(
+    n_values: int, n_out: int, size: int, stage: Stage, width: int = 1, memory: Memory | None = None
+) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table.
 
     Returns
@@ -120,17 +132,18 @@ def map_function(n_values: int, n_out: int, size: int, stage: Stage, width: int 
         whole steps, in lanes the same for all of them; `out` may be `rows`.
     """
     types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER]
+    types += [POINTER] * (memory is not None)
     code = Module(host().fused).function("map", types)
-    table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments
-    lanes = Lanes(code, n_out, width)
+    table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
+    lanes = Lanes(code, n_values, n_out, width) if memory is None else Room(code, memory, code.arguments[8], n_out, n_out)
     column = _column(code, table, kinds, size, 1, width, stage)
     with code.over(lanes.groups(n_rows)) as group:
         begin = group * width
-        state = _opened(code, lanes.loaded(rows, begin, n_rows), n_values)
+        state = lanes.opened(rows, begin, n_rows)
         step = code.load(steps, code.op("srem", INT, begin, n_steps), INT)
         with code.over(n_columns) as j:
-            _set(state, column(j, [x.value for x in state], step))
-        lanes.store([x.value for x in state[:n_out]], out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
+            lanes.set(state, column(j, lanes.values(state), step))
+        lanes.kept(state, n_out, out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
     return _finished(code, types)
 
 
@@ -163,12 +176,12 @@ def step_function(
     types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER]
     code = Module(host().fused).function("steps", types)
     table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments
-    lanes, alone = Lanes(code, n_out + own, width), Lanes(code, 1, width)
+    lanes, alone = Lanes(code, n_values, n_out + own, width), Lanes(code, 1, 1, width)
     with code.over(lanes.groups(n_rows)) as group:
         begin = group * width
         (at,), (length,) = alone.loaded(x, begin, n_rows), alone.loaded(h, begin, n_rows)
         values = lanes.loaded(rows, begin, n_rows)
-        state = _opened(code, values[:n_out], n_values)
+        state = lanes.padded(values[:n_out])
         with code.over(n_columns) as j:
             given = []
             for r in range(len(powers)):
@@ -179,18 +192,56 @@ def step_function(
                 given.append(total.value)
             grown = [value * length**power if power else value for value, power in zip(given, powers, strict=True)]
             entries = numbers(*grown[: len(grown) - own], *values[n_out:])
-            _set(state, stage([s.value for s in state], entries.__getitem__, j, j))
-        lanes.store([s.value for s in state[:n_out]], out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
+            lanes.set(state, stage(lanes.values(state), entries.__getitem__, j, j))
+        lanes.kept(state, n_out, out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
     return _finished(code, types)
 
 
 class Lanes:
-    """Rows of memory as values of registers: `width` rows side by side, the last one again where there are fewer."""
+    """Rows of memory as values of registers: `width` rows side by side, the last one again where there are fewer.
 
-    def __init__(self, code: Code, n_values: int, width: int) -> None:
-        self.code, self.n_values, self.width = code, n_values, width
+    A row has `n_given` numbers, and a state `n_values`, of which those that are not given begin as 0.
+    """
+
+    def __init__(self, code: Code, n_values: int, n_given: int, width: int) -> None:
+        self.code, self.n_values, self.n_given, self.width = code, n_values, n_given, width
         self.type = Type("double", width)
-        self._buffer = None if width == 1 else code.memory(self.n_values, self.type)
+        self.block = code.constant(BLOCK, INT)
+        self._buffer = None if width == 1 else code.memory(max(n_values, n_given), self.type)
+
+    # a state, which consists of variables ---------------------------------------------------------------------------
+
+    def opened(self, rows: Value, begin: Value, n_rows: Value) -> list[Variable]:
+        return self.padded(self.loaded(rows, begin, n_rows))
+
+    def padded(self, x: Sequence[Value]) -> list[Variable]:
+        zero = self.code.constant(0.0, self.type)
+        return [self.code.variable(value) for value in [*x, *[zero] * (self.n_values - len(x))]]
+
+    def values(self, state: Any) -> list[Value]:
+        return [x.value for x in state]
+
+    def set(self, state: Any, values: Sequence[Value]) -> None:
+        for variable, value in zip(state, values, strict=True):
+            variable.value = value
+
+    def copied(self, state: Any, _: int) -> Any:
+        """A copy of a state: of its beginning (1) or its end (2)."""
+        return [self.code.variable(x.value) for x in state]
+
+    def finite(self, state: Any) -> Value:
+        """True where all values are finite: times 0 they are 0."""
+        first, *others = self.values(state)
+        total = first * 0.0
+        for value in others:
+            total = self.code.fma(value, self.code.constant(0.0, value.type), total)
+        return self.code.apply("eq", (total, 0.0))
+
+    def kept(self, state: Any, count: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        """Write the first values of a state to memory: see `store`."""
+        self.store(self.values(state)[:count], out, begin, n_rows, stride, at)
+
+    # rows -----------------------------------------------------------------------------------------------------------
 
     def groups(self, n_rows: Value) -> Value:
         if self.width == 1:
@@ -198,7 +249,7 @@ class Lanes:
         return self.code.op("sdiv", INT, n_rows + (self.width - 1), self.code.constant(self.width, INT))
 
     def loaded(self, rows: Value, begin: Value, n_rows: Value) -> list[Value]:
-        code, n = self.code, self.n_values
+        code, n = self.code, self.n_given
         if self._buffer is None:
             start = code.at(rows, begin * n)
             return [code.load(start, i) for i in range(n)]
@@ -235,6 +286,83 @@ class Lanes:
         return self.code.apply("min", (self.code.constant(self.width, INT), n_rows - begin))
 
 
+class Memory(Protocol):
+    """States in memory, of any length, which stages change in place: what `run_function` must know of them.
+
+    A context is an array of whole numbers: sizes, and addresses of what the caller provides, so that code depends on
+    neither. The first five are the address of room for three states, the numbers of a state, those of a row and of a
+    `whole` one, which holds errors too, and the steps between two looks for a state that is not finite. The values of a
+    state are its address and that of the context, and a stage returns these.
+    """
+
+    def load(self, code: Code, context: Value, row: Value, state: Value, whole: bool) -> None:
+        """Write code that makes a state of a row [q, p] or, if `whole`, of all that `keep` wrote."""
+
+    def keep(self, code: Code, context: Value, state: Value, row: Value, whole: bool) -> None:
+        """Write code of the inverse; one thread does that."""
+
+
+ROOM, NUMBERS, ROW, WHOLE, LONGEST = range(5)
+"""Numbers of a context."""
+_BLOCK = Type("double", 8)
+"""Numbers of a state that are copied at a time: it has a multiple of these."""
+
+
+class Room:
+    """A state in memory, in the place of `Lanes`, and its two copies."""
+
+    width = 1
+
+    def __init__(self, code: Code, memory: Memory, context: Value, n_out: int, n_given: int) -> None:
+        self.code, self._memory, self._context = code, memory, context
+        self._n_out, self._n_given = n_out, n_given
+        self.block, self._n, *rows = (code.load(context, i, INT) for i in (LONGEST, NUMBERS, ROW, WHOLE))
+        self._rows = dict(zip((False, True), rows, strict=True))
+        self._room = code.address(code.load(context, ROOM, INT))
+
+    def groups(self, n_rows: Value) -> Value:
+        return n_rows
+
+    def opened(self, rows: Value, begin: Value, n_rows: Value) -> Any:
+        whole = self._n_given > self._n_out
+        row = self.code.at(rows, begin * self._rows[whole])
+        self._memory.load(self.code, self._context, row, self._room, whole)
+        return self._room
+
+    def values(self, state: Any) -> list[Value]:
+        return [state, self._context]
+
+    def set(self, state: Any, values: Sequence[Value]) -> None:
+        if values[0] is not state:
+            self._copy(values[0], state)
+
+    def copied(self, state: Any, which: int) -> Any:
+        copy = self.code.at(self._room, self._n * which)
+        self._copy(state, copy)
+        return copy
+
+    def _copy(self, source: Value, target: Value) -> None:
+        with self._blocks() as i:
+            self.code.store(self.code.load(source, i, _BLOCK), target, i)
+
+    def finite(self, state: Any) -> Value:
+        code = self.code
+        total = code.variable(code.constant(0.0, _BLOCK))
+        with self._blocks() as i:
+            total.value = code.fma(code.load(state, i, _BLOCK), code.constant(0.0, _BLOCK), total.value)
+        return ~code.any(~code.apply("eq", (total.value, 0.0)))
+
+    @contextmanager
+    def _blocks(self) -> Iterator[Value]:
+        with self.code.over(self._n >> 3) as k:
+            yield k << 3
+
+    def kept(self, state: Any, count: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        whole = count > self._n_out
+        row = self.code.at(out, (begin * stride + at) * self._rows[whole])
+        self._memory.keep(self.code, self._context, state, row, whole)
+
+
 def _column(
     code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Stage
 ) -> Callable[[Value, list[Value], Value], list[Value]]:
@@ -251,25 +379,6 @@ def _column(
         return stage(values, number, code.load(kinds, j, INT), step)
 
     return at
-
-
-def _opened(code: Code, x: Sequence[Value], n_values: int) -> list[Variable]:
-    """Variables of a state, whose values after those given are 0."""
-    zero = code.constant(0.0, x[0].type)
-    return [code.variable(value) for value in [*x, *[zero] * (n_values - len(x))]]
-
-
-def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:
-    for variable, value in zip(variables, values, strict=True):
-        variable.value = value
-
-
-def _finite(code: Code, x: Sequence[Value]) -> Value:
-    """True where all values are finite: times 0 they are 0."""
-    total = x[0] * 0.0
-    for value in x[1:]:
-        total = code.fma(value, code.constant(0.0, value.type), total)
-    return code.apply("eq", (total, 0.0))
 
 
 def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) -> Value:

@@ -1,0 +1,487 @@
+"""Splitting methods on bodies that interact in pairs: forces of any potential of one pair, over traced numbers.
+
+A few bodies are a symbolic system whose pairs are written out. Of more, states stand in memory, and one body meets a
+register of others at a time; with a cut-off bodies are sorted into cells, and each meets those of the cells around its
+own. Each pair is met once: its force is added to one body and taken from the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy as sp
+
+from sympflow.compiler.arrange import Arranged, Arrangement
+from sympflow.compiler.control import INT, Code, Type, Value
+from sympflow.hamiltonian.bodies import PairsHamiltonian
+from sympflow.hamiltonian.recorded import evaluator
+from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
+from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.runs import LONGEST, NUMBERS, ROOM, ROW, WHOLE, Numbers
+from sympflow.kernels.teams import Team, meet
+from sympflow.kernels.threads import threads_for
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+
+__all__ = ["Few", "PairCode", "PairForces", "is_few"]
+
+KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
+"""The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
+LANES = 8
+"""Bodies that one meets at a time."""
+CHUNKS, WORTH_CHUNKS = 8, 100_000
+"""Chunks of a sum, which threads share, and about how many nanoseconds a sum takes from which there are more than one:
+threads wait for each other after each sum."""
+BLOCK, MOMENT = 1024, 200_000_000
+"""Most steps between two looks for an interrupt, and about how many nanoseconds they may take."""
+
+
+def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Arranged:
+    """The derivatives of V by s, those of `kinds` with factors 2ᵏ: a program of s, columns of both bodies, constants.
+
+    A number that is known for a body is multiplied before those of its partners.
+    """
+    states = [(local.s.name, 0), *((a.name, -40) for a in local.first), *((b.name, -20) for b in local.second)]
+    made = Arrangement(states, [c.name for c in local.c])
+    letters = (local.s, *local.first, *local.second, *local.c)
+    value = evaluator(dict(zip(letters, (*made.states, *made.constants), strict=True)))
+    return made.finish([made.written(made.number(value(local.slopes[k]))) for k in kinds])
+
+
+class Pair(NamedTuple):
+    """A body and its partners: the differences d of positions and u of velocities, and the derivatives of V."""
+
+    d: list[Value]
+    u: list[Value]
+    g: list[Value]
+
+
+class PairLaw:
+    """The forces of one pair, of one kind of sum.
+
+    Parameters
+    ----------
+    local : PairsHamiltonian
+    kinds : sequence of int
+        The derivatives of V that are computed.
+    """
+
+    def __init__(self, local: PairsHamiltonian, kinds: Sequence[int]) -> None:
+        self.dim, self.cut, self.periodic = local.dim, local.cutoff is not None, local.box is not None
+        self.program = slopes_of(local, kinds)
+        self.n_numbers = 2 + 2 * local.dim + len(self.program.table.outputs)
+        self._local = local
+
+    def numbers(self) -> np.ndarray:
+        """ε², the largest s, the sides of the box and their inverses, and what the derivatives need."""
+        local = self._local
+        end = math.inf if local.cutoff is None else local.cutoff**2 + local.softening**2
+        box = np.zeros(local.dim) if local.box is None else local.box
+        inverse = np.zeros(local.dim) if local.box is None else 1 / local.box
+        return np.array([local.softening**2, end, *box, *inverse, *self.program.table(*local.constants)])
+
+    def met(
+        self,
+        numbers: Sequence[Value],
+        own: Sequence[Value],
+        other: Sequence[Value],
+        columns: Sequence[Value],
+        inside: Value | None = None,
+    ) -> Pair:
+        """A body with positions, and velocities behind them, and its partners, which are `inside`; 0 for others."""
+        code, dim = own[0].code, self.dim
+        softening, end, rest = numbers[0], numbers[1], numbers[2 + 2 * dim :]
+        d, u = ([a - b for a, b in zip(own[k:][:dim], other[k:][:dim], strict=True)] for k in (0, dim))
+        if self.periodic:
+            box, inverse = numbers[2:][:dim], numbers[2 + dim :][:dim]
+            d = [
+                x - side * code.apply("floor", (code.fma(x, over, code.operand(0.5, x.type)),))
+                for x, side, over in zip(d, box, inverse, strict=True)
+            ]
+        s = softening
+        for x in d:
+            s = code.fma(x, x, s)
+        if self.cut:
+            inside = s < end if inside is None else inside & (s < end)
+        g = self.program.body(s, *columns, *rest)
+        if inside is not None:
+            g = [code.apply("where", (inside, code.operand(x, s.type), 0.0)) for x in g]
+        return Pair(d, u, g)
+
+    def parts(self, kind: str, pair: Pair) -> list[tuple[Value, list[Value]]]:
+        """Factors of vectors, whose sum is the part of the pair in the sum of its first body."""
+        d, u, g = pair
+        if kind == "gradient":
+            return [(g[0], d)]
+        e = dot(d, u)
+        if kind == "hessian_vector":
+            return [(g[1] * e, d), (g[0], u)]
+        return [(0.5 * (g[1] * e * e + g[0] * dot(u, u)), d), (g[0] * e, u)]
+
+
+def summed(total: Value, parts: Sequence[tuple[Value, list[Value]]], axis: int, sign: float = 1.0) -> Value:
+    """A sum with the part of a pair along an axis."""
+    for factor, x in parts:
+        total = total.code.fma(factor if sign > 0 else -factor, x[axis], total)
+    return total
+
+
+def dot(x: Sequence[Value], y: Sequence[Value]) -> Value:
+    total = x[0] * y[0]
+    for a, b in zip(x[1:], y[1:], strict=True):
+        total = total.code.fma(a, b, total)
+    return total
+
+
+def aligned(n: int) -> np.ndarray:
+    """Zeros, the first of them where a line of the cache begins."""
+    x = np.zeros(n + 8)
+    first = -x.ctypes.data // 8 % 8
+    return x[first : first + n]
+
+
+# more bodies than a few: states in memory ---------------------------------------------------------------------------
+
+FIELDS = ("bodies", "size", "chunks", "member", "members", "sites", "numbers", "work", "sorted", "order", "cells")
+FIELDS += ("most_cells", "sums", "turn", "meeting", "stop")
+"""Numbers of a context behind those of `Room`: sizes, addresses, and the sums that are in turn."""
+_FIRST = LONGEST + 1
+_LANES = Type("double", LANES)
+
+
+def field(context: Value, name: str) -> Value:
+    return context.code.load(context, _FIRST + FIELDS.index(name), INT)
+
+
+def place(context: Value, name: str) -> Value:
+    return context.code.address(field(context, name))
+
+
+class PairStages:
+    """The code of stages that change a state in memory: arrays (sets, dim, size) of q, p and, compensated, their errors.
+
+    `sites` has a row of 1/m and one of each column. `work` holds the sum that was taken last and, behind it, the
+    velocities that sums are taken along.
+    """
+
+    def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
+        self.dim, self.columns = local.dim, len(local.first)
+        self.level, self.compensated, self.damped = level, compensated, damped
+        self.helpers = {0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level]
+        self.laws = {kind: PairLaw(local, KINDS[kind]) for kind in tuple(KINDS)[: self.helpers]}
+        self.cells = None if local.cutoff is None else Cells(local.dim, local.box is not None)
+
+    def numbers(self) -> np.ndarray:
+        """The numbers of all laws."""
+        return np.concatenate([law.numbers() for law in self.laws.values()])
+
+    # a state ----------------------------------------------------------------------------------------------------------
+
+    def load(self, code: Code, context: Value, row: Value, state: Value, whole: bool) -> None:
+        for at, end in self._numbers_of(context, whole):
+            code.store(code.load(row, end), state, at)
+
+    def keep(self, code: Code, context: Value, state: Value, row: Value, whole: bool) -> None:
+        with code.given(code.apply("eq", (field(context, "member"), 0))):
+            for at, end in self._numbers_of(context, whole):
+                code.store(code.load(state, at), row, end)
+
+    def _numbers_of(self, context: Value, whole: bool) -> Any:
+        """The places of each number, in a state and in a row: all are visited by the code that is written next."""
+        n, size = field(context, "bodies"), field(context, "size")
+        sets = 4 if self.compensated and whole else 2
+        for s in range(sets):
+            with context.code.over(n) as i:
+                for k in range(self.dim):
+                    yield size * (s * self.dim + k) + i, (n * s + i) * self.dim + k
+
+    # a stage ----------------------------------------------------------------------------------------------------------
+
+    def stage(self, context: Value, state: Value, kind: Value, numbers: Sequence[Value]) -> None:
+        """Kicks of the sums that a kind of kick has, and a drift."""
+        code = state.code
+        code.outlined("stage", (state, context, kind, *numbers), self._stage)
+
+    def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
+        """A plain kick (1), one with a force gradient (2), one with curvature terms (3), each the one before and more."""
+        code = state.code
+        a, b, *more = numbers
+        with code.given(kind > 0):
+            self._kick(context, state, "gradient", 0, -b, kind > 1, 1)
+        if self.level:
+            g = more[0]
+            with code.given(kind > 1):
+                self._kick(context, state, "hessian_vector", 1, g, kind > 2, 2)
+        if self.level == CURVATURE:
+            c = -more[1]
+            with code.given(kind > 2):
+                self._kick(context, state, "bend", 1, c)
+                self._kick(context, state, "hessian_vector", 2, c)
+        size, sites = field(context, "size"), place(context, "sites")
+        factors = more[-2:] if self.damped else [a]
+        factors = [code.splat(x, LANES) for x in factors]
+        with self._blocks(size) as i:
+            w = code.load(sites, i, _LANES)
+            for k in range(self.dim):
+                p = code.load(state, size * (self.dim + k) + i, _LANES)
+                self._add(state, size, k, i, factors[0], w * p)
+                if self.damped:
+                    code.store(p * factors[1], state, size * (self.dim + k) + i)
+
+    def _kick(
+        self,
+        context: Value,
+        state: Value,
+        kind: str,
+        along: int,
+        factor: Value,
+        kept: Value | None = None,
+        helper: int = 0,
+    ) -> None:
+        """A kick by a sum, which is kept as a velocity where a condition holds."""
+        code, dim = state.code, self.dim
+        size, work = field(context, "size"), place(context, "work")
+        code.outlined(f"sum_{kind}", (context, state, code.at(work, size * (dim * along))), self._sum(kind))
+        factor = code.splat(factor, LANES)
+        with self._blocks(size * dim) as i:
+            self._add(state, size, dim, i, factor, code.load(work, i, _LANES))
+        if kept is None or helper >= self.helpers:
+            return
+        sites = place(context, "sites")
+        with code.given(kept), self._blocks(size) as i:
+            w = code.load(sites, i, _LANES)
+            for k in range(dim):
+                code.store(w * code.load(work, size * k + i, _LANES), work, size * (dim * helper + k) + i)
+
+    def _add(self, state: Value, size: Value, row: int, i: Value, factor: Value, x: Value) -> None:
+        """Add a change, factor·x, to numbers of a row of a state."""
+        code = state.code
+        at = size * row + i
+        value = code.load(state, at, _LANES)
+        if not self.compensated:
+            code.store(code.fma(factor, x, value), state, at)
+            return
+        error = size * (2 * self.dim) + at
+        corrected = factor * x - code.load(state, error, _LANES)
+        total = value + corrected
+        code.store((total - value) - corrected, state, error)
+        code.store(total, state, at)
+
+    @contextmanager
+    def _blocks(self, size: Value) -> Iterator[Value]:
+        with size.code.over(size >> 3) as k:
+            yield k << 3
+
+    # a sum ------------------------------------------------------------------------------------------------------------
+
+    def _sum(self, kind: str) -> Callable[[Value, Value, Value], None]:
+        """The sum over all pairs, of this thread's chunks and, when all threads are here, of all chunks."""
+
+        def body(context: Value, state: Value, along: Value) -> None:
+            code, dim = state.code, self.dim
+            n, size, chunks, member, members = (field(context, name) for name in FIELDS[:5])
+            rows = self._rows(kind, context, state, along)
+            turn = code.constant(1, INT) - field(context, "turn")
+            code.store(turn, context, _FIRST + FIELDS.index("turn"))
+            sums = code.at(place(context, "sums"), turn * (chunks * (size * dim)))
+            begin, end = (code.op("sdiv", INT, chunks * m, members) for m in (member, member + 1))
+            with code.over(end - begin) as k:
+                chunk = begin + k
+                F = code.at(sums, chunk * (size * dim))
+                with self._blocks(size * dim) as i:
+                    code.store(code.constant(0.0, _LANES), F, i)
+                self._chunk(kind, context, rows, F, chunk, chunks, n)
+            meet(field(context, "meeting"), members, field(context, "stop"))
+            work, order = place(context, "work"), place(context, "order")
+            to = work if self.cells is None else code.at(place(context, "sorted"), size * dim)
+            with self._blocks(size * dim) as i:
+                total = code.variable(code.load(sums, i, _LANES))
+                with code.over(chunks - 1) as k:
+                    total.value = total.value + code.load(sums, (k + 1) * (size * dim) + i, _LANES)
+                code.store(total.value, to, i)
+            if self.cells:
+                with code.over(n) as i:
+                    at = code.load(order, i, INT)
+                    for k in range(dim):
+                        code.store(code.load(to, size * k + i), work, size * k + at)
+
+        return body
+
+    def _rows(self, kind: str, context: Value, state: Value, along: Value) -> list[Value]:
+        """Rows of what a pair depends on: coordinates, velocities along which a sum is taken, columns.
+
+        With cells they are in the order of these: that of coordinates and columns is made with the first sum of a kick.
+        """
+        code, dim = state.code, self.dim
+        size, sites = field(context, "size"), place(context, "sites")
+        x, v, c = (
+            [code.at(first, size * (k + shift)) for k in range(count)]
+            for first, shift, count in (
+                (state, 0, dim),
+                (along, 0, 0 if kind == "gradient" else dim),
+                (sites, 1, self.columns),
+            )
+        )
+        if self.cells is None:
+            return [*x, *v, *c]
+        n, order, ready = field(context, "bodies"), place(context, "order"), place(context, "sorted")
+        to = [code.at(ready, size * k) for k in range(2 * dim + self.columns)]
+        moved = list(zip(v, to[dim:], strict=False))
+        if kind == "gradient":
+            law = self.laws[kind]
+            numbers = place(context, "numbers")
+            end, softening = code.load(numbers, 1), code.load(numbers)
+            cutoff = code.apply("sqrt", (end - softening,))
+            box = [code.load(numbers, 2 + k) for k in range(dim)] if law.periodic else []
+            self.cells.sort(
+                state, n, size, field(context, "most_cells"), cutoff, box, order, place(context, "cells")
+            )
+            moved = list(zip([*x, *c], [*to[:dim], *to[2 * dim :]], strict=True))
+        with code.over(n) as i:
+            at = code.load(order, i, INT)
+            for source, target in moved:
+                code.store(code.load(source, at), target, i)
+        return [*to[:dim], *to[dim:][: len(v)], *to[2 * dim :]]
+
+    def _chunk(
+        self, kind: str, context: Value, rows: Sequence[Value], F: Value, chunk: Value, chunks: Value, n: Value
+    ) -> None:
+        """The pairs of each body of a chunk: of one in so many."""
+        code, law, dim = F.code, self.laws[kind], self.dim
+        size, moved = field(context, "size"), len(rows) - self.columns
+        start = sum(self.laws[k].n_numbers for k in tuple(self.laws)[: tuple(self.laws).index(kind)])
+        given = place(context, "numbers")
+        numbers = [code.splat(code.load(given, start + i), LANES) for i in range(law.n_numbers)]
+        lanes, zero = code.lane_numbers(LANES), code.constant(0.0, _LANES)
+        found, cell = code.memory(2 * MOST_RANGES, INT), code.variable(code.constant(0, INT))
+        cells = None if self.cells is None else place(context, "cells")
+        with code.over(code.op("sdiv", INT, n - chunk + (chunks - 1), chunks)) as turn:
+            i = chunk + turn * chunks
+            mine = [code.splat(code.load(row, i), LANES) for row in rows]
+            totals = [code.variable(zero) for _ in range(dim)]
+
+            def meets(first: Value, last: Value) -> None:
+                bounds = code.splat(first - 1, LANES), code.splat(last, LANES)
+
+                def block(k: Value, sums: Sequence[Value]) -> list[Value]:
+                    j = ((first >> 3) + k) << 3
+                    number = code.splat(j, LANES) + lanes
+                    other = [code.load(row, j, _LANES) for row in rows]
+                    pair = law.met(
+                        numbers,
+                        mine[:moved],
+                        other[:moved],
+                        [*mine[moved:], *other[moved:]],
+                        (bounds[0] < number) & (number < bounds[1]),
+                    )
+                    parts = law.parts(kind, pair)
+                    for axis in range(dim):
+                        at = size * axis + j
+                        code.store(summed(code.load(F, at, _LANES), parts, axis, -1.0), F, at)
+                    return [summed(total, parts, axis) for axis, total in enumerate(sums)]
+
+                count = ((last + (LANES - 1)) >> 3) - (first >> 3)
+                for variable, total in zip(totals, code.loop(count, [x.value for x in totals], block), strict=True):
+                    variable.value = total
+
+            if cells is None:
+                meets(i + 1, n)
+            else:
+                with code.over(self.cells.ranges(code, i, n, cell, cells, found)) as k:
+                    meets(code.load(found, k * 2, INT), code.load(found, k * 2 + 1, INT))
+            for axis, variable in enumerate(totals):
+                at = size * axis + i
+                code.store(code.load(F, at) + code.total(variable.value), F, at)
+
+
+class PairCode(Rollouts):
+    """The compiled functions of splitting schemes on bodies in pairs, of which only the potential is part of the code.
+
+    Parameters
+    ----------
+    local : PairsHamiltonian
+    level : int
+        See `Scheme`.
+    compensated : bool
+    damped : bool
+        True if there is friction −γp, whose numbers are the last two rows of a table.
+    """
+
+    lanes = 1
+
+    def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
+        if level == POLYNOMIAL:
+            raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+        self._given = local, level, compensated, damped
+        self._local = local
+        self.memory = self._stages = PairStages(local, level, compensated, damped)
+        self._numbers = self._stages.numbers()
+        n = local.n_bodies
+        self._sites = aligned((1 + len(local.columns)) * (-(-n // LANES) * LANES))
+        sites = self._sites.reshape(1 + len(local.columns), -1)
+        sites[0, :n], sites[1:, :n] = 1 / local.masses, local.columns
+        super().__init__(2 * local.ndof * (1 + compensated), 2 * local.ndof)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PairCode, self._given
+
+    @cached_property
+    def size(self) -> int:
+        return self._stages.helpers + 1 + 2 * self._stages.damped
+
+    def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+        state, context = values
+        self._stages.stage(context, state, kind, [numbers(i) for i in range(self.size)])
+        return values
+
+    def prepared(self, table: np.ndarray) -> Columns:
+        """The columns of a table, and which sums their kicks have."""
+        kinds = np.zeros(table.shape[1], dtype=np.int64)
+        for k in range(1, 1 + self._stages.helpers):
+            kinds[table[k] != 0] = k
+        return np.ascontiguousarray(table.T), kinds
+
+    def called(
+        self, function: Callable[..., None], n_rows: int, n_columns: int, stop: np.ndarray, arguments: tuple[int, ...]
+    ) -> None:
+        """Call a compiled run or map; one state is shared by several threads where that pays."""
+        local, stages = self._local, self._stages
+        n, dim = local.n_bodies, local.dim
+        size, chunks = -(-n // LANES) * LANES, CHUNKS if local.work >= WORTH_CHUNKS else 1
+        team = Team(threads_for(chunks, n_columns * local.work, None) if n_rows == 1 else 1)
+        numbers, sites = self._numbers, self._sites
+        sums, meeting = aligned(2 * chunks * dim * size), np.zeros(16, dtype=np.int64)
+        block = max(1, min(BLOCK, MOMENT // max(1, local.work)))
+        row, sets = 2 * local.ndof, 4 if stages.compensated else 2
+        most = most_along(n, dim)
+
+        def member(k: int) -> None:
+            room, work = aligned(3 * sets * dim * size), aligned(stages.helpers * dim * size)
+            ready = aligned((2 * dim + stages.columns) * size * (stages.cells is not None))
+            order, cells = np.arange(n), np.zeros(most_cells(n, dim) * (stages.cells is not None), dtype=np.int64)
+            arrays = {"sites": sites, "numbers": numbers, "work": work, "sorted": ready, "order": order}
+            arrays |= {"cells": cells, "sums": sums, "meeting": meeting, "stop": stop}
+            given = {"bodies": n, "size": size, "chunks": chunks, "member": k, "members": team.threads}
+            given |= {"most_cells": most, "turn": 0} | {name: x.ctypes.data for name, x in arrays.items()}
+            first = room.ctypes.data, sets * dim * size, row, row * sets // 2, block
+            context = np.array([*first, *(given[name] for name in FIELDS)], dtype=np.int64)
+            function(*arguments, context.ctypes.data)
+
+        team(member, stop)
+
+    def step_rows(
+        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
+        numbers = np.zeros((*table.shape[:2], len(h)))
+        for k in range(table.shape[2] - 1, -1, -1):
+            numbers = numbers * x + table[:, :, k, None]
+        powers = np.array([1, 1, 3, 5])[: len(table)]
+        tables = (numbers * h ** powers[:, None, None]).transpose(2, 0, 1)
+        for i, each in enumerate(tables):
+            self.mapped(each, y[i : i + 1], out[i : i + 1])
