@@ -19,11 +19,13 @@ import sympy as sp
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import INT, Code, Type, Value
+from sympflow.compiler.functions import apply
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import LONGEST, NUMBERS, ROOM, ROW, WHOLE, Numbers
+from sympflow.kernels.splittings import Shape, Splitting
 from sympflow.kernels.teams import Team, meet
 from sympflow.kernels.threads import threads_for
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
@@ -32,7 +34,8 @@ __all__ = ["Few", "PairCode", "PairForces", "is_few"]
 
 KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
 """The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
-LANES = 8
+SHIFT = 3
+LANES = 1 << SHIFT
 """Bodies that one meets at a time."""
 CHUNKS, WORTH_CHUNKS = 8, 100_000
 """Chunks of a sum, which threads share, and about how many nanoseconds a sum takes from which there are more than one:
@@ -136,6 +139,161 @@ def dot(x: Sequence[Value], y: Sequence[Value]) -> Value:
     for a, b in zip(x[1:], y[1:], strict=True):
         total = total.code.fma(a, b, total)
     return total
+
+
+# a few bodies: their pairs written out ------------------------------------------------------------------------------
+
+MOST_WRITTEN = 6
+"""Bodies whose pairs are written out."""
+
+
+@dataclass(frozen=True)
+class FewSymbols:
+    """A few bodies in the place of a symbolic Hamiltonian, whose parameters are all that a pair depends on."""
+
+    local: PairsHamiltonian
+    T = None
+
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """The values of the parameters, by their names."""
+        local, named = self.local, {}
+        for c, value in zip(local.c, local.constants, strict=True):
+            named[c.name] = value
+        named["softening"] = local.softening**2
+        for k, side in enumerate(() if local.box is None else local.box.tolist()):
+            named |= {f"box_{k}": side, f"over_box_{k}": 1 / side}
+        for i, mass in enumerate(local.masses.tolist()):
+            named[f"w_{i}"] = 1 / mass
+        for i, column in enumerate(local.columns):
+            named |= {f"column_{i}_{k}": x for k, x in enumerate(column.tolist())}
+        return named
+
+    @property
+    def ndof(self) -> int:
+        return self.local.ndof
+
+    @property
+    def parametric(self) -> FewSymbols:
+        return self
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        return tuple(self.numbers.values())
+
+    @property
+    def parameters(self) -> tuple[sp.Symbol, ...]:
+        return tuple(map(sp.Symbol, self.numbers))
+
+    @property
+    def q(self) -> tuple[sp.Symbol, ...]:
+        return tuple(sp.Symbol(f"q{i + 1}") for i in range(self.ndof))
+
+    @property
+    def p(self) -> tuple[sp.Symbol, ...]:
+        return tuple(sp.Symbol(f"p{i + 1}") for i in range(self.ndof))
+
+    @cached_property
+    def inverse_mass(self) -> sp.Matrix:
+        return sp.diag(*(sp.Symbol(f"w_{i // self.local.dim}") for i in range(self.ndof)))
+
+
+class FewSplitting(Splitting):
+    """The kicks and drifts of a few bodies."""
+
+    def _arranged(self, terms: int) -> Arranged:
+        return FewShape(self, terms, True).arranged()[1]
+
+
+class FewShape(Shape):
+    """A stage of a few bodies: of each pair one square root and one division at most, whose values both bodies share."""
+
+    def _kicked(self) -> list[Any]:
+        return self._moved([self.made.node(p) for p in self.p])
+
+    def _changes(self) -> list[Any]:
+        return [self.made.letter(x) for x in self._moved([0.0] * self.d)]
+
+    def _moved(self, momenta: list[Any]) -> list[Any]:
+        """Momenta, numbers of the body, after the kick."""
+        made, op = self.made, self.made.operation
+        b, *more = (self.number[name] for name in self.splitting.kick_numbers)
+        if self.terms == 1:
+            return self._sum("gradient", [], momenta, -b)
+        nothing: list[Any] = [0.0] * self.d
+
+        def moved(by: Any, x: Sequence[Any]) -> list[Any]:
+            return [op("fma", made.written(by), a, p) for a, p in zip(x, momenta, strict=True)]
+
+        slope = self._sum("gradient", [], nothing)
+        momenta = moved(-b, slope)
+        v = self._velocities(slope)
+        product = self._sum("hessian_vector", v, nothing)
+        momenta = moved(more[0], product)
+        if self.terms > 2:
+            bent = self._sum("bend", v, self._sum("hessian_vector", self._velocities(product), nothing))
+            momenta = moved(-more[1], bent)
+        return momenta
+
+    def _velocities(self, x: Sequence[Any]) -> list[Any]:
+        return [self.made.written(y) for y in self._by_mass([self.made.letter(y) for y in x])]
+
+    def _sum(self, kind: str, v: Sequence[Any], start: Sequence[Any], factor: Any = None) -> list[Any]:
+        """A sum over all pairs of numbers of the body, behind others, of a kind of `KINDS` along v."""
+        op, dim, total = self.made.operation, self.symbols.local.dim, list(start)
+        for (i, j), (d, s) in self._pairs.items():
+            g = [self._slope(i, j, s, k, factor) for k in KINDS[kind]]
+            u = [op("sub", v[dim * i + k], v[dim * j + k]) for k in range(dim if v else 0)]
+            parts = [(g[0], d)]
+            if kind == "hessian_vector":
+                parts = [(op("mul", g[1], self._dot(d, u)), d), (g[0], u)]
+            elif kind == "bend":
+                e = self._dot(d, u)
+                square = op("fma", op("mul", g[1], e), e, op("mul", g[0], self._dot(u, u)))
+                parts = [(op("mul", 0.5, square), d), (op("mul", g[0], e), u)]
+            for x, vector in parts:
+                for k in range(dim):
+                    total[dim * i + k] = op("fma", x, vector[k], total[dim * i + k])
+                    total[dim * j + k] = op("fma", op("neg", x), vector[k], total[dim * j + k])
+        return total
+
+    def _dot(self, x: Sequence[Any], y: Sequence[Any]) -> Any:
+        op = self.made.operation
+        total = op("mul", x[0], y[0])
+        for a, b in zip(x[1:], y[1:], strict=True):
+            total = op("fma", a, b, total)
+        return total
+
+    @cached_property
+    def _pairs(self) -> dict[tuple[int, int], tuple[list[Any], Any]]:
+        """The differences of the coordinates of each two bodies, and s."""
+        local, made = self.symbols.local, self.made
+        pairs = {}
+        for i in range(local.n_bodies):
+            for j in range(i + 1, local.n_bodies):
+                d = [made.written(self.q[local.dim * i + k] - self.q[local.dim * j + k]) for k in range(local.dim)]
+                if local.box is not None:
+                    for k, x in enumerate(map(made.letter, d)):
+                        image = apply("floor", self.number[f"over_box_{k}"] * x + 0.5)
+                        d[k] = made.written(x - self.number[f"box_{k}"] * image)
+                s = made.written(self.number["softening"])
+                for x in d:
+                    s = made.operation("fma", x, x, s)
+                pairs[i, j] = d, s
+        return pairs
+
+    def _slope(self, i: int, j: int, s: Any, kind: int, factor: Any) -> Any:
+        """A derivative of V by s, times a factor."""
+        local, made = self.symbols.local, self.made
+        columns = [self.number[f"column_{c}_{body}"] for body in (i, j) for c in range(len(local.columns))]
+        letter = made.letter(s)
+        letters = (local.s, *local.first, *local.second, *local.c)
+        values = (letter, *columns, *(self.number[c.name] for c in local.c))
+        slope = evaluator(dict(zip(letters, values, strict=True)))(local.slopes[kind])
+        slope = made.written(slope if factor is None else factor * slope)
+        if local.cutoff is None:
+            return slope
+        return made.operation("where", made.operation("lt", s, made.written(self.number["end"])), slope, 0.0)
 
 
 def aligned(n: int) -> np.ndarray:
@@ -274,8 +432,8 @@ class PairStages:
 
     @contextmanager
     def _blocks(self, size: Value) -> Iterator[Value]:
-        with size.code.over(size >> 3) as k:
-            yield k << 3
+        with size.code.over(size >> SHIFT) as k:
+            yield k << SHIFT
 
     # a sum ------------------------------------------------------------------------------------------------------------
 
@@ -369,7 +527,7 @@ class PairStages:
                 bounds = code.splat(first - 1, LANES), code.splat(last, LANES)
 
                 def block(k: Value, sums: Sequence[Value]) -> list[Value]:
-                    j = ((first >> 3) + k) << 3
+                    j = ((first >> SHIFT) + k) << SHIFT
                     number = code.splat(j, LANES) + lanes
                     other = [code.load(row, j, _LANES) for row in rows]
                     pair = law.met(
@@ -385,7 +543,7 @@ class PairStages:
                         code.store(summed(code.load(F, at, _LANES), parts, axis, -1.0), F, at)
                     return [summed(total, parts, axis) for axis, total in enumerate(sums)]
 
-                count = ((last + (LANES - 1)) >> 3) - (first >> 3)
+                count = ((last + (LANES - 1)) >> SHIFT) - (first >> SHIFT)
                 for variable, total in zip(totals, code.loop(count, [x.value for x in totals], block), strict=True):
                     variable.value = total
 

@@ -28,7 +28,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["SplittingCode"]
+__all__ = ["Shape", "Splitting", "SplittingCode"]
 
 MOST_TABLES = 64  # that are kept
 EARLY = -4  # when momenta are known before the positions, in cycles
@@ -76,11 +76,11 @@ class Splitting:
 
     def _arranged(self, terms: int) -> Arranged:
         """The stage as a program, the shape with the shortest chain and the fewest operations of two."""
-        shapes = [_Shape(self, terms, expand).arranged() for expand in ((True, False) if terms > 1 else (True,))]
+        shapes = [Shape(self, terms, expand).arranged() for expand in ((True, False) if terms > 1 else (True,))]
         return min(shapes, key=lambda shape: shape[0])[1]
 
 
-class _Shape:
+class Shape:
     """One way to write a stage: products of sums multiplied out, or left."""
 
     def __init__(self, splitting: Splitting, terms: int, expand: bool) -> None:
@@ -101,19 +101,22 @@ class _Shape:
     def arranged(self) -> tuple[int, Arranged]:
         """The cost of the stage, and its programs."""
         made, d = self.made, self.d
-        changes = self._changes()
         errors: list[Any] = []
         if self.splitting.compensated:
-            momenta, errors_p = self._compensated(self.p, [made.written(x) for x in changes], self.errors[d:])
+            changes = [made.written(x) for x in self._changes()]
+            momenta, errors_p = self._compensated(self.p, changes, self.errors[d:])
             moves = [made.written(x) for x in self._velocity(momenta, self.number["a"])]
             positions, errors_q = self._compensated(self.q, moves, self.errors[:d])
             errors = [*errors_q, *errors_p]
         else:
-            momenta = [made.written(p + x) for p, x in zip(self.p, changes, strict=True)]
-            positions, momenta = self._drifted(momenta)
+            positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
         arranged = made.finish(outputs)
         return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
+
+    def _kicked(self) -> list[Any]:
+        """The momenta after a kick, numbers of the body."""
+        return [self.made.written(p + x) for p, x in zip(self.p, self._changes(), strict=True)]
 
     def _changes(self) -> list[Any]:
         """The change of p by a kick."""
