@@ -32,6 +32,16 @@ def test_a_verlet_solve_loads_no_torch(backend):
     assert not loaded_after(code) & {"torch", "matplotlib", "torchdiffeq", "safetensors"}
 
 
+@pytest.mark.parametrize("scene", ["henon_heiles", "pendulum", "fput_beta", "driven_pendulum"])
+def test_a_primed_flow_that_ships_loads_no_torch(scene):
+    code = (
+        "import sympflow\n"
+        f"sol = sympflow.solve(sympflow.systems.{scene}(), 'sympflow', (0, 10))\n"
+        "assert sol.success and sol.stats['backend'] == 'compiled'"
+    )
+    assert "torch" not in loaded_after(code)
+
+
 def test_scipy_methods_load_no_torch():
     code = "import sympflow\nsympflow.solve(sympflow.systems.pendulum(), 'rk45', (0, 1))"
     assert loaded_after(code) == {"sympy", "scipy"}

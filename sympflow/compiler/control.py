@@ -542,4 +542,4 @@ class Code:
         self._lines.append(f"  br label %{label}")
 
 
-_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1}
+_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1, "ptr": 8}

@@ -530,9 +530,10 @@ class MLPPotential(Potential):
         return NetworkLayer(*first, biases, weights, array(w), self._sigma.compiled)
 
     def trained(self) -> TrainedNetwork | None:
-        from sympflow.kernels.network_tangents import BENDING, TrainedNetwork
+        from sympflow.kernels.activations import SLOPES
+        from sympflow.kernels.network_tangents import TrainedNetwork
 
-        if self.activation not in BENDING or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
+        if self.activation not in SLOPES or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
             return None
         inner = [*self.biases, *self.weights]
         units = [1 / self.scale.expand_as(self.weight_x), 1 / self.tau.expand_as(self.weight_t)]

@@ -12,13 +12,6 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.flow.families import family
-from sympflow.flow.files import (
-    MAX_LAYERS,
-    MAX_PARAMETERS,
-    Refused,
-    checked_widths,
-    count_parameters,
-)
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
 from sympflow.flow.potentials import (
@@ -30,6 +23,7 @@ from sympflow.flow.potentials import (
     module_weights,
     potential_named,
 )
+from sympflow.flow.records import MAX_LAYERS, MAX_PARAMETERS, Refused, checked_widths, count_parameters
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import Kept, check_compilable, check_memory
 from sympflow.hamiltonian.system import HamiltonianSystem

@@ -39,7 +39,10 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.approximations import Ranges
+    from sympflow.hamiltonian.local import LocalHamiltonian
+    from sympflow.kernels.rollouts import Rollouts
     from sympflow.kernels.sized_loops import SizedLoops
+    from sympflow.kernels.splittings import Splitting
     from sympflow.kernels.stage_times import Driving
 
 MOST_COUPLED = 6
@@ -307,17 +310,28 @@ def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> 
     return LatticeLoops(system.local, level, compensated, system.friction is not None)
 
 
-def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
-    """The loops of bodies in pairs, of which only the potential, and not their number, is part of the code."""
+def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> Rollouts:
+    """The functions of bodies in pairs, of which only the potential, and not their number, is part of the code."""
     from sympflow.hamiltonian.bodies import PairsHamiltonian
-    from sympflow.kernels.pair_forces import PairLoops
+    from sympflow.kernels.pairs import PairCode
 
     assert isinstance(system.local, PairsHamiltonian)
-    return PairLoops(system.local, level, compensated, system.friction is not None)
+    return PairCode(system.local, level, compensated, system.friction is not None)
 
 
-LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
+LOCAL: dict[str, Callable[..., SizedLoops | Rollouts]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
 """Makers of the loops of systems that are given by one piece."""
+
+
+def written_out(local: LocalHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple[float, ...]]:
+    """The splitting of a system so small that its pieces are written out, else None, and the values that it reads."""
+    if local.loops != "pairs":
+        return None, ()
+    from sympflow.hamiltonian.bodies import PairsHamiltonian
+    from sympflow.kernels.pairs import few
+
+    assert isinstance(local, PairsHamiltonian)
+    return few(local)
 
 
 def local_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,13 +24,13 @@ from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import Columns, Rollouts
-from sympflow.kernels.runs import LONGEST, NUMBERS, ROOM, ROW, WHOLE, Numbers
+from sympflow.kernels.runs import Memory, Numbers, Room
 from sympflow.kernels.splittings import Shape, Splitting
 from sympflow.kernels.teams import Team, meet
-from sympflow.kernels.threads import threads_for
+from sympflow.kernels.threads import NEVER, threads_for
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
-__all__ = ["Few", "PairCode", "PairForces", "is_few"]
+__all__ = ["PairCode", "PairForces", "few"]
 
 KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
 """The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
@@ -198,8 +198,20 @@ class FewSymbols:
         return sp.diag(*(sp.Symbol(f"w_{i // self.local.dim}") for i in range(self.ndof)))
 
 
+def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple[float, ...]]:
+    """The splitting of a few bodies, None of more, and the values that it reads."""
+    if local.n_bodies > MOST_WRITTEN:
+        return None, ()
+    symbols = FewSymbols(local)
+    return partial(FewSplitting, symbols), symbols.values
+
+
 class FewSplitting(Splitting):
     """The kicks and drifts of a few bodies."""
+
+    def kinds(self) -> list[Arranged]:
+        _check_level(self.level)
+        return super().kinds()
 
     def _arranged(self, terms: int) -> Arranged:
         return FewShape(self, terms, True).arranged()[1]
@@ -306,22 +318,61 @@ def aligned(n: int) -> np.ndarray:
 # more bodies than a few: states in memory ---------------------------------------------------------------------------
 
 FIELDS = ("bodies", "size", "chunks", "member", "members", "sites", "numbers", "work", "sorted", "order", "cells")
-FIELDS += ("most_cells", "sums", "turn", "meeting", "stop")
-"""Numbers of a context behind those of `Room`: sizes, addresses, and the sums that are in turn."""
-_FIRST = LONGEST + 1
+FIELDS += ("most_cells", "sums", "turn", "meeting", "stop", "block")
+"""Numbers of a context: sizes, addresses, the sums that are in turn, and the steps between two looks."""
 _LANES = Type("double", LANES)
 
 
 def field(context: Value, name: str) -> Value:
-    return context.code.load(context, _FIRST + FIELDS.index(name), INT)
+    return context.code.load(context, FIELDS.index(name), INT)
 
 
 def place(context: Value, name: str) -> Value:
     return context.code.address(field(context, name))
 
 
+class BodiesInMemory(Memory):
+    """A state as arrays (sets, dim, size) of q, p and, compensated, their errors."""
+
+    def __init__(self, dim: int, sets: int, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
+        super().__init__(code, width, arguments, before)
+        self._dim, self._sets, self._context = dim, sets, arguments[3]
+
+    def block(self, every: int) -> Value:
+        return field(self._context, "block")
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        state, code = self._running.state, self.code
+        with code.over(self.n_values) as i:
+            code.store(code.constant(0.0), state, i)
+        sets = self._sets if given is None else 2
+        for at, place, row in self._numbers(sets, rows, begin):
+            code.store(code.load(row, place), state, at)
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self._written(self._end, 2, out, begin * stride + at)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        self._written(self._running, self._sets, running, begin)
+
+    def _written(self, room: Room, sets: int, out: Value, row: Value) -> None:
+        """Write a state to a row, which one thread does."""
+        with self.code.given(self.code.apply("eq", (field(self._context, "member"), 0))):
+            for at, place, to in self._numbers(sets, out, row):
+                self.code.store(self.code.load(room.state, at), to, place)
+
+    def _numbers(self, sets: int, rows: Value, row: Value) -> Iterator[tuple[Value, Value, Value]]:
+        """The place of each number in a state and in a row; the code that is written next is that of all numbers."""
+        code, n, size = self.code, field(self._context, "bodies"), field(self._context, "size")
+        start = code.at(rows, row * (n * (sets * self._dim)))
+        for s in range(sets):
+            with code.over(n) as i:
+                for k in range(self._dim):
+                    yield size * (s * self._dim + k) + i, (n * s + i) * self._dim + k, start
+
+
 class PairStages:
-    """The code of stages that change a state in memory: arrays (sets, dim, size) of q, p and, compensated, their errors.
+    """The code of stages that change a state in memory.
 
     `sites` has a row of 1/m and one of each column. `work` holds the sum that was taken last and, behind it, the
     velocities that sums are taken along.
@@ -337,26 +388,6 @@ class PairStages:
     def numbers(self) -> np.ndarray:
         """The numbers of all laws."""
         return np.concatenate([law.numbers() for law in self.laws.values()])
-
-    # a state ----------------------------------------------------------------------------------------------------------
-
-    def load(self, code: Code, context: Value, row: Value, state: Value, whole: bool) -> None:
-        for at, end in self._numbers_of(context, whole):
-            code.store(code.load(row, end), state, at)
-
-    def keep(self, code: Code, context: Value, state: Value, row: Value, whole: bool) -> None:
-        with code.given(code.apply("eq", (field(context, "member"), 0))):
-            for at, end in self._numbers_of(context, whole):
-                code.store(code.load(state, at), row, end)
-
-    def _numbers_of(self, context: Value, whole: bool) -> Any:
-        """The places of each number, in a state and in a row: all are visited by the code that is written next."""
-        n, size = field(context, "bodies"), field(context, "size")
-        sets = 4 if self.compensated and whole else 2
-        for s in range(sets):
-            with context.code.over(n) as i:
-                for k in range(self.dim):
-                    yield size * (s * self.dim + k) + i, (n * s + i) * self.dim + k
 
     # a stage ----------------------------------------------------------------------------------------------------------
 
@@ -445,7 +476,7 @@ class PairStages:
             n, size, chunks, member, members = (field(context, name) for name in FIELDS[:5])
             rows = self._rows(kind, context, state, along)
             turn = code.constant(1, INT) - field(context, "turn")
-            code.store(turn, context, _FIRST + FIELDS.index("turn"))
+            code.store(turn, context, FIELDS.index("turn"))
             sums = code.at(place(context, "sums"), turn * (chunks * (size * dim)))
             begin, end = (code.op("sdiv", INT, chunks * m, members) for m in (member, member + 1))
             with code.over(end - begin) as k:
@@ -557,6 +588,11 @@ class PairStages:
                 code.store(code.load(F, at) + code.total(variable.value), F, at)
 
 
+def _check_level(level: int) -> None:
+    if level == POLYNOMIAL:
+        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+
+
 class PairCode(Rollouts):
     """The compiled functions of splitting schemes on bodies in pairs, of which only the potential is part of the code.
 
@@ -571,18 +607,18 @@ class PairCode(Rollouts):
     """
 
     lanes = 1
+    room = 0
 
     def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
-        if level == POLYNOMIAL:
-            raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+        _check_level(level)
         self._given = local, level, compensated, damped
         self._local = local
-        self.memory = self._stages = PairStages(local, level, compensated, damped)
+        self._stages = PairStages(local, level, compensated, damped)
+        self.memory = partial(BodiesInMemory, local.dim, 4 if compensated else 2)
         self._numbers = self._stages.numbers()
         n = local.n_bodies
-        self._sites = aligned((1 + len(local.columns)) * (-(-n // LANES) * LANES))
-        sites = self._sites.reshape(1 + len(local.columns), -1)
-        sites[0, :n], sites[1:, :n] = 1 / local.masses, local.columns
+        self._sites = aligned((1 + len(local.columns)) * (-(-n // LANES) * LANES)).reshape(1 + len(local.columns), -1)
+        self._sites[0, :n], self._sites[1:, :n] = 1 / local.masses, local.columns
         super().__init__(2 * local.ndof * (1 + compensated), 2 * local.ndof)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -592,10 +628,8 @@ class PairCode(Rollouts):
     def size(self) -> int:
         return self._stages.helpers + 1 + 2 * self._stages.damped
 
-    def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-        state, context = values
-        self._stages.stage(context, state, kind, [numbers(i) for i in range(self.size)])
-        return values
+    def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
+        self._stages.stage(room.places, room.state, kind, [numbers(i) for i in range(self.size)])
 
     def prepared(self, table: np.ndarray) -> Columns:
         """The columns of a table, and which sums their kicks have."""
@@ -604,31 +638,37 @@ class PairCode(Rollouts):
             kinds[table[k] != 0] = k
         return np.ascontiguousarray(table.T), kinds
 
-    def called(
-        self, function: Callable[..., None], n_rows: int, n_columns: int, stop: np.ndarray, arguments: tuple[int, ...]
-    ) -> None:
+    def call(self, name: str, width: int, *arguments: Any) -> None:
         """Call a compiled run or map; one state is shared by several threads where that pays."""
         local, stages = self._local, self._stages
         n, dim = local.n_bodies, local.dim
-        size, chunks = -(-n // LANES) * LANES, CHUNKS if local.work >= WORTH_CHUNKS else 1
+        if name == "run":
+            n_rows, n_columns = arguments[5], arguments[2] * (arguments[7] - arguments[6])
+        else:
+            n_rows, n_columns = arguments[6], arguments[2]
+        stop = np.zeros(1, dtype=np.int64)
+        if name == "run" and arguments[-1] is not NEVER:
+            stop = arguments[-1]
+        elif name == "run":
+            arguments = *arguments[:-1], stop
+        size, chunks = self._sites.shape[1], CHUNKS if local.work >= WORTH_CHUNKS else 1
         team = Team(threads_for(chunks, n_columns * local.work, None) if n_rows == 1 else 1)
-        numbers, sites = self._numbers, self._sites
         sums, meeting = aligned(2 * chunks * dim * size), np.zeros(16, dtype=np.int64)
-        block = max(1, min(BLOCK, MOMENT // max(1, local.work)))
-        row, sets = 2 * local.ndof, 4 if stages.compensated else 2
-        most = most_along(n, dim)
+        sets, sorts = 4 if stages.compensated else 2, stages.cells is not None
+        function = self.function(name, width)
+        shared = {"sites": self._sites, "numbers": self._numbers, "sums": sums, "meeting": meeting, "stop": stop}
+        sizes = {"bodies": n, "size": size, "chunks": chunks, "members": team.threads, "turn": 0}
+        sizes |= {"most_cells": most_along(n, dim), "block": max(1, min(BLOCK, MOMENT // local.work))}
+        given = [x.ctypes.data if isinstance(x, np.ndarray) else x for x in arguments]
 
         def member(k: int) -> None:
             room, work = aligned(3 * sets * dim * size), aligned(stages.helpers * dim * size)
-            ready = aligned((2 * dim + stages.columns) * size * (stages.cells is not None))
-            order, cells = np.arange(n), np.zeros(most_cells(n, dim) * (stages.cells is not None), dtype=np.int64)
-            arrays = {"sites": sites, "numbers": numbers, "work": work, "sorted": ready, "order": order}
-            arrays |= {"cells": cells, "sums": sums, "meeting": meeting, "stop": stop}
-            given = {"bodies": n, "size": size, "chunks": chunks, "member": k, "members": team.threads}
-            given |= {"most_cells": most, "turn": 0} | {name: x.ctypes.data for name, x in arrays.items()}
-            first = room.ctypes.data, sets * dim * size, row, row * sets // 2, block
-            context = np.array([*first, *(given[name] for name in FIELDS)], dtype=np.int64)
-            function(*arguments, context.ctypes.data)
+            ready = aligned((2 * dim + stages.columns) * size * sorts)
+            order, cells = np.arange(n), np.zeros(most_cells(n, dim) * sorts, dtype=np.int64)
+            arrays = shared | {"work": work, "sorted": ready, "order": order, "cells": cells}
+            numbers = sizes | {"member": k} | {name: x.ctypes.data for name, x in arrays.items()}
+            context = np.array([numbers[name] for name in FIELDS], dtype=np.int64)
+            function(*given, sets * dim * size, 2 * dim * n, room.ctypes.data, context.ctypes.data)
 
         team(member, stop)
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from sympflow.compiler.control import Value
-from sympflow.kernels.runs import Memory, Numbers, map_function, run_function
-from sympflow.kernels.threads import NEVER
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
 
 __all__ = ["Columns", "Rollouts"]
 
@@ -33,11 +32,21 @@ class Rollouts:
     lanes : int
         Trajectories of a batch that run side by side: of two registers or four, so that one need not wait for the
         other.
+    room : int, optional
+        Where states are in memory, how many numbers more stages need there; None where they are in registers.
+    memory : callable
+        How they are there: `sympflow.kernels.runs.Memory`, or such a class.
+    data : sequence of ndarray
+        Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
+    every : int, optional
+        Steps after which `look` changes the running state.
     """
 
     lanes = 16
-    memory: Memory | None = None
-    """Where states stand that are too long for registers."""
+    room: int | None = None
+    data: Sequence[np.ndarray] = ()
+    memory: Callable[..., Memory] = Memory
+    every: int | None = None
 
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
@@ -46,6 +55,10 @@ class Rollouts:
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
+        raise NotImplementedError
+
+    def look(self, values: Any) -> Any:
+        """The running state changed, where there is `every`: see `sympflow.kernels.runs.run_function`."""
         raise NotImplementedError
 
     @cached_property
@@ -73,15 +86,22 @@ class Rollouts:
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "run", "run own" or "map"."""
+        memory = None if self.room is None else self.memory
         if name == "map":
-            return map_function(self.n_values, self.n_out, self.size, self.stage, width, self.memory)
-        return run_function(self.n_values, self.n_out, self.size, self.stage, width, name == "run own", self.memory)
+            return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory)
+        look, every = (None, BLOCK) if self.every is None else (self.look, self.every)
+        return run_function(
+            self.n_values, self.n_out, self.size, self.stage, width, name == "run own", memory, look, every
+        )
 
-    def called(
-        self, function: Callable[..., None], n_rows: int, n_columns: int, stop: np.ndarray, arguments: tuple[int, ...]
-    ) -> None:
-        """Call a compiled run or map of so many columns; one whose states are in memory is given its context."""
-        function(*arguments)
+    def call(self, name: str, width: int, *arguments: Any) -> None:
+        """Call the compiled function of a name with arrays and integers."""
+        if self.room is not None:
+            work = np.empty((3 * self.n_values + self.room) * width)
+            places = np.array([x.ctypes.data for x in self.data], dtype=np.int64)
+            arguments = *arguments, self.n_values, self.n_out, work, places
+        given = (x.ctypes.data if isinstance(x, np.ndarray) else x for x in arguments)
+        self.function(name, width)(*given)
 
     def rollout(
         self,
@@ -162,13 +182,10 @@ class Rollouts:
         width: int,
     ) -> None:
         states = y0[:, : self.n_out]
-        stop = np.zeros(1, dtype=np.int64) if stop is NEVER else stop  # that a thread which fails may set
         if y0.shape[1] > self.n_out:
-            entries, kinds = self.own_columns(table, y0[:, self.n_out :], width)
-            run = self.function("run own", width)
+            name, (entries, kinds) = "run own", self.own_columns(table, y0[:, self.n_out :], width)
         else:
-            entries, kinds = self.prepared(table)
-            run = self.function("run", width)
+            name, (entries, kinds) = "run", self.prepared(table)
         begun = int(np.searchsorted(save, 0, side="right")) if len(save) and save[0] <= 0 else 0
         if begun:
             out[:, :begun] = states[:, None]
@@ -178,17 +195,13 @@ class Rollouts:
         if first > 0:
             start = np.ascontiguousarray(running)
         elif self.n_values > self.n_out:
-            start = np.concatenate([states, np.zeros_like(states)], axis=1)
+            start = np.concatenate([states, np.zeros((len(states), self.n_values - self.n_out))], axis=1)
         else:
             start = np.ascontiguousarray(states)
         keeps = running.shape[-1] > 0
         left = np.empty((len(y0), self.n_values)) if keeps else running
-        arrays = entries, kinds, start, later, outputs, n_finite, left, stop
-        table_at, kinds_at, start_at, save_at, out_at, finite_at, left_at, stop_at = (x.ctypes.data for x in arrays)
-        lengths = len(kinds) - 2, int(closed)
-        of_rows = table_at, kinds_at, *lengths, start_at, len(y0), first, n_steps, save_at, len(later), out_at
-        columns = lengths[0] * (n_steps - first)
-        self.called(run, len(y0), columns, stop, (*of_rows, finite_at, left_at, int(keeps), stop_at))
+        given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps, later, len(later)
+        self.call(name, width, *given, outputs, n_finite, left, int(keeps), stop)
         if outputs is not out:
             out[:, begun:] = outputs
         if keeps:
@@ -228,8 +241,5 @@ class Rollouts:
         if not len(y):
             return
         entries, kinds = self.prepared(table)
-        function = self.function("map", 1 if len(y) == 1 else self.lanes)
-        arrays = entries, kinds, y, out
-        table_at, kinds_at, rows_at, out_at = (x.ctypes.data for x in arrays)
-        arguments = table_at, kinds_at, len(kinds), kinds_at, 1, rows_at, len(y), out_at
-        self.called(function, len(y), len(kinds), np.zeros(1, dtype=np.int64), arguments)
+        width = 1 if len(y) == 1 else self.lanes
+        self.call("map", width, entries, kinds, len(kinds), kinds, 1, y, len(y), out)

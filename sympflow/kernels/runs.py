@@ -9,15 +9,14 @@ closing column is applied. One function is the run of a single trajectory, and o
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["LONGEST", "NUMBERS", "ROOM", "ROW", "WHOLE", "Memory", "Numbers", "Stage", "map_function", "run_function", "step_function"]
+__all__ = ["Memory", "Numbers", "Room", "Stage", "map_function", "run_function", "step_function"]
 
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
@@ -26,16 +25,20 @@ Numbers = Callable[[int], Any]
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 """``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
 `step` tells after how many whole steps the stage is executed."""
+MemoryStage = Callable[["Room", Numbers, Value, Value], None]
+"""The same of a state in memory, which it changes in place."""
 
 
 def run_function(
     n_values: int,
     n_out: int,
     size: int,
-    stage: Stage,
+    stage: Stage | MemoryStage,
     width: int = 1,
     own: bool = False,
-    memory: Memory | None = None,
+    memory: Callable[..., Memory] | None = None,
+    look: Callable[[Any], Any] | None = None,
+    every: int = BLOCK,
 ) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side.
 
@@ -49,101 +52,118 @@ def run_function(
     width : int
     own : bool
         True if each trajectory has a table of its own.
-    memory : Memory, optional
-        Where states stand that are too long for registers.
+    memory : callable, optional
+        How states are in memory: then their sizes are arguments of the function, not `n_values` and `n_out`.
+    look : callable, optional
+        ``look(values)``, the values of the running state after each `every` steps of the run, changed so that the
+        outputs are the same but for what it knows of; of states in memory ``look(room)`` in place.
+    every : int
+        Steps between two looks, for a state that is not finite too.
 
     Returns
     -------
     callable
         Of addresses and integers (table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite,
-        running, keeps, stop).
+        running, keeps, stop), of states in memory then `MEMORY`.
 
         The table holds columns, in each of these `size` numbers or, for tables of their own, `size` times `width`, a
         table for every `width` trajectories. `rows` (n_rows, n_values) are the states to begin with, those of the run
         where it goes on after `first` steps. Outputs are made after ``save[i]`` steps, later than `first`, with the
         closing column where `closes` is 1. `finite[i]` becomes the last step of row i that ends in a finite state; of
         trajectories side by side only whether it is `n_steps`, else −1. Where `keeps` is 1, `running` is left with the
-        state of the run. Ends soon if ``stop[0]`` becomes 1. With `memory` there is one more address, of its context.
+        state of the run. Ends soon if ``stop[0]`` becomes 1.
     """
     module = Module(host().fused)
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
-    types += [POINTER] * (memory is not None)
+    types += MEMORY if memory else []
     code = module.function("run", types)
     table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite, running, keeps, stop = (
         code.arguments[:15]
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
-    lanes = Lanes(code, n_values, n_values, width) if memory is None else Room(code, memory, code.arguments[15], n_out, n_values)
-    with code.over(lanes.groups(n_rows)) as group:
+    state = _state(code, n_values, n_out, width, memory, code.arguments[15:], before=width == 1)
+    with code.over(_groups(code, n_rows, width)) as group:
         begin = group * width
         place = code.at(table, group * (link + 2) * (size * width)) if own else table
         column = _column(code, place, kinds, size, width if own else 1, width, stage)
-        state = lanes.opened(rows, begin, n_rows)
-        n, saved, longest = code.variable(first), code.variable(zero), code.variable(lanes.block)
+        state.open(rows, begin, n_rows)
+        n, saved, longest = code.variable(first), code.variable(zero), code.variable(state.block(every))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
         alive = code.variable(code.constant(1, Type("i1", width)))
         going = code.variable(first < n_steps)
         with code.during(lambda: going.value):
             k = code.apply("min", (longest.value, n_steps - n.value))
+            if look is not None:
+                k = code.apply("min", (k, every - code.op("srem", INT, n.value, code.constant(every, INT))))
             left = saved.value < n_saved
             following = code.load(save, code.select(left, saved.value, zero), INT) - n.value
             k = code.select(left, code.apply("min", (k, following)), k)
-            before, j_before, step_before = lanes.copied(state, 1), j.value, step.value
+            j_before, step_before = j.value, step.value
+            state.remember()
             with code.over(k * link):
                 at = j.value
-                lanes.set(state, column(at, lanes.values(state), step.value))
+                state.change(column, at, step.value)
                 j.value = code.select(code.apply("eq", (at, link)), one, at + 1)
                 step.value = code.select(code.apply("eq", (j.value, link)), step.value + 1, step.value)
-            end = lanes.copied(state, 2)
+            state.end()
             with code.over(closes):
-                lanes.set(end, column(link + 1, lanes.values(end), step.value))
-            alive.value = alive.value & lanes.finite(end)
+                state.change(column, link + 1, step.value, end=True)
+            alive.value = alive.value & state.finite()
             good = code.any(alive.value)
             going.value = good & code.apply("eq", (code.load(stop, 0, INT, shared=True), zero))
             with code.given(good):
                 n.value = n.value + k
                 going.value = going.value & (n.value < n_steps)
                 with code.during(partial(_due, code, save, n_saved, saved, n)):
-                    lanes.kept(end, n_out, out, begin, n_rows, n_saved, saved.value)
+                    state.store(out, begin, n_rows, n_saved, saved.value)
                     saved.value = saved.value + 1
+                if look is not None:
+                    whole = code.op("srem", INT, n.value, code.constant(every, INT))
+                    with code.given(code.apply("eq", (whole, 0))):
+                        state.look(look)
             if width == 1:  # again, step by step
                 with code.given(~good & (one < k)):
-                    lanes.set(state, lanes.values(before))
+                    state.restore()
                     j.value, step.value, longest.value = j_before, step_before, one
                     alive.value, going.value = code.constant(1, Type("i1")), code.constant(1, Type("i1"))
         if width == 1:
             code.store(n.value, finite, begin)
         else:
-            lanes.mark(alive.value, n.value, finite, begin, n_rows)
+            _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
-            lanes.kept(state, n_values, running, begin, n_rows, one, zero)
+            state.keep(running, begin, n_rows)
     return _finished(code, types)
 
 
 def map_function(
-    n_values: int, n_out: int, size: int, stage: Stage, width: int = 1, memory: Memory | None = None
+    n_values: int,
+    n_out: int,
+    size: int,
+    stage: Stage | MemoryStage,
+    width: int = 1,
+    memory: Callable[..., Memory] | None = None,
 ) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table.
 
     Returns
     -------
     callable
-        Of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out): row i is mapped after ``steps[i % n_steps]``
-        whole steps, in lanes the same for all of them; `out` may be `rows`.
+        Of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out), of states in memory then `MEMORY`: row i is
+        mapped after ``steps[i % n_steps]`` whole steps, in lanes the same for all of them; `out` may be `rows`.
     """
-    types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER]
-    types += [POINTER] * (memory is not None)
+    types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
-    lanes = Lanes(code, n_values, n_out, width) if memory is None else Room(code, memory, code.arguments[8], n_out, n_out)
+    state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
     column = _column(code, table, kinds, size, 1, width, stage)
-    with code.over(lanes.groups(n_rows)) as group:
+    with code.over(_groups(code, n_rows, width)) as group:
         begin = group * width
-        state = lanes.opened(rows, begin, n_rows)
+        state.open(rows, begin, n_rows, n_out)
         step = code.load(steps, code.op("srem", INT, begin, n_steps), INT)
         with code.over(n_columns) as j:
-            lanes.set(state, column(j, lanes.values(state), step))
-        lanes.kept(state, n_out, out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
+            state.change(column, j, step)
+        state.end()
+        state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
     return _finished(code, types)
 
 
@@ -153,8 +173,9 @@ def step_function(
     powers: Sequence[int],
     own: int,
     numbers: Callable[..., Sequence[Any]],
-    stage: Stage,
+    stage: Stage | MemoryStage,
     width: int = 1,
+    memory: Callable[..., Memory] | None = None,
 ) -> Callable[..., None]:
     """Compile single steps from rows, each of its own length.
 
@@ -170,18 +191,19 @@ def step_function(
     Returns
     -------
     callable
-        Of (coefficients, n_columns, n_powers, x, h, t, rows, n_rows, out): the given numbers of a column of row i are
-        polynomials Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
+        Of (coefficients, n_columns, n_powers, x, h, t, rows, n_rows, out), of states in memory then `MEMORY`: the given
+        numbers of a column of row i are polynomials Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
     """
-    types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER]
+    types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("steps", types)
-    table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments
-    lanes, alone = Lanes(code, n_values, n_out + own, width), Lanes(code, 1, 1, width)
-    with code.over(lanes.groups(n_rows)) as group:
+    table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments[:9]
+    state = _state(code, n_values, n_out, width, memory, code.arguments[9:])
+    alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
+    with code.over(_groups(code, n_rows, width)) as group:
         begin = group * width
         (at,), (length,) = alone.loaded(x, begin, n_rows), alone.loaded(h, begin, n_rows)
-        values = lanes.loaded(rows, begin, n_rows)
-        state = lanes.padded(values[:n_out])
+        state.open(rows, begin, n_rows, n_out, own)
+        values = [] if behind is None else behind.loaded(rows, begin, n_rows, state.n_out + own, state.n_out)
         with code.over(n_columns) as j:
             given = []
             for r in range(len(powers)):
@@ -191,70 +213,231 @@ def step_function(
                     total.value = total.value * at + code.splat(code.load(start, n_powers - 1 - k), width)
                 given.append(total.value)
             grown = [value * length**power if power else value for value, power in zip(given, powers, strict=True)]
-            entries = numbers(*grown[: len(grown) - own], *values[n_out:])
-            lanes.set(state, stage(lanes.values(state), entries.__getitem__, j, j))
-        lanes.kept(state, n_out, out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
+            entries = numbers(*grown[: len(grown) - own], *values)
+            state.change(lambda j, x, step, entries=entries: stage(x, entries.__getitem__, j, step), j, j)
+        state.end()
+        state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
     return _finished(code, types)
 
 
-class Lanes:
-    """Rows of memory as values of registers: `width` rows side by side, the last one again where there are fewer.
+MEMORY = [INT, INT, POINTER, POINTER]
+"""Further arguments where states are in memory: the numbers of a state, and how many of them are the output; room for
+three states, and after these for what stages need, times the width; an array of the addresses of what they read."""
 
-    A row has `n_given` numbers, and a state `n_values`, of which those that are not given begin as 0.
+
+class Room:
+    """A state in memory, of any size: its number i of all trajectories side by side lies at i times the width.
+
+    Attributes
+    ----------
+    state, work : Value
+        Addresses: of the numbers of the state, and of room for others.
+    size : Value
+        How many numbers it has.
+    places : Value
+        The address of the array of addresses.
+    width : int
     """
 
-    def __init__(self, code: Code, n_values: int, n_given: int, width: int) -> None:
-        self.code, self.n_values, self.n_given, self.width = code, n_values, n_given, width
+    def __init__(self, code: Code, width: int, state: Value, work: Value, size: Value, data: Value) -> None:
+        self.code, self.width, self.state, self.work, self.size, self.places = code, width, state, work, size, data
         self.type = Type("double", width)
-        self.block = code.constant(BLOCK, INT)
-        self._buffer = None if width == 1 else code.memory(max(n_values, n_given), self.type)
 
-    # a state, which consists of variables ---------------------------------------------------------------------------
+    def data(self, i: int) -> Value:
+        """The address of array i of those that a stage reads."""
+        return self.code.load(self.places, i, POINTER)
 
-    def opened(self, rows: Value, begin: Value, n_rows: Value) -> list[Variable]:
-        return self.padded(self.loaded(rows, begin, n_rows))
+    def load(self, i: Any, place: Value | None = None) -> Value:
+        """The number i of the state, or of others from a place on."""
+        return self.code.load(self.state if place is None else place, i * self.width, self.type)
 
-    def padded(self, x: Sequence[Value]) -> list[Variable]:
-        zero = self.code.constant(0.0, self.type)
-        return [self.code.variable(value) for value in [*x, *[zero] * (self.n_values - len(x))]]
+    def store(self, x: Any, i: Any, place: Value | None = None) -> None:
+        x = self.code.operand(x, self.type)
+        self.code.store(x, self.state if place is None else place, i * self.width)
 
-    def values(self, state: Any) -> list[Value]:
-        return [x.value for x in state]
+    def add(self, x: Any, i: Any, place: Value | None = None) -> None:
+        self.store(self.load(i, place) + x, i, place)
 
-    def set(self, state: Any, values: Sequence[Value]) -> None:
-        for variable, value in zip(state, values, strict=True):
-            variable.value = value
+    def part(self, i: Any, place: Value | None = None) -> Value:
+        """The address of number i."""
+        return self.code.at(self.state if place is None else place, i * self.width)
 
-    def copied(self, state: Any, _: int) -> Any:
-        """A copy of a state: of its beginning (1) or its end (2)."""
-        return [self.code.variable(x.value) for x in state]
 
-    def finite(self, state: Any) -> Value:
-        """True where all values are finite: times 0 they are 0."""
-        first, *others = self.values(state)
+class _Registers:
+    """The state of a run as values, which the machine keeps in registers, and its end, a copy that is closed."""
+
+    def __init__(self, code: Code, n_values: int, n_out: int, width: int) -> None:
+        self.code, self.n_values, self.n_out = code, n_values, code.constant(n_out, INT)
+        self._count, self._lanes = n_out, Lanes(code, n_values, width)
+        self._state: list[Variable] = []
+        self._end: list[Variable] = []
+        self._before: list[Value] = []
+
+    def block(self, every: int) -> Value:
+        """Steps between two looks."""
+        return self.code.constant(every, INT)
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        """Read a state, of which the first numbers are given and the others are 0."""
+        given = self.n_values if given is None else given
+        lanes = self._lanes if given + own == self.n_values else Lanes(self.code, given + own, self._lanes.width)
+        x = lanes.loaded(rows, begin, n_rows)[:given]
+        zero = self.code.constant(0.0, x[0].type)
+        self._state = [self.code.variable(value) for value in [*x, *[zero] * (self.n_values - len(x))]]
+
+    def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
+        state = self._end if end else self._state
+        _set(state, column(j, [x.value for x in state], step))
+
+    def look(self, look: Callable[[Any], Any]) -> None:
+        _set(self._state, look([x.value for x in self._state]))
+
+    def remember(self) -> None:
+        self._before = [x.value for x in self._state]
+
+    def restore(self) -> None:
+        _set(self._state, self._before)
+
+    def end(self) -> None:
+        self._end = [self.code.variable(x.value) for x in self._state]
+
+    def finite(self) -> Value:
+        """True where all values of the end are finite: times 0 they are 0."""
+        first, *rest = [x.value for x in self._end]
         total = first * 0.0
-        for value in others:
+        for value in rest:
             total = self.code.fma(value, self.code.constant(0.0, value.type), total)
         return self.code.apply("eq", (total, 0.0))
 
-    def kept(self, state: Any, count: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        """Write the first values of a state to memory: see `store`."""
-        self.store(self.values(state)[:count], out, begin, n_rows, stride, at)
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        """Write the end to the row `at` of `stride` rows that each trajectory has in `out`."""
+        self._lanes.store([x.value for x in self._end[: self._count]], out, begin, n_rows, stride, at)
 
-    # rows -----------------------------------------------------------------------------------------------------------
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
+        self._lanes.store([x.value for x in self._state], running, begin, n_rows, one, zero)
 
-    def groups(self, n_rows: Value) -> Value:
-        if self.width == 1:
-            return n_rows
-        return self.code.op("sdiv", INT, n_rows + (self.width - 1), self.code.constant(self.width, INT))
 
-    def loaded(self, rows: Value, begin: Value, n_rows: Value) -> list[Value]:
-        code, n = self.code, self.n_given
+class Memory:
+    """The same in memory: the state, its end, and the state before a block of steps.
+
+    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`.
+    """
+
+    def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
+        self.code, self.width, self._remembers = code, width, before
+        self.n_values, self.n_out, work, data = arguments
+        rooms = [code.at(work, self.n_values * (i * width)) for i in range(4)]
+        self._running, self._end, self._before = (
+            Room(code, width, x, rooms[3], self.n_values, data) for x in rooms[:3]
+        )
+
+    def block(self, every: int) -> Value:
+        return self.code.constant(every, INT)
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        n = self.n_values if given is None else self.n_out
+        with self.code.over(self.code.constant(self.width, INT)) as lane:
+            start = self.code.at(rows, self.code.apply("min", (begin + lane, n_rows - 1)) * (n + own))
+            with self.code.over(n) as i:
+                self.code.store(self.code.load(start, i), self._running.state, i * self.width + lane)
+        if given is not None:
+            with self.code.over(self.n_values - n) as i:
+                self._running.store(0.0, n + i)
+
+    def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
+        column(j, self._end if end else self._running, step)
+
+    def look(self, look: Callable[[Any], Any]) -> None:
+        look(self._running)
+
+    def remember(self) -> None:
+        if self._remembers:
+            self._copy(self._running, self._before)
+
+    def restore(self) -> None:
+        self._copy(self._before, self._running)
+
+    def end(self) -> None:
+        self._copy(self._running, self._end)
+
+    def _copy(self, source: Room, target: Room) -> None:
+        with self.code.over(self.n_values) as i:
+            target.store(source.load(i), i)
+
+    def finite(self) -> Value:
+        zero = self.code.constant(0.0, self._end.type)
+        total = self.code.variable(zero)
+        with self.code.over(self.n_values) as i:
+            total.value = self.code.fma(self._end.load(i), zero, total.value)
+        return self.code.apply("eq", (total.value, 0.0))
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self._write(self._end, self.n_out, out, begin, n_rows, stride, at)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
+        self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
+
+    def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        with self.code.over(_there(self.code, self.width, begin, n_rows)) as lane:
+            start = self.code.at(out, ((begin + lane) * stride + at) * n)
+            with self.code.over(n) as i:
+                self.code.store(self.code.load(room.state, i * self.width + lane), start, i)
+
+
+def _state(
+    code: Code,
+    n_values: int,
+    n_out: int,
+    width: int,
+    memory: Callable[..., Memory] | None,
+    arguments: Sequence[Value],
+    before: bool = False,
+) -> _Registers | Memory:
+    if memory is None:
+        return _Registers(code, n_values, n_out, width)
+    return memory(code, width, arguments, before)
+
+
+def _groups(code: Code, n_rows: Value, width: int) -> Value:
+    if width == 1:
+        return n_rows
+    return code.op("sdiv", INT, n_rows + (width - 1), code.constant(width, INT))
+
+
+def _there(code: Code, width: int, begin: Value, n_rows: Value) -> Value:
+    return code.apply("min", (code.constant(width, INT), n_rows - begin))
+
+
+def _mark(code: Code, alive: Value, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
+    """Write n for the trajectories that are alive, else −1."""
+    width = alive.type.width
+    marks = code.memory(1, Type("i64", width))
+    code.store(code.select(alive, code.splat(n, width), code.constant(-1, Type("i64", width))), marks)
+    with code.over(_there(code, width, begin, n_rows)) as lane:
+        code.store(code.load(marks, lane, INT), finite, begin + lane)
+
+
+class Lanes:
+    """Rows of memory as values of registers: `width` rows side by side, the last one again where there are fewer."""
+
+    def __init__(self, code: Code, n_values: int, width: int) -> None:
+        self.code, self.n_values, self.width = code, n_values, width
+        self.type = Type("double", width)
+        self._buffer = None if width == 1 else code.memory(self.n_values, self.type)
+
+    def loaded(
+        self, rows: Value, begin: Value, n_rows: Value, stride: Value | None = None, at: Value | None = None
+    ) -> list[Value]:
+        """The values of rows, or of parts of rows of `stride` numbers, from `at` on."""
+        code, n = self.code, self.n_values
+        length, first = n if stride is None else stride, code.constant(0, INT) if at is None else at
         if self._buffer is None:
-            start = code.at(rows, begin * n)
+            start = code.at(rows, begin * length + first)
             return [code.load(start, i) for i in range(n)]
         with code.over(code.constant(self.width, INT)) as lane:
-            start = code.at(rows, code.apply("min", (begin + lane, n_rows - 1)) * n)
+            start = code.at(rows, code.apply("min", (begin + lane, n_rows - 1)) * length + first)
             with code.over(code.constant(n, INT)) as i:
                 code.store(code.load(start, i), self._buffer, i * self.width + lane)
         return [code.load(self._buffer, i * self.width, self.type) for i in range(n)]
@@ -269,106 +452,18 @@ class Lanes:
             return
         for i, value in enumerate(x):
             code.store(value, self._buffer, i * self.width)
-        with code.over(self._there(begin, n_rows)) as lane:
+        with code.over(_there(code, self.width, begin, n_rows)) as lane:
             start = code.at(out, ((begin + lane) * stride + at) * n)
             for i in range(n):
                 code.store(code.load(self._buffer, lane + i * self.width), start, i)
 
-    def mark(self, alive: Value, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
-        """Write n for the trajectories that are alive, else −1."""
-        code = self.code
-        marks = code.memory(1, Type("i64", self.width))
-        code.store(code.select(alive, code.splat(n, self.width), code.constant(-1, Type("i64", self.width))), marks)
-        with code.over(self._there(begin, n_rows)) as lane:
-            code.store(code.load(marks, lane, INT), finite, begin + lane)
-
-    def _there(self, begin: Value, n_rows: Value) -> Value:
-        return self.code.apply("min", (self.code.constant(self.width, INT), n_rows - begin))
-
-
-class Memory(Protocol):
-    """States in memory, of any length, which stages change in place: what `run_function` must know of them.
-
-    A context is an array of whole numbers: sizes, and addresses of what the caller provides, so that code depends on
-    neither. The first five are the address of room for three states, the numbers of a state, those of a row and of a
-    `whole` one, which holds errors too, and the steps between two looks for a state that is not finite. The values of a
-    state are its address and that of the context, and a stage returns these.
-    """
-
-    def load(self, code: Code, context: Value, row: Value, state: Value, whole: bool) -> None:
-        """Write code that makes a state of a row [q, p] or, if `whole`, of all that `keep` wrote."""
-
-    def keep(self, code: Code, context: Value, state: Value, row: Value, whole: bool) -> None:
-        """Write code of the inverse; one thread does that."""
-
-
-ROOM, NUMBERS, ROW, WHOLE, LONGEST = range(5)
-"""Numbers of a context."""
-_BLOCK = Type("double", 8)
-"""Numbers of a state that are copied at a time: it has a multiple of these."""
-
-
-class Room:
-    """A state in memory, in the place of `Lanes`, and its two copies."""
-
-    width = 1
-
-    def __init__(self, code: Code, memory: Memory, context: Value, n_out: int, n_given: int) -> None:
-        self.code, self._memory, self._context = code, memory, context
-        self._n_out, self._n_given = n_out, n_given
-        self.block, self._n, *rows = (code.load(context, i, INT) for i in (LONGEST, NUMBERS, ROW, WHOLE))
-        self._rows = dict(zip((False, True), rows, strict=True))
-        self._room = code.address(code.load(context, ROOM, INT))
-
-    def groups(self, n_rows: Value) -> Value:
-        return n_rows
-
-    def opened(self, rows: Value, begin: Value, n_rows: Value) -> Any:
-        whole = self._n_given > self._n_out
-        row = self.code.at(rows, begin * self._rows[whole])
-        self._memory.load(self.code, self._context, row, self._room, whole)
-        return self._room
-
-    def values(self, state: Any) -> list[Value]:
-        return [state, self._context]
-
-    def set(self, state: Any, values: Sequence[Value]) -> None:
-        if values[0] is not state:
-            self._copy(values[0], state)
-
-    def copied(self, state: Any, which: int) -> Any:
-        copy = self.code.at(self._room, self._n * which)
-        self._copy(state, copy)
-        return copy
-
-    def _copy(self, source: Value, target: Value) -> None:
-        with self._blocks() as i:
-            self.code.store(self.code.load(source, i, _BLOCK), target, i)
-
-    def finite(self, state: Any) -> Value:
-        code = self.code
-        total = code.variable(code.constant(0.0, _BLOCK))
-        with self._blocks() as i:
-            total.value = code.fma(code.load(state, i, _BLOCK), code.constant(0.0, _BLOCK), total.value)
-        return ~code.any(~code.apply("eq", (total.value, 0.0)))
-
-    @contextmanager
-    def _blocks(self) -> Iterator[Value]:
-        with self.code.over(self._n >> 3) as k:
-            yield k << 3
-
-    def kept(self, state: Any, count: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        whole = count > self._n_out
-        row = self.code.at(out, (begin * stride + at) * self._rows[whole])
-        self._memory.keep(self.code, self._context, state, row, whole)
-
 
 def _column(
-    code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Stage
-) -> Callable[[Value, list[Value], Value], list[Value]]:
+    code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Stage | MemoryStage
+) -> Callable[[Value, Any, Value], Any]:
     """The stage of a column, the numbers of which are those of all lanes, or one for each."""
 
-    def at(j: Value, values: list[Value], step: Value) -> list[Value]:
+    def at(j: Value, values: Any, step: Value) -> Any:
         start = code.at(table, j * (size * lanes))
 
         def number(i: int) -> Value:
@@ -379,6 +474,11 @@ def _column(
         return stage(values, number, code.load(kinds, j, INT), step)
 
     return at
+
+
+def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:
+    for variable, value in zip(variables, values, strict=True):
+        variable.value = value
 
 
 def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) -> Value:

@@ -22,6 +22,7 @@ from sympflow.kernels.loop_functions import (
     local_loops,
     symbolic_loops,
     takes_values,
+    written_out,
 )
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.stages import StageTable, run_table, step_table
@@ -86,6 +87,7 @@ class SplittingLoops:
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = self.traced = False
         self._symbols = system.symbols
+        self._written: Callable[..., Any] | None = None
         self._codes: dict[tuple[int, bool, Monomials], LoopFunctions] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
@@ -126,9 +128,11 @@ class SplittingLoops:
                     f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
                     "backend='array'."
                 )
-            self.closes = True
+            self.closes = system.local.loops != "pairs"
             self._has_force_gradient = system.quadratic_kinetic
             self._compile = partial(local_loops, system)
+            self._written, self.values = written_out(system.local)
+            self.traced = self._written is not None
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
@@ -216,9 +220,12 @@ class SplittingLoops:
 
         key = level, compensated, monomials
         if key not in self._codes:
-            assert self._symbols is not None
             ndim = None if self.friction is None else self.friction.damping.ndim
-            code = SplittingCode(Splitting(self._symbols.parametric, level, monomials, compensated, ndim))
+            splitting: Callable[..., Splitting] | None = self._written
+            if splitting is None:
+                assert self._symbols is not None
+                splitting = partial(Splitting, self._symbols.parametric)
+            code = SplittingCode(splitting(level, monomials, compensated, ndim))
             processed = code.rollout_processed, code.rollout_processed_batch
             self._codes[key] = LoopFunctions(code.rollout, code.rollout_batch, *processed, code.step_rows)
         return self._codes[key]

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["Shape", "Splitting", "SplittingCode"]
 
 MOST_TABLES = 64  # that are kept
+LONG = 64  # operations of a stage, beyond which products of sums may better be left
 EARLY = -4  # when momenta are known before the positions, in cycles
 
 
@@ -75,9 +76,12 @@ class Splitting:
         return [self._arranged(terms) for terms in range(1, 2 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0))]
 
     def _arranged(self, terms: int) -> Arranged:
-        """The stage as a program, the shape with the shortest chain and the fewest operations of two."""
-        shapes = [Shape(self, terms, expand).arranged() for expand in ((True, False) if terms > 1 else (True,))]
-        return min(shapes, key=lambda shape: shape[0])[1]
+        """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
+        cost, shape = Shape(self, terms, True).arranged()
+        if terms > 1 and len(shape.body) > LONG:
+            other_cost, other = Shape(self, terms, False).arranged()
+            return shape if cost <= other_cost else other
+        return shape
 
 
 class Shape:
@@ -330,7 +334,5 @@ class SplittingCode(Rollouts):
     ) -> None:
         """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
         own = " own" if y.shape[1] > self.n_out else ""
-        step = self.function("step" + own, 1 if len(y) == 1 else self.lanes)
-        table = np.ascontiguousarray(table)
-        table_at, x_at, h_at, t_at, rows_at, out_at = (a.ctypes.data for a in (table, x, h, t, y, out))
-        step(table_at, table.shape[1], table.shape[2], x_at, h_at, t_at, rows_at, len(y), out_at)
+        table, width = np.ascontiguousarray(table), 1 if len(y) == 1 else self.lanes
+        self.call("step" + own, width, table, table.shape[1], table.shape[2], x, h, t, y, len(y), out)

@@ -9,7 +9,7 @@ import sympy as sp
 from watchdog import watched
 
 from sympflow import HamiltonianSystem, SympFlow, load, systems
-from sympflow.flow.files import KEY, SUM, text_checksum
+from sympflow.flow.records import KEY, SUM, text_checksum
 from sympflow.hamiltonian.expression import Unreadable, read
 
 q, p, q1, q2 = sp.symbols("q p q1 q2", real=True)

@@ -184,7 +184,7 @@ def test_other_values_of_parameters_need_no_other_code(texts, compensated):
 def test_code_depends_on_which_parameters_there_are_alone(texts, level, monomials, compensated):
     for params in (*PARAMETERS, {**PARAMETERS[0], "n": 4}, {**PARAMETERS[0], "lam": 0}):
         code = splitting_loops(with_parameters(**params)).functions(level, compensated, monomials).rollout.__self__
-        code._function("run", 1)
+        code.function("run", 1)
     assert texts[0] == texts[1]
     assert len({*texts}) == 3  # an exponent, and a term that is left out, are other code
 
