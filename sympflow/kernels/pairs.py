@@ -18,13 +18,14 @@ import numpy as np
 import sympy as sp
 
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import INT, Code, Type, Value
+from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
 from sympflow.compiler.functions import apply
+from sympflow.compiler.machine import host
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import Columns, Rollouts
-from sympflow.kernels.runs import Memory, Numbers, Room
+from sympflow.kernels.runs import Memory, Numbers, Room, finished
 from sympflow.kernels.splittings import Shape, Splitting
 from sympflow.kernels.teams import Team, meet
 from sympflow.kernels.threads import NEVER, threads_for
@@ -75,6 +76,7 @@ class PairLaw:
     """
 
     def __init__(self, local: PairsHamiltonian, kinds: Sequence[int]) -> None:
+        self.columns = len(local.first)
         self.dim, self.cut, self.periodic = local.dim, local.cutoff is not None, local.box is not None
         self.program = slopes_of(local, kinds)
         self.n_numbers = 2 + 2 * local.dim + len(self.program.table.outputs)
@@ -683,3 +685,169 @@ class PairCode(Rollouts):
         tables = (numbers * h ** powers[:, None, None]).transpose(2, 0, 1)
         for i, each in enumerate(tables):
             self.mapped(each, y[i : i + 1], out[i : i + 1])
+
+
+# forces at many states ------------------------------------------------------------------------------------------------
+
+
+DIRECTIONS = 16
+"""Directions along which derivatives are taken together."""
+
+
+class PairForces:
+    """F = −∇V and G = ∇²V M⁻¹∇V of bodies at many states, and their derivatives, for the fits of tables.
+
+    States q are (d, P), directions (K, d, P), Jacobians (d, d, P), as in `sympflow.training.table_step`. States stand
+    side by side in registers.
+
+    Parameters
+    ----------
+    local : PairsHamiltonian
+    level : int
+        See `Scheme`; there are no curvature terms.
+    """
+
+    def __init__(self, local: PairsHamiltonian, level: int) -> None:
+        assert level < CURVATURE
+        self._given, self._has_gradient = (local, level), level >= FORCE_GRADIENT
+        self._law = PairLaw(local, (1, 2, 3))
+        self._numbers = self._law.numbers()
+        self._sites = np.concatenate([1 / local.masses[None], local.columns])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PairForces, self._given
+
+    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
+        """F and G."""
+        P, q = q.shape[1], _in_registers(q)
+        F, G = np.zeros_like(q), np.zeros_like(q)
+        self._forces(*self._given_arrays(q), F.ctypes.data, G.ctypes.data)
+        return (F[:, :P], G[:, :P])[: 1 + self._has_gradient]
+
+    def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """These, and their derivatives along directions."""
+        P, q, v = q.shape[1], _in_registers(q), _in_registers(v)
+        F, G, DF, DG = np.zeros_like(q), np.zeros_like(q), np.zeros_like(v), np.zeros_like(v)
+        self._forces(*self._given_arrays(q), F.ctypes.data, G.ctypes.data)
+        self._products(*self._given_arrays(q), F.ctypes.data, *(x.ctypes.data for x in (v, DF, DG)), len(v))
+        values, changes = ([x[..., :P] for x in pair][: 1 + self._has_gradient] for pair in ((F, G), (DF, DG)))
+        return values, changes
+
+    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """These, and their Jacobians."""
+        d, P = q.shape
+        values, changes = self.along(q, np.broadcast_to(np.eye(d)[..., None], (d, d, P)))
+        return values, [change.swapaxes(0, 1) for change in changes]
+
+    def _given_arrays(self, q: np.ndarray) -> tuple[int, ...]:
+        return self._sites.shape[1], q.shape[1], self._sites.ctypes.data, self._numbers.ctypes.data, q.ctypes.data
+
+    @cached_property
+    def _forces(self) -> Callable[..., None]:
+        """Of (n, P, sites, numbers, q, F, G): adds F and G at P states to zeros."""
+        code = Module(host().fused).function("forces", [INT, INT, *[POINTER] * 5])
+        *_, F, G = code.arguments
+        states = _States(self._law, code)
+        with states.groups():
+            for i, j, pair in states.pairs():
+                states.add(F, (i, j), self._law.parts("gradient", pair), -1.0)
+            if self._has_gradient:
+                for i, j, pair in states.pairs(F):
+                    states.add(G, (i, j), self._law.parts("hessian_vector", pair), 1.0)
+        return finished(code, [INT, INT, *[POINTER] * 5])
+
+    @cached_property
+    def _products(self) -> Callable[..., None]:
+        """Of (n, P, sites, numbers, q, F, v, DF, DG, K): adds the derivatives of F and G along K directions to zeros."""
+        types = [INT, INT, *[POINTER] * 7, INT]
+        code = Module(host().fused).function("products", types)
+        *_, F, v, DF, DG, K = code.arguments
+        law, states = self._law, _States(self._law, code)
+        with states.groups(), states.some(K) as (first, count):
+            for i, j, (d, a, g) in states.pairs(F):
+                da = dot(d, a)
+                with code.over(count) as k:
+                    m = first + k
+                    u = [x - y for x, y in zip(states.vector(v, i, m), states.vector(v, j, m), strict=True)]
+                    along, across = dot(d, u), dot(a, u)
+                    states.add(DF, (i, j), [(g[1] * along, d), (g[0], u)], -1.0, m)
+                    if self._has_gradient:
+                        straight = g[2] * da * along + g[1] * across
+                        states.add(DG, (i, j), [(straight, d), (g[1] * along, a), (g[1] * da, u)], 1.0, m)
+            if self._has_gradient:
+                for i, j, (d, _, g) in states.pairs():
+                    with code.over(count) as k:
+                        m = first + k
+                        u = states.between(DF, i, j, m)
+                        states.add(DG, (i, j), law.parts("hessian_vector", Pair(d, u, g)), 1.0, m)
+        return finished(code, types)
+
+
+class _States:
+    """The code of loops over states side by side, and over the pairs of each."""
+
+    def __init__(self, law: PairLaw, code: Code) -> None:
+        self._law, self._code, self._dim = law, code, law.dim
+        self._n, self._P, self._sites, numbers, self._q = code.arguments[:5]
+        self._numbers = [code.splat(code.load(numbers, i), LANES) for i in range(law.n_numbers)]
+
+    @contextmanager
+    def groups(self) -> Iterator[None]:
+        with self._code.over(self._P >> SHIFT) as k:
+            self._begin = k << SHIFT
+            yield
+
+    @contextmanager
+    def some(self, K: Value) -> Iterator[tuple[Value, Value]]:
+        """The first of some directions and their number, so few that what is made of them stays near."""
+        code = self._code
+        with code.over((K + (DIRECTIONS - 1)) >> 4) as b:
+            first = b << 4
+            yield first, code.apply("min", (K - first, code.constant(DIRECTIONS, INT)))
+
+    def pairs(self, F: Value | None = None) -> Iterator[tuple[Value, Value, Pair]]:
+        """Two bodies, of whom velocities are those of −M⁻¹F: the code written next is that of all pairs."""
+        code = self._code
+        with code.over(self._n) as i:
+            x, columns = self.vector(self._q, i), self._columns(i)
+            with code.over(self._n - 1 - i) as k:
+                j = i + 1 + k
+                pair = self._law.met(self._numbers, x, self.vector(self._q, j), [*columns, *self._columns(j)])
+                yield i, j, pair if F is None else pair._replace(u=self.between(F, i, j))
+
+    def between(self, F: Value, i: Value, j: Value, m: Value | None = None) -> list[Value]:
+        """The difference of the −M⁻¹F of two bodies."""
+        w_i, w_j = (self._site(0, body) for body in (i, j))
+        return [b * w_j - a * w_i for a, b in zip(self.vector(F, i, m), self.vector(F, j, m), strict=True)]
+
+    def vector(self, x: Value, i: Value, m: Value | None = None) -> list[Value]:
+        """The numbers of a body, of direction m where there are directions."""
+        return [self._code.load(x, self._place(i, k, m), _LANES) for k in range(self._dim)]
+
+    def add(
+        self, x: Value, ends: tuple[Value, Value], parts: Sequence[Any], sign: float, m: Value | None = None
+    ) -> None:
+        """Add the part of a pair to that of its first body, and take it from the second; with a sign of −1 reversed."""
+        for body, part in zip(ends, (sign, -sign), strict=True):
+            for axis, value in enumerate(self.vector(x, body, m)):
+                self._code.store(summed(value, parts, axis, part), x, self._place(body, axis, m))
+
+    def _place(self, i: Value, axis: int, m: Value | None) -> Value:
+        row = i * self._dim + axis
+        if m is not None:
+            row = row + m * (self._n * self._dim)
+        return row * self._P + self._begin
+
+    def _site(self, row: int, i: Value) -> Value:
+        return self._code.splat(self._code.load(self._sites, self._n * row + i), LANES)
+
+    def _columns(self, i: Value) -> list[Value]:
+        return [self._site(1 + k, i) for k in range(self._law.columns)]
+
+
+def _in_registers(x: np.ndarray) -> np.ndarray:
+    """Arrays (…, P) with the last column again where they do not fill registers."""
+    P = x.shape[-1]
+    full = np.empty((*x.shape[:-1], -(-P // LANES) * LANES))
+    full[..., :P], full[..., P:] = x, x[..., -1:]
+    return full

@@ -16,7 +16,7 @@ from typing import Any
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Memory", "Numbers", "Room", "Stage", "map_function", "run_function", "step_function"]
+__all__ = ["Memory", "Numbers", "Room", "Stage", "finished", "map_function", "run_function", "step_function"]
 
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
@@ -132,7 +132,7 @@ def run_function(
             _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
             state.keep(running, begin, n_rows)
-    return _finished(code, types)
+    return finished(code, types)
 
 
 def map_function(
@@ -164,7 +164,7 @@ def map_function(
             state.change(column, j, step)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return _finished(code, types)
+    return finished(code, types)
 
 
 def step_function(
@@ -217,7 +217,7 @@ def step_function(
             state.change(lambda j, x, step, entries=entries: stage(x, entries.__getitem__, j, step), j, j)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return _finished(code, types)
+    return finished(code, types)
 
 
 MEMORY = [INT, INT, POINTER, POINTER]
@@ -491,6 +491,7 @@ def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) 
 _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
 
 
-def _finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+def finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+    """End the code of a function, and compile it."""
     code.give()
     return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *[_C[t.scalar] for t in types]))
