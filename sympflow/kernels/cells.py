@@ -44,7 +44,15 @@ class Cells:
         self.dim, self.periodic = dim, periodic
 
     def sort(
-        self, x: Value, n: Value, size: Value, most: Value, cutoff: Value, box: Sequence[Value], order: Value, work: Value
+        self,
+        x: Value,
+        n: Value,
+        size: Value,
+        most: Value,
+        cutoff: Value,
+        box: Sequence[Value],
+        order: Value,
+        work: Value,
     ) -> None:
         """Write code that sorts bodies (dim, size) by their cells into `order`; one cell where more are of no use."""
         code = x.code

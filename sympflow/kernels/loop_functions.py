@@ -37,10 +37,10 @@ from sympflow.kernels.stages import (
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.approximations import Ranges
-    from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.kernels.rollouts import Rollouts
+    from sympflow.kernels.pairs import PairCode
     from sympflow.kernels.sized_loops import SizedLoops
     from sympflow.kernels.splittings import Splitting
     from sympflow.kernels.stage_times import Driving
@@ -310,7 +310,7 @@ def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> 
     return LatticeLoops(system.local, level, compensated, system.friction is not None)
 
 
-def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> Rollouts:
+def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> PairCode:
     """The functions of bodies in pairs, of which only the potential, and not their number, is part of the code."""
     from sympflow.hamiltonian.bodies import PairsHamiltonian
     from sympflow.kernels.pairs import PairCode
@@ -319,7 +319,7 @@ def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> Rol
     return PairCode(system.local, level, compensated, system.friction is not None)
 
 
-LOCAL: dict[str, Callable[..., SizedLoops | Rollouts]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
+LOCAL: dict[str, Callable[..., SizedLoops | PairCode]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
 """Makers of the loops of systems that are given by one piece."""
 
 

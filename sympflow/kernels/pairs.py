@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 import sympy as sp
@@ -30,6 +30,9 @@ from sympflow.kernels.splittings import Shape, Splitting
 from sympflow.kernels.teams import Team, meet
 from sympflow.kernels.threads import NEVER, threads_for
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 __all__ = ["PairCode", "PairForces", "few"]
 
@@ -205,7 +208,7 @@ def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple
     if local.n_bodies > MOST_WRITTEN:
         return None, ()
     symbols = FewSymbols(local)
-    return partial(FewSplitting, symbols), symbols.values
+    return partial(FewSplitting, cast("SymbolicHamiltonian", symbols)), symbols.values
 
 
 class FewSplitting(Splitting):
@@ -220,7 +223,11 @@ class FewSplitting(Splitting):
 
 
 class FewShape(Shape):
-    """A stage of a few bodies: of each pair one square root and one division at most, whose values both bodies share."""
+    """A stage of a few bodies: both of a pair share its square root, its division and all else."""
+
+    @cached_property
+    def _local(self) -> PairsHamiltonian:
+        return cast("FewSymbols", self.symbols).local
 
     def _kicked(self) -> list[Any]:
         return self._moved([self.made.node(p) for p in self.p])
@@ -254,7 +261,7 @@ class FewShape(Shape):
 
     def _sum(self, kind: str, v: Sequence[Any], start: Sequence[Any], factor: Any = None) -> list[Any]:
         """A sum over all pairs of numbers of the body, behind others, of a kind of `KINDS` along v."""
-        op, dim, total = self.made.operation, self.symbols.local.dim, list(start)
+        op, dim, total = self.made.operation, self._local.dim, list(start)
         for (i, j), (d, s) in self._pairs.items():
             g = [self._slope(i, j, s, k, factor) for k in KINDS[kind]]
             u = [op("sub", v[dim * i + k], v[dim * j + k]) for k in range(dim if v else 0)]
@@ -281,7 +288,7 @@ class FewShape(Shape):
     @cached_property
     def _pairs(self) -> dict[tuple[int, int], tuple[list[Any], Any]]:
         """The differences of the coordinates of each two bodies, and s."""
-        local, made = self.symbols.local, self.made
+        local, made = self._local, self.made
         pairs = {}
         for i in range(local.n_bodies):
             for j in range(i + 1, local.n_bodies):
@@ -298,7 +305,7 @@ class FewShape(Shape):
 
     def _slope(self, i: int, j: int, s: Any, kind: int, factor: Any) -> Any:
         """A derivative of V by s, times a factor."""
-        local, made = self.symbols.local, self.made
+        local, made = self._local, self.made
         columns = [self.number[f"column_{c}_{body}"] for body in (i, j) for c in range(len(local.columns))]
         letter = made.letter(s)
         letters = (local.s, *local.first, *local.second, *local.c)
@@ -319,8 +326,10 @@ def aligned(n: int) -> np.ndarray:
 
 # more bodies than a few: states in memory ---------------------------------------------------------------------------
 
-FIELDS = ("bodies", "size", "chunks", "member", "members", "sites", "numbers", "work", "sorted", "order", "cells")
-FIELDS += ("most_cells", "sums", "turn", "meeting", "stop", "block")
+FIELDS = [
+    *("bodies", "size", "chunks", "member", "members", "sites", "numbers", "work", "sorted", "order", "cells"),
+    *("most_cells", "sums", "turn", "meeting", "stop", "block"),
+]
 """Numbers of a context: sizes, addresses, the sums that are in turn, and the steps between two looks."""
 _LANES = Type("double", LANES)
 
@@ -399,7 +408,7 @@ class PairStages:
         code.outlined("stage", (state, context, kind, *numbers), self._stage)
 
     def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
-        """A plain kick (1), one with a force gradient (2), one with curvature terms (3), each the one before and more."""
+        """A kick, plain (1), with a force gradient (2) or with curvature terms too (3), or none (0); and a drift."""
         code = state.code
         a, b, *more = numbers
         with code.given(kind > 0):
@@ -473,7 +482,7 @@ class PairStages:
     def _sum(self, kind: str) -> Callable[[Value, Value, Value], None]:
         """The sum over all pairs, of this thread's chunks and, when all threads are here, of all chunks."""
 
-        def body(context: Value, state: Value, along: Value) -> None:
+        def summed_up(context: Value, state: Value, along: Value) -> None:
             code, dim = state.code, self.dim
             n, size, chunks, member, members = (field(context, name) for name in FIELDS[:5])
             rows = self._rows(kind, context, state, along)
@@ -497,11 +506,11 @@ class PairStages:
                 code.store(total.value, to, i)
             if self.cells:
                 with code.over(n) as i:
-                    at = code.load(order, i, INT)
-                    for k in range(dim):
-                        code.store(code.load(to, size * k + i), work, size * k + at)
+                    body = code.load(order, i, INT)
+                    for axis in range(dim):
+                        code.store(code.load(to, size * axis + i), work, size * axis + body)
 
-        return body
+        return summed_up
 
     def _rows(self, kind: str, context: Value, state: Value, along: Value) -> list[Value]:
         """Rows of what a pair depends on: coordinates, velocities along which a sum is taken, columns.
@@ -529,9 +538,7 @@ class PairStages:
             end, softening = code.load(numbers, 1), code.load(numbers)
             cutoff = code.apply("sqrt", (end - softening,))
             box = [code.load(numbers, 2 + k) for k in range(dim)] if law.periodic else []
-            self.cells.sort(
-                state, n, size, field(context, "most_cells"), cutoff, box, order, place(context, "cells")
-            )
+            self.cells.sort(state, n, size, field(context, "most_cells"), cutoff, box, order, place(context, "cells"))
             moved = list(zip([*x, *c], [*to[:dim], *to[2 * dim :]], strict=True))
         with code.over(n) as i:
             at = code.load(order, i, INT)
@@ -545,7 +552,7 @@ class PairStages:
         """The pairs of each body of a chunk: of one in so many."""
         code, law, dim = F.code, self.laws[kind], self.dim
         size, moved = field(context, "size"), len(rows) - self.columns
-        start = sum(self.laws[k].n_numbers for k in tuple(self.laws)[: tuple(self.laws).index(kind)])
+        start = sum(self.laws[k].n_numbers for k in [*self.laws][: [*self.laws].index(kind)])
         given = place(context, "numbers")
         numbers = [code.splat(code.load(given, start + i), LANES) for i in range(law.n_numbers)]
         lanes, zero = code.lane_numbers(LANES), code.constant(0.0, _LANES)
@@ -580,7 +587,7 @@ class PairStages:
                 for variable, total in zip(totals, code.loop(count, [x.value for x in totals], block), strict=True):
                     variable.value = total
 
-            if cells is None:
+            if cells is None or self.cells is None:
                 meets(i + 1, n)
             else:
                 with code.over(self.cells.ranges(code, i, n, cell, cells, found)) as k:
@@ -758,7 +765,7 @@ class PairForces:
 
     @cached_property
     def _products(self) -> Callable[..., None]:
-        """Of (n, P, sites, numbers, q, F, v, DF, DG, K): adds the derivatives of F and G along K directions to zeros."""
+        """Of (n, P, sites, numbers, q, F, v, DF, DG, K): adds the derivatives of F and G along K directions."""
         types = [INT, INT, *[POINTER] * 7, INT]
         code = Module(host().fused).function("products", types)
         *_, F, v, DF, DG, K = code.arguments

@@ -13,7 +13,7 @@ from contextvars import copy_context
 
 import numpy as np
 
-from sympflow.compiler.control import BOOL, INT, Type, Value
+from sympflow.compiler.control import INT, Type, Value
 
 __all__ = ["Team", "meet"]
 
