@@ -28,6 +28,7 @@ from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
+from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
@@ -272,7 +273,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     elif problem.store is not None:
         run = partial(_run_stored, action=action)
     else:
-        check_memory(integrator, replace(problem, system=between))
+        check_memory(integrator, problem if between is system else replace(problem, system=between))
 
     start, stopped = time.perf_counter(), None
     with naming_plugin(integrator):
@@ -284,14 +285,12 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     outcome.stats["wall_time"] = time.perf_counter() - start
     passed = False
     if system.poles is not None and problem.diagnosed and problem.letters is None and problem.store is None:
-        from sympflow.integrators.diagnosis import note_poles
-
         if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
             passed = note_poles(outcome, integrator, problem, stacklevel=4)
+        if stopped is None and readable(outcome.y):
+            warn_of_cancelling(outcome, problem, stacklevel=4)
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
     if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
-        from sympflow.integrators.diagnosis import note_singularities
-
         note_singularities(outcome, integrator, problem, passed)
     if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
@@ -363,8 +362,6 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
 
 def _note_singularities(sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows) -> None:
     """Note when solutions with parameters of their own become infinite, of the first `MOST_DIAGNOSED` that fail."""
-    from sympflow.integrators.diagnosis import note_singularities
-
     status = np.asarray(sol.status)
     failed, times = np.flatnonzero(status < 0), np.full(len(status), np.nan)
     for few, system, _ in itertools.islice(rows.taken(failed).distinct(), MOST_DIAGNOSED):

@@ -27,8 +27,8 @@ from sympflow.lazy import announced, distribution, load_announced
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from importlib.metadata import EntryPoint
 
-    from sympflow.kernels.network_loops import NetworkLayer
     from sympflow.kernels.network_tangents import TrainedNetwork
+    from sympflow.kernels.networks import NetworkLayer
 
 Time = float | Tensor
 
@@ -518,7 +518,7 @@ class MLPPotential(Potential):
         return K, k, list(self.biases), list(self.weights), w
 
     def network(self, is_kick: bool) -> NetworkLayer:
-        from sympflow.kernels.network_loops import NetworkLayer
+        from sympflow.kernels.networks import NetworkLayer
 
         K, k, b, W, w = self.folded()
 

@@ -31,8 +31,8 @@ from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
-    from sympflow.kernels.network_loops import MLPFlowKernel
     from sympflow.kernels.network_tangents import NetworkTangents
+    from sympflow.kernels.networks import MLPFlowKernel
 
 UNCOMPENSATED = (
     "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
@@ -462,7 +462,7 @@ class SympFlow(FlowMap):
         return self._network.current(self._compiled)
 
     def _compiled(self) -> MLPFlowKernel:
-        from sympflow.kernels.network_loops import MLPFlowKernel
+        from sympflow.kernels.networks import MLPFlowKernel
 
         networks = [layer.network() for layer in self.layers]  # type: ignore[operator]
         check_compilable(self.dtype, self.device)

@@ -20,8 +20,8 @@ from sympflow.flow.sympflow import SympFlow, pairs_of_layers
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
-    from sympflow.kernels.network_loops import NetworkLayer
     from sympflow.kernels.network_tangents import TrainedNetwork
+    from sympflow.kernels.networks import NetworkLayer
 
 
 @dataclass(frozen=True)

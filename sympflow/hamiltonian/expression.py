@@ -16,6 +16,8 @@ from typing import Any
 
 import sympy as sp
 
+from sympflow.hamiltonian.removable import with_sinc
+
 MAX_TEXT = 100_000  # characters
 MAX_NESTING = 100  # brackets and powers in each other
 MAX_EXPONENT = 1000.0  # of a power, where it is a number
@@ -110,6 +112,7 @@ def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
     f = expression.xreplace(
         {s: sp.Symbol(spelled.get(_normal(s.name), s.name), real=True) for s in expression.free_symbols}
     )
+    f = with_sinc(f)
     for extremum in f.atoms(sp.Max, sp.Min):
         _check_compared(type(extremum).__name__, len(extremum.args))
     return f

@@ -45,6 +45,7 @@ from sympflow.hamiltonian.jumps import (
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
+from sympflow.hamiltonian.removable import sinc
 
 LARGEST = sys.float_info.max
 MOST_LEFT_OUT = 100
@@ -775,8 +776,8 @@ def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
 
 
 def printable(f: sp.Expr) -> sp.Expr:
-    """A derivative as code needs it: its constants numbers, and the δ of a kink's second derivative left out."""
-    return _with_numeric_constants(without_deltas(f))
+    """A derivative as code needs it: constants as numbers, sinc written out, the δ of a kink's second one left out."""
+    return _with_numeric_constants(without_deltas(f).replace(sinc, lambda *args: sinc(*args).written_out))
 
 
 def without_deltas(f: sp.Expr) -> sp.Expr:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
     from sympflow.flow.known import KnownFlow
     from sympflow.hamiltonian.fingerprint import Identity
-    from sympflow.kernels.tangent_loops import TangentKernel
+    from sympflow.kernels.tangents import TangentKernel
     from sympflow.schemes import Scheme
     from sympflow.storage.runs import RunStore
 

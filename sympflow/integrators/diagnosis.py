@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakSet
 
 import numpy as np
 
@@ -32,6 +33,12 @@ H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
 
 
+FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
+"""The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
+that share of errors there is told."""
+_TOLD: WeakSet[Any] = WeakSet()
+
+
 class Passage(NamedTuple):
     """The times between which a trajectory passed a pole, its column, and True if no solution does."""
 
@@ -54,7 +61,7 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
     Returns True if the run, or a trajectory of it, was ended.
     """
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
-    if poles is None or not n:
+    if poles is None or not poles.watched or not n:
         return False
     starts = to_numpy(problem.y0).reshape(-1, width)
     outputs = to_numpy(outcome.y).reshape(n, -1, width)
@@ -63,11 +70,12 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
     t = np.concatenate([[problem.t0], outcome.t[every][::-1]])
     with np.errstate(all="ignore"):
         try:
-            odd, scale = _look(problem.system, poles, t, y)
+            looked = _look(problem.system, poles, t, y)
         except TypeError:  # a function that takes no arrays
             return False
-        if not odd.any():
+        if looked is None:
             return False
+        odd, scale = looked
         held = (np.atleast_1d(np.asarray(outcome.status)) >= 0).reshape(-1)
         rows = np.flatnonzero(odd.any(0) & held)
         found: dict[int, Passage] = {}
@@ -95,12 +103,47 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
     return bool(certain)
 
 
-def _look(system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> None:
+    """Warn, once for a system, of a run about a value of q or p near which terms of H cancel until digits are lost."""
+    poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
+    if poles is None or not poles.cancelling or poles in _TOLD:
+        return
+    starts = to_numpy(problem.y0).reshape(-1, width)
+    every = slice(None, None, max(1, n // LOOKED_AT))
+    y = np.concatenate([starts[None], to_numpy(outcome.y).reshape(n, len(starts), width)[every]])
+    for each in poles.cancelling:
+        x = y[..., each.column] - each.at
+        about = np.fmin.reduce(x) <= 0
+        about &= np.fmax.reduce(x) >= 0
+        if not about.any():
+            continue
+        reach = float(np.fmax.reduce(np.abs(x[:, about]), axis=None))
+        steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
+        visited = y[:, about, each.column].ravel()
+        if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, visited) > LOST_DIGITS:
+            continue
+        _TOLD.add(poles)
+        warnings.warn(
+            f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in "
+            "many digits, and at it no number. Write them by sinc, which is sin(x)/x without that, or near it by their "
+            "series, in a Piecewise.",
+            RuntimeWarning,
+            stacklevel=stacklevel + 1,
+        )
+        return
+
+
+def _look(
+    system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
     """True for states y (n, N, 2d) with signs or H unlike the first ones, and for a start without H: (n, N).
 
     Also the largest kinetic energy, or change of the potential one, beside which H is judged: (N,).
+    None if there is no such state.
     """
     cells, H, T = poles.look(y, t[:, None])
+    if T is not None and (cells == cells[0]).all() and (H.max(0) - H.min(0) <= OFF * np.abs(T).max(0)).all():
+        return None
     odd = (cells != cells[0]).any(-1)
     scale = np.full(y.shape[1], np.inf)
     if T is not None:
@@ -108,7 +151,7 @@ def _look(system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray)
         scale = np.fmax.reduce(np.maximum(np.abs(T), np.abs(V - V[0])), axis=0)
         odd |= ~(np.abs(H - H[0]) <= (OFF if system.conservative and system.autonomous else FAR_OFF) * scale)
     odd[0] = ~np.isfinite(H[0])
-    return odd, scale
+    return (odd, scale) if odd.any() else None
 
 
 def _steps_of(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,14 +14,13 @@ from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, Map
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.implicit_loops import implicit_kernel
-from sympflow.kernels.loop_functions import LoopFunctions
-from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
-from sympflow.kernels.timed_loops import reach_times
 from sympflow.schemes import CURVATURE, Scheme
+
+if TYPE_CHECKING:
+    from sympflow.kernels.splitting_loops import Functions
 
 __all__ = [
     "ClockedFlowKernel",
@@ -200,7 +199,7 @@ class PrimedFlowKernel(Kernel):
             return self._splitting.damped_kernel(scheme, partial(_stepped_by, step))
         return self._splitting.kernel(scheme, self._compensated, self._ranges)
 
-    def _functions(self) -> LoopFunctions:
+    def _functions(self) -> Functions:
         """The compiled functions for the kicks of the flow."""
         tables = self._tables
         return self._splitting.functions(tables.level, self._compensated, tables.monomials, ranges=self._ranges)
@@ -269,6 +268,8 @@ class SplitFlowKernel(Kernel):
     saves_finite = True
 
     def __init__(self, maps: MapSource, parts: ExactParts, dt: float) -> None:
+        from sympflow.kernels.parts_loops import parts_loops
+
         self.parts, self._maps, self._dt = parts, maps, dt
         self._loops = parts_loops(parts)
         self._kernel = self._loops.kernel(lambda h: maps.maps(float(h)))
@@ -386,6 +387,8 @@ class ClockedFlowKernel(Kernel):
 
         `numbers` are those of the clock, if they have been asked for.
         """
+        from sympflow.kernels.timed_loops import reach_times
+
         numbers = self._numbers() if numbers is None else numbers
         return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)
 
@@ -405,6 +408,8 @@ class CollocatedFlowKernel(Kernel):
     saves_finite = False
 
     def __init__(self, system: HamiltonianSystem, tableau: Tableau, steps: int) -> None:
+        from sympflow.kernels.implicit_loops import implicit_kernel
+
         self._kernel, self._steps = implicit_kernel(system, tableau), steps
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:

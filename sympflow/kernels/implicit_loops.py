@@ -1,23 +1,20 @@
-"""Compiled loops of implicit Gauss methods: Newton's iteration with the Hessian of a symbolic H."""
+"""Compiled loops of implicit Gauss methods on a symbolic system."""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from types import ModuleType
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import sympy as sp
 from numpy.typing import ArrayLike
 
-from sympflow.hamiltonian.collocation import Tableau
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.collocation import Tableau, stage_nodes
+from sympflow.hamiltonian.driving import with_letters
+from sympflow.hamiltonian.recorded import check_recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels import terms
-from sympflow.kernels.codegen import statements
-from sympflow.kernels.modules import constants_source, load_algebra, template
+from sympflow.kernels.newton import newton_code
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
+from sympflow.kernels.samples import check_samples
 from sympflow.kernels.terms import is_large
 from sympflow.kernels.threads import given
 
@@ -69,9 +66,27 @@ class ImplicitKernel(Kernel):
             )
         if friction is not None and friction.damping.ndim == 2:
             raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
-        rates = () if friction is None else tuple(np.broadcast_to(friction.rates, system.ndof).tolist())
-        self.ndof, self._tableau, self._compensated, self._rates = system.ndof, tableau, compensated, rates
-        self._algebra = gradient_and_hessian_source(system.symbols)
+        self._rates = None if friction is None else np.broadcast_to(friction.rates, system.ndof)
+        self._nodes = np.array(stage_nodes(tableau))
+        symbols = system.symbols if is_large(system.symbols) else system.symbols.parametric
+        for name in symbols.samples:
+            check_samples(symbols.samples[name])
+        check_recorded(with_letters([symbols.H])[0][0])
+        self._values, self._driven = symbols.values, symbols.time is not None
+        self._code, self._single = (
+            newton_code(symbols, tableau, sums, friction is not None) for sums in (compensated, False)
+        )
+
+    def _numbers(self, h: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """The numbers (n, size) of steps of lengths h (n,), at the times t (n,) less those of whole steps before."""
+        given = [h[:, None], np.broadcast_to(self._values, (len(h), len(self._values)))]
+        if self._driven:
+            given.append(t[:, None])
+        if self._rates is not None:
+            exponents = np.append(self._nodes, 1.0)[:, None] * self._rates
+            decays = -h[:, None] * exponents.ravel()
+            given.append(np.exp(np.concatenate([-decays, decays], axis=1)))
+        return np.concatenate(given, axis=1)
 
     def run(
         self,
@@ -109,59 +124,18 @@ class ImplicitKernel(Kernel):
         threads: int | None,
         carry: Carry | None,
     ) -> Run:
-        loops = _load(self._algebra, self.ndof, self._tableau, self._compensated, self._rates)
-        iterations = np.empty(len(y0), dtype=np.int64)
+        code, counts = self._code, np.zeros(len(y0))
+        rollout: Any = code.rollout_batch
+        columns = np.repeat(self._numbers(np.array([h]), np.array([t0])), 3, axis=0), np.zeros(3, dtype=np.int64)
 
         def rows(i: slice, *rest: Any) -> None:
-            *states, stop, first, running = rest
-            loops.rollout_each(h, t0, *states, iterations[i], stop, first, running)
+            rollout(columns, *rest, closed=False, counts=counts[i])
 
-        width, size = 2 * self.ndof * (1 + self._compensated), 2 * self.ndof * len(self._tableau[1])
-        Y, n_finite, _ = run_states(rows, y0, n_steps, save, threads, carry, width, 4 * size**3)
-        return Run(Y, n_finite, int(iterations.sum()))
+        Y, n_finite, _ = run_states(rows, y0, n_steps, save, threads, carry, code.n_values - 1, code.work)
+        return Run(Y, n_finite, int(counts.sum()))
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
         y = given(y)
         h, t = (given(np.broadcast_to(x, y.shape[:1])) for x in (h, t))
-        out, iterations = np.empty_like(y), np.empty(len(y), dtype=np.int64)
-        _load(self._algebra, self.ndof, self._tableau, False, self._rates).step_each(h, t, y, out, iterations)
-        return Steps(out, int(iterations.sum()))
-
-
-@lru_cache(maxsize=256)
-def _load(algebra: str, ndof: int, tableau: Tableau, compensated: bool, rates: tuple[float, ...]) -> ModuleType:
-    A, B, scale = tableau
-    C = tuple(float(np.dot(row, scale)) for row in A)
-    numbers: dict[str, Any] = {"A": A, "B": B, "C": C, "SCALE": scale, "RATES": rates}
-    constants = constants_source(COMPENSATED=compensated, NDOF=ndof, STAGES=len(B), **numbers)
-    steps = "\n\n\n".join([constants, template("running_states"), template("newton_steps")])
-    return load_algebra(algebra, ["newton"], [steps])
-
-
-def gradient_and_hessian_source(symbols: SymbolicHamiltonian) -> str:
-    """``gradient_and_hessian(y, g, S, t)``: ∇H into g and ∇²H into S, as statements; zeros of S are not written.
-
-    Raises
-    ------
-    ValueError
-        If a function in H has no counterpart in compiled code.
-    """
-    variables, H, before = symbols.q + symbols.p, symbols.H, ""
-    if symbols.time is not None:
-        from sympflow.kernels.stage_times import in_code, sampled_sources
-
-        before = "\n\n\n".join([*sampled_sources([H], symbols.samples), before])
-        H = in_code(H, symbols.time, "t")
-    if is_large(symbols):
-        return before + terms.gradient_and_hessian_source(H, variables, "gradient_and_hessian", time="t")
-    slopes = [sp.diff(H, s) for s in variables]
-    triangle = [(i, j) for i in range(len(variables)) for j in range(i, len(variables))]
-    entries = {ij: sp.diff(slopes[ij[0]], variables[ij[1]]) for ij in triangle}
-    entries = {ij: entry for ij, entry in entries.items() if entry != 0}
-    targets = [f"g[{i}]" for i in range(len(variables))]
-    targets += [f"S[{i}, {j}] = S[{j}, {i}]" if i != j else f"S[{i}, {i}]" for i, j in entries]
-    lines = [f"{before}@njit(**OPTIONS)", "def gradient_and_hessian(y, g, S, t):"]
-    lines += [f"    {s.name} = y[{i}]" for i, s in enumerate(variables)]
-    lines += [f"    {statement}" for statement in statements(targets, [*slopes, *entries.values()])]
-    return "\n".join(lines) + "\n"
+        return Steps(*self._single.steps(y, self._numbers(h, t)))

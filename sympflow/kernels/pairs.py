@@ -20,11 +20,11 @@ import sympy as sp
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
 from sympflow.compiler.functions import apply
-from sympflow.compiler.machine import host
+from sympflow.compiler.machine import address, host
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
-from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.rollouts import Columns, Rollouts, aligned
 from sympflow.kernels.runs import Memory, Numbers, Room, finished
 from sympflow.kernels.splittings import Shape, Splitting
 from sympflow.kernels.teams import Team, meet
@@ -32,9 +32,11 @@ from sympflow.kernels.threads import NEVER, threads_for
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.local import LocalHamiltonian
+    from sympflow.hamiltonian.monomials import Monomials
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["PairCode", "PairForces", "few"]
+__all__ = ["PairCode", "PairForces", "few", "pair_code"]
 
 KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
 """The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
@@ -203,8 +205,9 @@ class FewSymbols:
         return sp.diag(*(sp.Symbol(f"w_{i // self.local.dim}") for i in range(self.ndof)))
 
 
-def few(local: PairsHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple[float, ...]]:
+def few(local: LocalHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple[float, ...]]:
     """The splitting of a few bodies, None of more, and the values that it reads."""
+    assert isinstance(local, PairsHamiltonian)
     if local.n_bodies > MOST_WRITTEN:
         return None, ()
     symbols = FewSymbols(local)
@@ -317,11 +320,11 @@ class FewShape(Shape):
         return made.operation("where", made.operation("lt", s, made.written(self.number["end"])), slope, 0.0)
 
 
-def aligned(n: int) -> np.ndarray:
-    """Zeros, the first of them where a line of the cache begins."""
-    x = np.zeros(n + 8)
-    first = -x.ctypes.data // 8 % 8
-    return x[first : first + n]
+def zeros(n: int) -> np.ndarray:
+    """Numbers 0 that begin with a line of memory."""
+    x = aligned(n)
+    x[:] = 0.0
+    return x
 
 
 # more bodies than a few: states in memory ---------------------------------------------------------------------------
@@ -597,6 +600,14 @@ class PairStages:
                 code.store(code.load(F, at) + code.total(variable.value), F, at)
 
 
+def pair_code(
+    local: LocalHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
+) -> PairCode:
+    """The compiled functions of more bodies than a few; `damped` if there is friction −γp."""
+    assert isinstance(local, PairsHamiltonian)
+    return PairCode(local, level, compensated, damped)
+
+
 def _check_level(level: int) -> None:
     if level == POLYNOMIAL:
         raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
@@ -626,7 +637,7 @@ class PairCode(Rollouts):
         self.memory = partial(BodiesInMemory, local.dim, 4 if compensated else 2)
         self._numbers = self._stages.numbers()
         n = local.n_bodies
-        self._sites = aligned((1 + len(local.columns)) * (-(-n // LANES) * LANES)).reshape(1 + len(local.columns), -1)
+        self._sites = zeros((1 + len(local.columns)) * (-(-n // LANES) * LANES)).reshape(1 + len(local.columns), -1)
         self._sites[0, :n], self._sites[1:, :n] = 1 / local.masses, local.columns
         super().__init__(2 * local.ndof * (1 + compensated), 2 * local.ndof)
 
@@ -647,7 +658,7 @@ class PairCode(Rollouts):
             kinds[table[k] != 0] = k
         return np.ascontiguousarray(table.T), kinds
 
-    def call(self, name: str, width: int, *arguments: Any) -> None:
+    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
         """Call a compiled run or map; one state is shared by several threads where that pays."""
         local, stages = self._local, self._stages
         n, dim = local.n_bodies, local.dim
@@ -668,16 +679,16 @@ class PairCode(Rollouts):
         shared = {"sites": self._sites, "numbers": self._numbers, "sums": sums, "meeting": meeting, "stop": stop}
         sizes = {"bodies": n, "size": size, "chunks": chunks, "members": team.threads, "turn": 0}
         sizes |= {"most_cells": most_along(n, dim), "block": max(1, min(BLOCK, MOMENT // local.work))}
-        given = [x.ctypes.data if isinstance(x, np.ndarray) else x for x in arguments]
+        given = [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
 
         def member(k: int) -> None:
-            room, work = aligned(3 * sets * dim * size), aligned(stages.helpers * dim * size)
-            ready = aligned((2 * dim + stages.columns) * size * sorts)
+            room, work = aligned(3 * sets * dim * size), zeros(stages.helpers * dim * size)
+            ready = zeros((2 * dim + stages.columns) * size * sorts)
             order, cells = np.arange(n), np.zeros(most_cells(n, dim) * sorts, dtype=np.int64)
             arrays = shared | {"work": work, "sorted": ready, "order": order, "cells": cells}
-            numbers = sizes | {"member": k} | {name: x.ctypes.data for name, x in arrays.items()}
+            numbers = sizes | {"member": k} | {name: address(x) for name, x in arrays.items()}
             context = np.array([numbers[name] for name in FIELDS], dtype=np.int64)
-            function(*given, sets * dim * size, 2 * dim * n, room.ctypes.data, context.ctypes.data)
+            function(*given, sets * dim * size, 2 * dim * n, address(room), address(context))
 
         team(member, stop)
 
@@ -728,15 +739,15 @@ class PairForces:
         """F and G."""
         P, q = q.shape[1], _in_registers(q)
         F, G = np.zeros_like(q), np.zeros_like(q)
-        self._forces(*self._given_arrays(q), F.ctypes.data, G.ctypes.data)
+        self._forces(*self._given_arrays(q, F, G))
         return (F[:, :P], G[:, :P])[: 1 + self._has_gradient]
 
     def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
         """These, and their derivatives along directions."""
         P, q, v = q.shape[1], _in_registers(q), _in_registers(v)
         F, G, DF, DG = np.zeros_like(q), np.zeros_like(q), np.zeros_like(v), np.zeros_like(v)
-        self._forces(*self._given_arrays(q), F.ctypes.data, G.ctypes.data)
-        self._products(*self._given_arrays(q), F.ctypes.data, *(x.ctypes.data for x in (v, DF, DG)), len(v))
+        self._forces(*self._given_arrays(q, F, G))
+        self._products(*self._given_arrays(q, F, v, DF, DG), len(v))
         values, changes = ([x[..., :P] for x in pair][: 1 + self._has_gradient] for pair in ((F, G), (DF, DG)))
         return values, changes
 
@@ -746,8 +757,8 @@ class PairForces:
         values, changes = self.along(q, np.broadcast_to(np.eye(d)[..., None], (d, d, P)))
         return values, [change.swapaxes(0, 1) for change in changes]
 
-    def _given_arrays(self, q: np.ndarray) -> tuple[int, ...]:
-        return self._sites.shape[1], q.shape[1], self._sites.ctypes.data, self._numbers.ctypes.data, q.ctypes.data
+    def _given_arrays(self, *arrays: np.ndarray) -> tuple[int, ...]:
+        return self._sites.shape[1], arrays[0].shape[1], *map(address, (self._sites, self._numbers, *arrays))
 
     @cached_property
     def _forces(self) -> Callable[..., None]:

@@ -16,7 +16,7 @@ from typing import Any
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Memory", "Numbers", "Room", "Stage", "finished", "map_function", "run_function", "step_function"]
+__all__ = ["Lanes", "Memory", "Numbers", "Room", "finished", "groups", "map_function", "run_function", "step_function"]
 
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
@@ -82,7 +82,7 @@ def run_function(
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
     state = _state(code, n_values, n_out, width, memory, code.arguments[15:], before=width == 1)
-    with code.over(_groups(code, n_rows, width)) as group:
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         place = code.at(table, group * (link + 2) * (size * width)) if own else table
         column = _column(code, place, kinds, size, width if own else 1, width, stage)
@@ -156,7 +156,7 @@ def map_function(
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
     state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
     column = _column(code, table, kinds, size, 1, width, stage)
-    with code.over(_groups(code, n_rows, width)) as group:
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         state.open(rows, begin, n_rows, n_out)
         step = code.load(steps, code.op("srem", INT, begin, n_steps), INT)
@@ -199,7 +199,7 @@ def step_function(
     table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments[:9]
     state = _state(code, n_values, n_out, width, memory, code.arguments[9:])
     alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
-    with code.over(_groups(code, n_rows, width)) as group:
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         (at,), (length,) = alone.loaded(x, begin, n_rows), alone.loaded(h, begin, n_rows)
         state.open(rows, begin, n_rows, n_out, own)
@@ -400,7 +400,8 @@ def _state(
     return memory(code, width, arguments, before)
 
 
-def _groups(code: Code, n_rows: Value, width: int) -> Value:
+def groups(code: Code, n_rows: Value, width: int) -> Value:
+    """How often `width` rows are begun side by side."""
     if width == 1:
         return n_rows
     return code.op("sdiv", INT, n_rows + (width - 1), code.constant(width, INT))

@@ -23,7 +23,7 @@ from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
-from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -69,11 +69,14 @@ class Splitting:
         of_friction = [f"{name}_{i}" for name in ("mean", "decay") for i in range(damped)]
         return ["a", *self.kick_numbers, *of_friction, *(s.name for s in self.symbols.parameters)]
 
+    @property
+    def terms(self) -> list[int]:
+        """Terms of the kicks of each kind of stage: one, two, …; a polynomial has all of its own."""
+        return [1, 2, 3][: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0)]
+
     def kinds(self) -> list[Arranged]:
-        """The stages with kicks of one number, of two, …; a polynomial has all of its numbers."""
-        if self.level == POLYNOMIAL:
-            return [self._arranged(1)]
-        return [self._arranged(terms) for terms in range(1, 2 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0))]
+        """The stages, those with the fewest terms first."""
+        return [self._arranged(terms) for terms in self.terms]
 
     def _arranged(self, terms: int) -> Arranged:
         """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""

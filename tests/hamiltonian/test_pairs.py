@@ -93,9 +93,7 @@ class TestFunctions:
 
 
 class TestRuns:
-    @pytest.mark.parametrize(
-        ("method", "options"), [("verlet", {}), ("chin4a", {}), ("verlet", {"compensated": True})]
-    )
+    @pytest.mark.parametrize(("method", "options"), [("verlet", {}), ("chin4a", {}), ("verlet", {"compensated": True})])
     @pytest.mark.parametrize("n", [4, 40], ids=["written out", "in memory"])
     def test_compiled_and_by_arrays_agree_and_conserve_momenta(self, n, method, options):
         system = gravity(n)

@@ -165,3 +165,36 @@ def test_a_start_without_h_is_told():
     np.testing.assert_array_equal(sol.status, [0, -1])
     assert sol.message == "H of trajectory 1 is infinite, or no number, at `y0`: start elsewhere."
     assert sf.solve(system, "verlet", (0, 1), [-1.0, 0.0], dt=0.03, diagnose=False).success
+
+
+CANCELLING = {
+    "csch(q) - 1/q": ([1.0, -2.0], 100_000, True),
+    "(exp(q) - 1 - q)/q**2": ([1.0, -3.0], 10_000, True),
+    "tan(q)/q": ([1e-7, 0.0], 100, True),
+    "csch(q) - 1/q + q**2": ([1.0, -2.0], 100, False),
+    "tan(q)/q - q**2": ([0.1, 0.0], 100, False),
+    "sin(q)/q": ([1e-7, 0.0], 1000, False),
+    "exp(-1/q**2)": ([1.0, -3.0], 10_000, False),
+    "csch(q) + 1/q": ([1.0, 1.0], 1000, False),
+}
+"""V, a start, the steps in a time of 10, and True if the force loses digits, as its terms cancel there."""
+
+
+@pytest.mark.parametrize("V", CANCELLING)
+def test_a_run_about_a_place_where_terms_cancel_is_warned_of_once(V):
+    y0, n_steps, lost = CANCELLING[V]
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + {V}")
+    told = []
+    for _ in range(2):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            sf.solve(system, "verlet", (0, 10), y0, dt=10 / n_steps)
+        told.append([str(w.message) for w in caught if "cancel" in str(w.message)])
+    assert [len(each) for each in told] == [lost, 0]
+    assert all(text.startswith("`system` has terms that cancel at q1 = 0, ") and "sinc" in text for text in told[0])
+
+
+def test_a_start_where_terms_cancel_is_told_why_it_fails():
+    system = HamiltonianSystem.from_sympy("p**2/2 + tan(q)/q")
+    with pytest.warns(RuntimeWarning, match=r"cancel at q1 = 0, tan\(q1\)/q1"):
+        assert sf.solve(system, "verlet", (0, 1), [0.0, 0.1], dt=0.1).status == -1
