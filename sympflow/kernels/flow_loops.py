@@ -182,6 +182,21 @@ class PrimedFlowKernel(Kernel):
                 out[rows] = self._stepped(np.abs(h[rows]), y[rows], back, times[rows])
         return Steps(out)
 
+    def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """ψ̄_h of each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d): see `Kernel`."""
+        from sympflow.kernels.tangents import step_tangents
+
+        tables, out, A = self._tables, y.copy(), np.broadcast_to(np.eye(y.shape[1]), (*y.shape, y.shape[1])).copy()
+        for back, rows in ((False, h > 0), (True, h < 0)):
+            if rows.any():
+                t = np.abs(h[rows])
+                table = tables.kept(("polynomials", back), partial(tables.polynomials, back))
+                found = step_tangents(self.system, table, tables.variable(t), t, y[rows], tables.monomials)
+                if found is None:
+                    return None
+                out[rows], A[rows] = found
+        return out, A
+
     def _stepped(self, h: np.ndarray, y: np.ndarray, back: bool, t: ArrayLike) -> np.ndarray:
         tables, loops = self._tables, self._splitting
 

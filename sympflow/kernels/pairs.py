@@ -217,6 +217,12 @@ def few(local: LocalHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple
 class FewSplitting(Splitting):
     """The kicks and drifts of a few bodies."""
 
+    @property
+    def key(self) -> tuple[Any, ...]:
+        local = cast("FewSymbols", self.symbols).local
+        pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
+        return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
+
     def kinds(self) -> list[Arranged]:
         _check_level(self.level)
         return super().kinds()

@@ -55,6 +55,8 @@ class Rollouts:
         Steps between two looks for a state that is not finite, or a stop, where nothing is saved.
     counted : bool
         True if the last of `n_values` is a count, which is no part of the running state.
+    closing : bool
+        False if outputs are never closed, so that the code need not hold a stage for that.
     """
 
     lanes = 16
@@ -65,6 +67,7 @@ class Rollouts:
     every: int | None = None
     block = BLOCK
     counted = False
+    closing = True
 
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
@@ -92,6 +95,11 @@ class Rollouts:
         """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
         raise NotImplementedError
 
+    @property
+    def place(self) -> Callable[..., Memory] | None:
+        """What is made of states in memory; None where they are in registers."""
+        return None if self.room is None else self.memory
+
     def function(self, name: str, width: int) -> Callable[..., None]:
         """The compiled function of a name, see `made`."""
         found = self._functions.get((name, width))
@@ -104,12 +112,13 @@ class Rollouts:
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "run", "run own" or "map"."""
-        memory = None if self.room is None else self.memory
+        memory = self.place
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
+        own = name == "run own"
         return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, name == "run own", memory, look, every
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing
         )
 
     def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:

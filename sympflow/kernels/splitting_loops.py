@@ -229,13 +229,14 @@ class SplittingLoops:
 
     def _traced(self, level: int, compensated: bool, monomials: Monomials) -> Functions:
         """The functions over traced numbers, which serve batches with own values too."""
-        from sympflow.kernels.splittings import Splitting, SplittingCode
+        from sympflow.kernels.splittings import Splitting, SplittingCode, shared
 
         key = level, compensated, monomials
         if key not in self._codes:
             ndim = None if self.friction is None else self.friction.damping.ndim
-            splitting = self._written or partial(Splitting, self._symbols.parametric)
-            self._codes[key] = SplittingCode(splitting(level, monomials, compensated, ndim))
+            make = self._written or partial(Splitting, self._symbols.parametric)
+            splitting = make(level, monomials, compensated, ndim)
+            self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:

@@ -28,7 +28,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["Shape", "Splitting", "SplittingCode"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "shared"]
 
 MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
@@ -56,6 +56,12 @@ class Splitting:
     monomials: Monomials = ()
     compensated: bool = False
     friction: int | None = None
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Same for systems that share their code: those that differ in the values of parameters alone."""
+        of_system = self.symbols.H, self.symbols.parameters, self.symbols.q, self.symbols.p
+        return *of_system, self.level, self.monomials, self.compensated, self.friction
 
     @property
     def kick_numbers(self) -> tuple[str, ...]:
@@ -235,6 +241,20 @@ def _slope_of_monomial(powers: Sequence[int], i: int, q: Sequence[Any]) -> Any:
     return value
 
 
+MOST_CODES = 64  # that are kept, of systems with other structures
+_CODES: dict[Any, Any] = {}
+
+
+def shared(key: Any, make: Callable[[], Any]) -> Any:
+    """Return the code of a key, made once while it is kept: systems are often made again."""
+    found = _CODES.get(key)
+    if found is None:
+        while len(_CODES) >= MOST_CODES:
+            _CODES.pop(next(iter(_CODES)), None)
+        found = _CODES[key] = make()
+    return found
+
+
 class SplittingCode(Rollouts):
     """The compiled functions of splitting schemes on one symbolic system.
 
@@ -290,9 +310,8 @@ class SplittingCode(Rollouts):
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
             return self._executed(last, values, numbers)
 
-        return step_function(
-            self.n_values, self.n_out, powers, self._own if own else 0, self._kinds[last].table, stage, width
-        )
+        own_numbers, table = self._own if own else 0, self._kinds[last].table
+        return step_function(self.n_values, self.n_out, powers, own_numbers, table, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
 
