@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.compiler.control import Value
 from sympflow.kernels.runs import BLOCK, Numbers, map_function, run_function
 
-__all__ = ["Columns", "Rollouts", "aligned"]
+__all__ = ["Columns", "Rollouts", "address", "aligned"]
 
 LINE = 8  # numbers in a line of memory
 AT_ONCE = 4096  # trajectories with tables of their own
@@ -22,15 +22,18 @@ Columns = tuple[np.ndarray, np.ndarray]
 """The numbers (m, size) of columns and their kinds (m,), as compiled code reads them: see `run_function`."""
 
 
+def address(x: np.ndarray) -> int:
+    """Where an array begins, in a fraction of the time that `ctypes.data` takes; 0 of one without numbers."""
+    if not x.size:
+        return 0
+    return addressof(c_char.from_buffer(x.data)) if x.flags.writeable else int(x.ctypes.data)
+
+
 def aligned(n: int) -> np.ndarray:
     """Numbers in memory, of any values, that begin with a line of it."""
     memory = np.empty(n + LINE)
-    return memory[-(memory.ctypes.data // 8) % LINE :][:n]
-
-
-def _address(x: np.ndarray) -> int:
-    """Where an array begins, in a third of the time that `ctypes.data` takes."""
-    return addressof(c_char.from_buffer(x.data)) if x.size and x.flags.writeable else int(x.ctypes.data)
+    begin = -(address(memory) // 8) % LINE
+    return memory[begin : begin + n]
 
 
 class Rollouts:
@@ -111,9 +114,9 @@ class Rollouts:
         """Call the compiled function of a name with arrays and integers."""
         if self.room is not None:
             work = aligned((3 * self.n_values + self.room) * width)
-            places = np.array([*map(_address, self.data)], dtype=np.int64)
+            places = np.array([*map(address, self.data)], dtype=np.int64)
             arguments = *arguments, self.n_values, self.n_out, work, places
-        self.function(name, width)(*[_address(x) if isinstance(x, np.ndarray) else x for x in arguments])
+        self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
 
     def rollout(
         self,
