@@ -64,8 +64,12 @@ class Poles(Protocol):
     def watched(self) -> bool:
         """False if H has cancelling terms alone."""
 
-    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    def look(
+        self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Numbers (..., m) that differ on the two sides of a place, H and T: states (..., 2d), times (...).
+
+        Numbers are values of the parameters of a `parametric` form.
 
         Where these cost more than such a number, H is 0, or NaN where it is no number, and T None. Where H has no
         part T there is one of its size.
@@ -110,8 +114,8 @@ class SymbolicPoles:
     def watched(self) -> bool:
         return bool(self._places)
 
-    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        values = self._look(y, *self._time(y, t))
+    def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        values = self._look(y, *self._time(y, t), numbers=numbers)
         return values[..., : self._m], values[..., -2], values[..., -1]
 
     def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
@@ -167,7 +171,7 @@ class LatticePoles:
     cancelling: Sequence[Cancelling] = ()
     watched = True
 
-    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, None]:
+    def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         cells = self._columns("cells", _cells, y)
         ending = self._columns("endings", _endings, y)
         return cells, np.where(np.isnan(ending).any(-1), np.nan, 0.0), None

@@ -36,7 +36,7 @@ def _surely_within(flow: KnownFlow | None, system: HamiltonianSystem, y: np.ndar
 
 @cache
 def _compiled() -> Callable[..., bool]:
-    from sympflow.kernels.sublevel_loops import all_within
+    from sympflow.kernels.passes import all_within
 
     return all_within
 

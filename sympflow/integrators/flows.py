@@ -213,7 +213,13 @@ class FlowIntegrator(OwnStepper):
         return _apply(self.flow_like(system, y).inverse, y, h, t)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        self.flow_for(system)  # files cannot be read inside a function transform
+        flow, x = self.flow_for(system), to_numpy(y)  # files cannot be read inside a function transform
+        kernel = compiled_loops(lambda: flow.kernel_for(system), x, "auto") if x.size else None
+        if kernel is not None:
+            lengths = np.broadcast_to(h, x.shape[:-1]).astype(float).ravel()
+            found = kernel.tangents(lengths, np.ascontiguousarray(x.reshape(-1, x.shape[-1])))
+            if found is not None:
+                return found[0].reshape(x.shape), found[1].reshape(*x.shape, x.shape[-1])
         return super().tangent(system, t, y, h)
 
 

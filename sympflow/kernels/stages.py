@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.system import HamiltonianSystem
 
 __all__ = [
     "DampedDrift",
@@ -17,6 +20,7 @@ __all__ = [
     "StageTable",
     "TimeAlone",
     "TimedNumbers",
+    "damped_drift",
     "kicks_of",
     "lanes_source",
     "numbers_of_kicks",
@@ -26,6 +30,7 @@ __all__ = [
     "stages_source",
     "step_constants",
     "step_table",
+    "takes_values",
     "time_lines",
     "with_last_stage",
 ]
@@ -211,6 +216,14 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
     return replace(after, **columns, times=np.concatenate([run.times[-1:], of_kicks[merged:]]))
 
 
+def takes_values(level: int) -> bool:
+    """True of kicks whose code is the same for all values of parameters.
+
+    In those with force gradients sums such as g ω⁴ − b ω² would round in another way than with numbers in the code.
+    """
+    return level not in (FORCE_GRADIENT, CURVATURE)
+
+
 # kinds of kick as code --------------------------------------------------------------------------------------------
 
 
@@ -352,6 +365,22 @@ def damped(p, a):
             return [move.format(p="p", a="a[0]"), "p = damped(p, a)"]
         spread = "spread(p, a, work)" if self.in_place else "spread(p, a, None)"
         return [move.format(p=spread, a="1.0"), "p = damped(p, a)"]
+
+
+MOST_COUPLED = 6
+"""Degrees of freedom of a damping matrix in compiled loops, where the two maps of each drift are 2d² numbers."""
+
+
+def damped_drift(system: HamiltonianSystem, in_place: bool) -> DampedDrift | None:
+    """The drift of a system with friction as code; None without."""
+    if system.damping is None:
+        return None
+    if system.damping.ndim == 2 and (in_place or system.ndof > MOST_COUPLED):
+        raise ValueError(
+            f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "
+            f"{MOST_COUPLED} degrees of freedom: use backend='array'."
+        )
+    return DampedDrift(system.damping.ndim, system.ndof, in_place)
 
 
 _DRIFT_OF = """@njit(**OPTIONS, forceinline=True)

@@ -20,13 +20,13 @@ import numpy as np
 
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
 from sympflow.compiler.functions import fma
-from sympflow.compiler.machine import compiled, host
+from sympflow.compiler.machine import address, compiled, host
 from sympflow.compiler.program import Program, fused, gradient, tangent, traced
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.rollouts import address, aligned
+from sympflow.kernels.rollouts import aligned
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["LabelErrors", "TableLoops", "table_loops"]

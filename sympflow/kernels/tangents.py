@@ -24,11 +24,12 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, run_states
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.kernels.splittings import EARLY, Splitting, SplittingCode
-from sympflow.kernels.stages import run_table
+from sympflow.kernels.splittings import EARLY, Splitting, SplittingCode, shared
+from sympflow.kernels.stages import StageTable, run_table
+from sympflow.kernels.threads import given
 from sympflow.schemes import POLYNOMIAL, Scheme
 
-__all__ = ["TangentCode", "TangentKernel", "TangentRun", "tangent_kernel"]
+__all__ = ["TangentCode", "TangentKernel", "TangentRun", "step_tangents", "tangent_kernel"]
 
 EVERY = 256  # steps after which vectors are rescaled
 AT_ONCE = 1 << 20  # numbers of outputs
@@ -446,21 +447,33 @@ def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, ve
     ValueError
         If there are none, with the reason.
     """
+    codes, key = _CODES.setdefault(system, {}), (level, monomials, vectors, grows)
+    if key not in codes:
+        codes[key] = _lacks(system)
+        if not codes[key]:
+            assert system.symbols is not None
+            ndim = None if system.friction is None else system.friction.damping.ndim
+            splitting = Splitting(system.symbols.parametric, level, monomials, friction=ndim)
+            codes[key] = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
+    found = codes[key]
+    if isinstance(found, str):
+        raise ValueError(found)
+    return found
+
+
+def _lacks(system: HamiltonianSystem) -> str:
+    """The reason why a system has no compiled vectors, "" if it has."""
     from sympflow.kernels.terms import is_large
 
-    symbols, loops = system.symbols, splitting_loops(system)
-    if symbols is None or is_large(symbols) or not loops.traced:
-        raise ValueError(
+    if not system.autonomous:
+        return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
+    symbols = system.symbols
+    if symbols is None or is_large(symbols) or not splitting_loops(system).traced:
+        return (
             f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "
             "few terms: use backend='auto'."
         )
-    if not system.autonomous:
-        raise ValueError(f"`system` {system.name!r} depends on t, for which vectors are moved by arrays.")
-    codes, key = _CODES.setdefault(system, {}), (level, monomials, vectors, grows)
-    if key not in codes:
-        ndim = None if system.friction is None else system.friction.damping.ndim
-        codes[key] = TangentCode(Splitting(symbols.parametric, level, monomials, friction=ndim), vectors, grows)
-    return codes[key]
+    return ""
 
 
 def tangent_kernel(system: HamiltonianSystem, scheme: Scheme, vectors: int) -> TangentKernel:
@@ -468,4 +481,25 @@ def tangent_kernel(system: HamiltonianSystem, scheme: Scheme, vectors: int) -> T
     return TangentKernel(system, scheme, vectors)
 
 
-_CODES: WeakKeyDictionary[HamiltonianSystem, dict[Any, TangentCode]] = WeakKeyDictionary()
+def step_tangents(
+    system: HamiltonianSystem, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The steps from rows of `y` (N, 2d) and their Jacobians (N, 2d, 2d), as `SplittingLoops.step_rows` makes them.
+
+    None where they are not compiled.
+    """
+    if system.friction is not None:
+        return None
+    n = y.shape[1]
+    try:
+        code = tangent_code(system, table.level, monomials, n, False)
+    except ValueError:
+        return None
+    rows = np.empty((len(y), n * (1 + n)))
+    rows[:, :n], rows[:, n:] = y, np.eye(n).reshape(-1)
+    out = np.empty_like(rows)
+    code.step_rows(splitting_loops(system).rows(table), given(x), given(h), given(h), rows, out)
+    return out[:, :n], out[:, n:].reshape(-1, n, n).swapaxes(1, 2)
+
+
+_CODES: WeakKeyDictionary[HamiltonianSystem, dict[Any, TangentCode | str]] = WeakKeyDictionary()
