@@ -109,7 +109,7 @@ class OneStep(Rollouts):
             return super().made(name, width)
         # All numbers follow the states in their rows, which have the count behind them.
         n, memory = self.n_out + self.counted, self.room is not None
-        return step_function(n, n, [0] * self.size, self.size, lambda *numbers: numbers, self.stage, width, memory)
+        return step_function(n, n, [0] * self.size, self.size, lambda _, *numbers: numbers, self.stage, width, memory)
 
     def steps(self, y: np.ndarray, numbers: np.ndarray) -> Steps:
         """One step from every row of `y` (N, 2d) by its own numbers (N, size)."""

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.loop_functions import LoopFunctions
     from sympflow.kernels.rollouts import Rollouts
+    from sympflow.kernels.stage_times import Driving
 
     Functions = LoopFunctions | Rollouts
 
@@ -80,6 +81,7 @@ class SplittingLoops:
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = self.traced = False
         self._symbols = system.symbols
+        self._driving: Driving | None = None
         self._codes: dict[tuple[int, bool, Monomials], Functions] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
@@ -95,12 +97,13 @@ class SplittingLoops:
 
                 self._compile = partial(family_loops, system, damped_drift(system, True))
             elif self.driven:
-                from sympflow.kernels.loop_functions import driven_loops
                 from sympflow.kernels.stage_times import driven_form
 
-                driving = driven_form(system.symbols.parametric)
-                self.values = driving.form.values
-                self._compile = partial(driven_loops, driving, damped_drift(system, False))
+                self._driving = driven_form(system.symbols.parametric)
+                self._driving.check()
+                damped_drift(system, False)
+                self.values, self.traced = self._driving.form.values, True
+                self.abreast = LANES
             else:
                 V = system.symbols.V
                 check_recorded(V)
@@ -225,7 +228,9 @@ class SplittingLoops:
         if key not in self._codes:
             assert self._symbols is not None
             ndim = None if self.friction is None else self.friction.damping.ndim
-            splitting = Splitting(self._symbols.parametric, level, monomials, compensated, ndim)
+            driving = self._driving
+            symbols = self._symbols.parametric if driving is None else driving.form
+            splitting = Splitting(symbols, level, monomials, compensated, ndim, driving)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
 
