@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.stage_times import Driving
 
-__all__ = ["Splitting", "SplittingCode", "shared"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "shared"]
 
 MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
@@ -92,14 +92,14 @@ class Splitting:
 
     def _arranged(self, terms: int) -> Arranged:
         """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
-        cost, shape = _Shape(self, terms, True).arranged()
+        cost, shape = Shape(self, terms, True).arranged()
         if terms > 1 and len(shape.body) > LONG:
-            other_cost, other = _Shape(self, terms, False).arranged()
+            other_cost, other = Shape(self, terms, False).arranged()
             return shape if cost <= other_cost else other
         return shape
 
 
-class _Shape:
+class Shape:
     """One way to write a stage: products of sums multiplied out, or left."""
 
     def __init__(self, splitting: Splitting, terms: int, expand: bool) -> None:
@@ -120,19 +120,22 @@ class _Shape:
     def arranged(self) -> tuple[int, Arranged]:
         """The cost of the stage, and its programs."""
         made, d = self.made, self.d
-        changes = self._changes()
         errors: list[Any] = []
         if self.splitting.compensated:
-            momenta, errors_p = self._compensated(self.p, [made.written(x) for x in changes], self.errors[d:])
+            changes = [made.written(x) for x in self._changes()]
+            momenta, errors_p = self._compensated(self.p, changes, self.errors[d:])
             moves = [made.written(x) for x in self._velocity(momenta, self.number["a"])]
             positions, errors_q = self._compensated(self.q, moves, self.errors[:d])
             errors = [*errors_q, *errors_p]
         else:
-            momenta = [made.written(p + x) for p, x in zip(self.p, changes, strict=True)]
-            positions, momenta = self._drifted(momenta)
+            positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
         arranged = made.finish(outputs)
         return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
+
+    def _kicked(self) -> list[Any]:
+        """The momenta after a kick, numbers of the body."""
+        return [self.made.written(p + x) for p, x in zip(self.p, self._changes(), strict=True)]
 
     def _changes(self) -> list[Any]:
         """The change of p by a kick."""
@@ -292,17 +295,18 @@ class SplittingCode(Rollouts):
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """A kick and a drift, of the kind that a column has."""
         if len(self._kinds) == 1:
-            return self._executed(0, values, numbers, step)
+            return self._executed(0, values, self._column(0, values[0].type, numbers, step))
         code = values[0].code
         results = [code.variable(x) for x in values]
         for k in range(len(self._kinds)):
             with code.given(code.apply("eq", (kind, k))):
-                for result, x in zip(results, self._executed(k, values, numbers, step), strict=True):
+                column = self._column(k, values[0].type, numbers, step)
+                for result, x in zip(results, self._executed(k, values, column), strict=True):
                     result.value = x
         return [x.value for x in results]
 
-    def _executed(self, k: int, values: Any, numbers: Numbers, step: Value) -> Any:
-        return self._kinds[k].body(*values, *self._column(k, values[0].type, numbers, step))
+    def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
+        return self._kinds[k].body(*values, *column)
 
     def _column(self, k: int, type: Type, numbers: Numbers, step: Value) -> list[Value]:
         """The numbers that a stage of a kind reads."""
@@ -334,7 +338,7 @@ class SplittingCode(Rollouts):
             return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
         powers = [1, *kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self._own]
-        table, body = self._kinds[-1]
+        last, table = len(self._kinds) - 1, self._kinds[-1].table
 
         def column(time: Value, *given: Value) -> list[Any]:
             if not self.timed:
@@ -343,9 +347,10 @@ class SplittingCode(Rollouts):
             return [time.code.operand(x, time.type) for x in table(*self._lettered(at, given))]
 
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-            return body(*values, *[numbers(i) for i in range(len(table.outputs))])
+            return self._executed(last, values, [numbers(i) for i in range(len(table.outputs))])
 
-        return step_function(self.n_values, self.n_out, powers, self._own if own else 0, column, stage, width)
+        own_numbers = self._own if own else 0
+        return step_function(self.n_values, self.n_out, powers, own_numbers, column, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
 

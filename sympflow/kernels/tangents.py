@@ -260,17 +260,15 @@ class TangentCode(SplittingCode):
             return super().stage(values, numbers, kind, step)
         for k in range(len(self._kinds)):
             with values.code.given(values.code.apply("eq", (kind, k))):
-                self._executed(k, values, numbers, step)
+                self._executed(k, values, self._column(k, values.type, numbers, step))
         return None
 
-    def _executed(self, k: int, values: Any, numbers: Numbers, step: Value) -> Any:
+    def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
         d, body = self._d, self._kinds[k].body
         if not isinstance(values, Room):
-            column = self._column(k, values[0].type, numbers, step)
             n = 2 * d * (1 + self.vectors)
             return [*body(*values[:n], *column), *values[n:]]
         room = values
-        column = self._column(k, room.type, numbers, step)
         found = body(*(room.load(i) for i in range(2 * d)), *column)
         for m, x in enumerate(found[: 2 * d]):
             room.store(x, m)
