@@ -205,12 +205,10 @@ def _bent(code: Code) -> None:
     with code.over(parts) as b:
         part = code.at(curvature, b * size)
         with code.over(k) as i:
-            (inner,) = code.when(
-                whole,
-                lambda i=i: [code.load(step, i)],
-                lambda b=b, i=i: [_dot(code.at(blocks, (b * k + i) * n), step, n)],
-            )
-            _add(part, -probe * inner, code.at(columns, i * m + b * size), size)
+            inner = code.variable(code.load(step, i))
+            with code.given(~whole):
+                inner.value = _dot(code.at(blocks, (b * k + i) * n), step, n)
+            _add(part, -probe * inner.value, code.at(columns, i * m + b * size), size)
         with code.over(k) as i:
             along = -_dot(code.at(columns, i * m + b * size), part, size) / square
             with code.given(whole):

@@ -227,12 +227,13 @@ class _Factored(Linearized):
     def __init__(self, x: np.ndarray, r: np.ndarray, J: np.ndarray | Blocks, scale: np.ndarray) -> None:
         self.x, self.r = x, np.ascontiguousarray(r)
         J = J if isinstance(J, Blocks) else Blocks(np.ascontiguousarray(J.T), NO_BLOCKS)
-        self.J = J.columns, J.matrices
-        self._R, self.scale = factored(*self.J, self.r, scale)
+        self.J = J
+        self._R, self.scale = factored(J.columns, J.matrices, self.r, scale)
         self.D = np.where(self.scale > 0, self.scale, 1.0)
 
     def damp(self, damping: float) -> None:
-        self._damped, *self._newton = damped(self._R, self.D, damping)
+        self._damped, step, decrease = damped(self._R, self.D, damping)
+        self._newton = step, decrease
 
     def newton(self) -> tuple[np.ndarray, float]:
         step, decrease = self._newton
@@ -240,7 +241,7 @@ class _Factored(Linearized):
 
     def bend(self, residuals: Callable[[np.ndarray], np.ndarray], step: np.ndarray) -> Any:
         probed = residuals(self.x + PROBE * step)
-        return bent(*self.J, self.r, probed, PROBE, step, self._damped, self.D, CURVED)
+        return bent(self.J.columns, self.J.matrices, self.r, probed, PROBE, step, self._damped, self.D, CURVED)
 
     def moved(self, step: np.ndarray, bend: np.ndarray) -> np.ndarray:
         return self.x + step + bend
