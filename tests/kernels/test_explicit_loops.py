@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 from sympflow import HamiltonianSystem, doubled, solve, systems
@@ -63,15 +62,6 @@ def test_rows_pieces_and_single_steps_give_the_same_bits(name):
     assert np.array_equal(batch, np.concatenate(pieces, axis=1))
     times = (np.full(11, 0.5),) if t else ()
     assert np.array_equal(kernel.step(np.full(11, 0.02), y0, *times).states, batch[:, 1])
-
-
-@pytest.mark.parametrize(("method", "theirs"), [("rk45", "RK45"), ("dop853", "DOP853")])
-def test_solvers_of_scipy_take_the_same_steps_with_the_compiled_field(method, theirs):
-    tol, times = 1e-9, np.linspace(0, 5, 6)
-    ours = solve(DRIVEN, method, (0, 5), rtol=tol, atol=tol, t_eval=times)
-    scipys = solve_ivp(DRIVEN, (0, 5), DRIVEN.y0, method=theirs, rtol=tol, atol=tol, t_eval=times)
-    assert ours.stats["force_evaluations"] == scipys.nfev
-    np.testing.assert_allclose(ours.y, scipys.y, rtol=0, atol=tol)  # rounding changes the lengths of steps
 
 
 def test_a_run_that_ends_keeps_its_finite_states():
