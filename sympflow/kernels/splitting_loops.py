@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.loop_functions import LoopFunctions
     from sympflow.kernels.rollouts import Rollouts
     from sympflow.kernels.splittings import Splitting
+    from sympflow.kernels.stage_times import Driving
 
     Functions = LoopFunctions | Rollouts
 
@@ -81,6 +82,7 @@ class SplittingLoops:
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = self.traced = False
         self._symbols: Any = system.symbols
+        self._driving: Driving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Functions]
         self._codes: dict[tuple[int, bool, Monomials], Functions] = {}
@@ -98,12 +100,13 @@ class SplittingLoops:
 
                 self._compile = partial(family_loops, system, damped_drift(system, True))
             elif self.driven:
-                from sympflow.kernels.loop_functions import driven_loops
                 from sympflow.kernels.stage_times import driven_form
 
-                driving = driven_form(system.symbols.parametric)
-                self.values = driving.form.values
-                self._compile = partial(driven_loops, driving, damped_drift(system, False))
+                self._driving = driven_form(system.symbols.parametric)
+                self._driving.check()
+                damped_drift(system, False)
+                self.values, self.traced = self._driving.form.values, True
+                self.abreast = LANES
             else:
                 V = system.symbols.V
                 check_recorded(V)
@@ -229,15 +232,23 @@ class SplittingLoops:
 
     def _traced(self, level: int, compensated: bool, monomials: Monomials) -> Functions:
         """The functions over traced numbers, which serve batches with own values too."""
-        from sympflow.kernels.splittings import Splitting, SplittingCode, shared
+        from sympflow.kernels.splittings import SplittingCode, shared
 
         key = level, compensated, monomials
         if key not in self._codes:
-            ndim = None if self.friction is None else self.friction.damping.ndim
-            make = self._written or partial(Splitting, self._symbols.parametric)
-            splitting = make(level, monomials, compensated, ndim)
+            splitting = self.splitting(level, monomials, compensated)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
+
+    def splitting(self, level: int, monomials: Monomials = (), compensated: bool = False) -> Splitting:
+        """The kicks and drifts of a level, of a system whose loops are made of traced numbers."""
+        from sympflow.kernels.splittings import Splitting
+
+        ndim, driving = None if self.friction is None else self.friction.damping.ndim, self._driving
+        if self._written is not None:
+            return self._written(level, monomials, compensated, ndim)
+        symbols = self._symbols.parametric if driving is None else driving.form
+        return Splitting(symbols, level, monomials, compensated, ndim, driving)
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""

@@ -260,13 +260,11 @@ class TangentCode(SplittingCode):
             return super().stage(values, numbers, kind, step)
         for k in range(len(self._kinds)):
             with values.code.given(values.code.apply("eq", (kind, k))):
-                self._executed(k, values, numbers)
+                self._executed(k, values, self._column(k, values.type, numbers, step))
         return None
 
-    def _executed(self, k: int, values: Any, numbers: Numbers) -> Any:
-        d = self._d
-        table, body = self._kinds[k]
-        column = [numbers(i) for i in range(len(table.outputs))]
+    def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
+        d, body = self._d, self._kinds[k].body
         if not isinstance(values, Room):
             n = 2 * d * (1 + self.vectors)
             return [*body(*values[:n], *column), *values[n:]]
@@ -451,9 +449,7 @@ def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, ve
     if key not in codes:
         codes[key] = _lacks(system)
         if not codes[key]:
-            assert system.symbols is not None
-            ndim = None if system.friction is None else system.friction.damping.ndim
-            splitting = Splitting(system.symbols.parametric, level, monomials, friction=ndim)
+            splitting = splitting_loops(system).splitting(level, monomials)
             codes[key] = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
     found = codes[key]
     if isinstance(found, str):
@@ -468,7 +464,8 @@ def _lacks(system: HamiltonianSystem) -> str:
     if not system.autonomous:
         return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
     symbols = system.symbols
-    if symbols is None or is_large(symbols) or not splitting_loops(system).traced:
+    given = system.local is not None if symbols is None else not is_large(symbols)
+    if not given or not splitting_loops(system).traced:
         return (
             f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "
             "few terms: use backend='auto'."
