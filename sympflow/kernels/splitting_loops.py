@@ -232,17 +232,23 @@ class SplittingLoops:
 
     def _traced(self, level: int, compensated: bool, monomials: Monomials) -> Functions:
         """The functions over traced numbers, which serve batches with own values too."""
-        from sympflow.kernels.splittings import Splitting, SplittingCode, shared
+        from sympflow.kernels.splittings import SplittingCode, shared
 
         key = level, compensated, monomials
         if key not in self._codes:
-            ndim = None if self.friction is None else self.friction.damping.ndim
-            driving = self._driving
-            symbols = self._symbols.parametric if driving is None else driving.form
-            make = self._written or partial(Splitting, symbols, driving=driving)
-            splitting = make(level, monomials, compensated, ndim)
+            splitting = self.splitting(level, monomials, compensated)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
+
+    def splitting(self, level: int, monomials: Monomials = (), compensated: bool = False) -> Splitting:
+        """The kicks and drifts of a level, of a system whose loops are made of traced numbers."""
+        from sympflow.kernels.splittings import Splitting
+
+        ndim, driving = None if self.friction is None else self.friction.damping.ndim, self._driving
+        if self._written is not None:
+            return self._written(level, monomials, compensated, ndim)
+        symbols = self._symbols.parametric if driving is None else driving.form
+        return Splitting(symbols, level, monomials, compensated, ndim, driving)
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""

@@ -18,6 +18,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.codegen import statements
 
 __all__ = [
+    "Family",
     "bend_source",
     "families",
     "gradient_source",
