@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -23,10 +24,12 @@ from sympflow.arguments import (
     check_t_eval,
     check_t_span,
 )
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable
+from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable, to_numpy
 from sympflow.events import EventSearch, parse
+from sympflow.hamiltonian.scales import default_step
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import report_lanes, run_and_search
+from sympflow.integrators.base import FixedStep, report_lanes, run_and_search
+from sympflow.integrators.choosing import check_tolerance, choose_method, step_for
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
 from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling
 from sympflow.integrators.domain_exit import (
@@ -39,8 +42,9 @@ from sympflow.integrators.domain_exit import (
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.impulses import run_between_impulses
 from sympflow.integrators.progress import Asked, Progress
-from sympflow.integrators.registry import build, check_applies, naming_plugin
-from sympflow.solution import Solution, StoredSolution, joined
+from sympflow.integrators.registry import build, check_applies, get, naming_plugin
+from sympflow.solution import Solution, StoredSolution, energy_change, joined
+from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -55,10 +59,12 @@ _FLOAT64 = np.dtype(np.float64)
 
 def solve(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | Array | None = None,
     *,
+    tol: float | None = None,
+    tol_of: str = "energy",
     params: Mapping[str, ArrayLike] | None = None,
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
@@ -81,14 +87,24 @@ def solve(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator, or trained flow
-        A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow.
+        Or the name of a scene, such as "henon-heiles", or H as a formula, such as "p**2/2 + q**4/4".
+    method : str, Integrator, or trained flow, optional
+        A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow. By
+        default one that suits the system, the first of these that applies: a flow that ships for it ("sympflow");
+        "log_kahan_li8" where V falls without bound towards q = 0; "srkn11b" where T = ½ pᵀM⁻¹p; "kahan_li8" where H is
+        separable; "gauss_legendre6"; "dop853". The message and `stats["chosen"]` say which, and why.
     t_span : (float, float), optional
         Start and end; the end may lie before the start. The default is the system's. With a terminal event the end may
         be infinite: without the event the run ends after a million steps, with status −1.
     y0 : array_like or tensor of shape (..., 2d), optional
         Initial state [q, p], or a batch of them. The default is the system's. A NumPy array gives float64 (integers are
         promoted); a tensor gives a tensor of its dtype and device, and gradients flow to it.
+    tol : float, optional
+        The largest relative energy error that is asked for. A method of fixed steps takes the step that
+        `sympflow.choose_step` finds by short trial runs; for "sympflow" it chooses the flow, see its option. The run
+        itself is checked: where its energy error is larger, a RuntimeWarning and the message say so.
+    tol_of : {"energy", "state"}
+        See `sympflow.choose_step`.
     params : mapping of str to array_like, optional
         Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
@@ -170,13 +186,19 @@ def solve(
     """
     if is_tensor(y0):
         check_not_traced("solve")
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
-    integrator = build(method, options)
+    system = given_system(system)
+    given, chosen = options, None
+    if tol is not None:
+        check_tolerance(tol, tol_of)
+        given = {**options, "tol": tol} if isinstance(method, str) and "tol" in get(method).options() else options
+    integrator = None if method is None else build(method, given)
     search = check_events(events, event_step)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     system.check_times(t0, t1)
+    if integrator is None:
+        simple = events is None and store is None and params is None and not dense_output
+        integrator, chosen = choose_method(system, y_start, options, tol, simple, flows=params is None)
     rows = None
     if params is not None:
         rows, y_start = check_params(system, params, y_start, integrator)
@@ -213,8 +235,26 @@ def solve(
             "`resume` and `checkpoint_every` are for runs with a `store`, and `same` with them: give one, or leave "
             "them out."
         )
+    if tol is not None and "tol" not in integrator.options():
+        integrator = replace(integrator, dt=step_for(integrator, problem, tol, tol_of))  # type: ignore[type-var]
+    elif system.step_is_open and isinstance(integrator, FixedStep) and not integrator.trained and readable(y_start):
+        integrator = replace(integrator, dt=integrator.dt or default_step(system, to_numpy(y_start)))
+    sol = _shown(integrator, problem, action, rows, progress)
+    if tol is not None and store is None and system.autonomous and system.conservative and tol_of == "energy":
+        _check_tolerance_met(sol, tol)
+    if chosen is not None:
+        sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"
+        sol.message += f" Method {sol.integrator.label!r} was chosen: {chosen}."
+    return sol
+
+
+def _shown(
+    integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None, progress: Asked
+) -> Solution:
+    """The solution of a validated problem, with a bar where that is asked for."""
     if progress is False:
         return _answered(integrator, problem, action, rows)
+    t0, t1 = problem.t0, problem.t1
     sign = math.copysign(1.0, t1 - t0)
     bar = Progress(progress, abs(t1 - t0), lambda done: f"t = {t0 + sign * done:.6g} of {t1:.6g}")
     try:
@@ -224,6 +264,17 @@ def solve(
     finally:
         bar.end()
     return sol
+
+
+def _check_tolerance_met(sol: Solution, tol: float) -> None:
+    """Note a run whose energy error is larger than was asked for."""
+    with warnings.catch_warnings(action="ignore"):  # of an error that is absolute
+        error = float(np.max(np.abs(energy_change(sol)), initial=0.0))
+    sol.stats["energy_error"] = error
+    if error > tol:
+        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
+        sol.message += f" {note}"
+        warnings.warn(note, RuntimeWarning, stacklevel=3)
 
 
 def check_backend(backend: Any, integrator: Integrator) -> None:

@@ -8,25 +8,20 @@ memory, where gradient and Hessian stand in the code once, in a loop over the st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cached_property, lru_cache, reduce
+from collections.abc import Sequence
+from functools import cached_property, reduce
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import sympy as sp
 
 from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Type, Value
 from sympflow.compiler.functions import fma, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
-from sympflow.hamiltonian.driving import with_letters
-from sympflow.hamiltonian.recorded import evaluator
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.rollouts import Columns, Rollouts
-from sympflow.kernels.runs import Numbers, Room, step_function
-from sympflow.kernels.samples import sampled_value
-from sympflow.kernels.stage_times import letters_of_time
+from sympflow.kernels.one_steps import Lettered, OneStep, recorded
+from sympflow.kernels.rollouts import Rollouts
+from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.terms import families, is_large
 
 __all__ = ["newton_code"]
@@ -39,72 +34,33 @@ ABREAST = 4  # numbers of a row of a matrix that are changed together
 LONG = 4e6  # operations between two looks for a stop
 
 
-@lru_cache(maxsize=256)
-def newton_code(symbols: SymbolicHamiltonian, tableau: Tableau, compensated: bool, damped: bool) -> NewtonCode:
-    """The code of a method on a symbolic system; systems that differ in their parameters alone share it."""
+def newton_code(lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> NewtonCode:
+    """The code of a method for H, `lettered`."""
+    symbols = lettered.symbols
     few = 2 * symbols.ndof * len(tableau[1]) <= MOST_IN_REGISTERS and not is_large(symbols)
-    return (_InRegisters if few else _InMemory)(symbols, tableau, compensated, damped)
+    return (_InRegisters if few else _InMemory)(lettered, tableau, compensated, damped)
 
 
-class NewtonCode(Rollouts):
+class NewtonCode(OneStep):
     """Steps of an implicit method on a symbolic system, whose count is of Newton's iterations.
 
-    The numbers of a column are h, the system's parameters, the time t0 of the run's beginning where H depends on it
-    and, with friction, e^{γτ} at the stages and at the end of a step, then their reciprocals. What depends on t alone
-    is computed once a step, for each stage, and follows them.
-
-    Attributes
-    ----------
-    work : int
-        About how many nanoseconds a step takes.
+    With friction the last numbers of a column are e^{γτ} at the stages and at the end of a step, then their
+    reciprocals. What depends on t alone is computed once a step, for each stage, and follows them.
     """
 
     counted = True
 
-    def __init__(self, symbols: SymbolicHamiltonian, tableau: Tableau, compensated: bool, damped: bool) -> None:
-        self._symbols, self._tableau, self._compensated, self._damped = symbols, tableau, compensated, damped
-        self._driven = symbols.time is not None
-        self._parameters = len(symbols.parameters)
-        self._nodes = stage_nodes(tableau)
-        self.ndof, self.stages, n = symbols.ndof, len(tableau[1]), 2 * symbols.ndof
+    def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
+        self._tableau, self._compensated, self._damped = tableau, compensated, damped
+        self._nodes, self.stages = stage_nodes(tableau), len(tableau[1])
+        n = 2 * lettered.symbols.ndof
+        super().__init__(lettered, n * (1 + compensated) + 1, n * (self.stages + 1) * damped)
         self.unknowns = n * self.stages
         self.work = 4 * self.unknowns**3
         self.block = int(min(max(LONG / self.unknowns**3, 1), Rollouts.block))
-        super().__init__(n * (1 + compensated) + 1, n)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return newton_code, (self._symbols, self._tableau, self._compensated, self._damped)
-
-    @cached_property
-    def size(self) -> int:
-        damped = 2 * self.ndof * (self.stages + 1) if self._damped else 0
-        return 1 + self._parameters + self._driven + damped
-
-    def prepared(self, table: Columns) -> Columns:
-        return table
-
-    def made(self, name: str, width: int) -> Callable[..., None]:
-        if name != "step":
-            return super().made(name, width)
-        # All numbers follow the states in their rows, which have the count behind them.
-        n, memory = self.n_out + 1, self.room is not None
-        return step_function(n, n, [0] * self.size, self.size, lambda *numbers: numbers, self.stage, width, memory)
-
-    def steps(self, y: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, int]:
-        """One step from every row of `y` (N, 2d) by its own numbers (N, size); Newton's iterations in sum."""
-        rows = np.concatenate([y, np.zeros((len(y), 1)), numbers], axis=1)
-        out, nothing, h = np.empty((len(y), self.n_out + 1)), np.zeros((self.size, 1, 1)), np.zeros(len(y))
-        width = 1 if len(y) == 1 else self.lanes
-        self.call("step", width, nothing, 1, 1, h, h, h, rows, len(y), out, n_out=self.n_out + 1)
-        return out[:, :-1].copy(), int(out[:, -1].sum())
-
-    def _column(self, code: Code, numbers: Numbers, step: Value) -> list[Value]:
-        """The numbers of a column, with the time at which the step begins."""
-        column = [numbers(i) for i in range(self.size)]
-        if self._driven:
-            at, width = 1 + self._parameters, column[0].type.width
-            column[at] = column[at] + code.splat(code.convert("sitofp", step, "double"), width) * column[0]
-        return column
+        return newton_code, (self.lettered, self._tableau, self._compensated, self._damped)
 
     def _changes(self, K: Sequence[Value]) -> Value:
         """Σ B_i K_i of one variable."""
@@ -113,30 +69,10 @@ class NewtonCode(Rollouts):
     # H ------------------------------------------------------------------------------------------------------------
 
     @cached_property
-    def _lettered(self) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
-        """H with letters for what depends on t and on parameters alone, and these."""
-        found: dict[sp.Expr, sp.Symbol] = {}
-        H, t = self._symbols.H, self._symbols.time
-        if t is not None:
-            H = letters_of_time(H, t, {*self._symbols.parameters}, found, "letter")
-        return H, {s: f for f, s in found.items()}
-
-    def _letters(self, t: Value, parameters: Sequence[Value]) -> list[Value]:
-        """The letters at a time."""
-        _, letters = self._lettered
-        expressions, sampled = with_letters(list(letters.values()))
-        of_time = evaluator({self._symbols.time: t, **dict(zip(self._symbols.parameters, parameters, strict=True))})
-        values = [
-            sampled_value(self._symbols.samples[each.name_of_samples], each.order, of_time(each.at)) for each in sampled
-        ]
-        inputs = (self._symbols.time, *self._symbols.parameters, *sampled.values())
-        return [t.code.operand(x, t.type) for x in _recorded(expressions, inputs)(t, *parameters, *values)]
-
-    @cached_property
     def slopes(self) -> Program:
         """∇H and the upper triangle of ∇²H, row by row, from q, p, the parameters and the letters."""
-        H, letters = self._lettered
-        program = _recorded([H], (*self._symbols.q, *self._symbols.p, *self._symbols.parameters, *letters))
+        symbols = self.lettered.symbols
+        program = recorded(self.lettered.expressions, (*symbols.q, *symbols.p, *self.lettered.given))
         y = program.inputs[: self.n_out]
         slope = gradient(program.outputs[0], y)
         rows = [gradient(x, y[i:]) for i, x in enumerate(slope)]
@@ -162,7 +98,7 @@ class _InRegisters(NewtonCode):
         """One step: y, the errors of compensated sums, and the count of iterations."""
         code, n, d = values[0].code, self.n_out, self.ndof
         y, errors, count = values[:n], values[n:-1], values[-1]
-        column = self._column(code, numbers, step)
+        column = self.column(code, numbers, step)
         K, taken, lost = self._iterated(code, y, column)
         changes = [self._changes(K[m::n]) for m in range(n)]
         if self._compensated:
@@ -180,9 +116,9 @@ class _InRegisters(NewtonCode):
         self, Y: Sequence[Any], column: Sequence[Any], stage: int
     ) -> tuple[list[Any], list[list[Any]]]:
         """∇H and ∇²H at a stage, with friction of [q, P] as the equations hold them."""
-        d, n, letters = self.ndof, self.n_out, len(self._lettered[1])
+        d, n, letters = self.ndof, self.n_out, len(self.lettered.letters)
         start = self.size + stage * letters
-        given = [*column[1 : 1 + self._parameters], *column[start : start + letters]]
+        given = [*column[1 : 1 + self.parameters], *column[start : start + letters]]
         if not self._damped:
             return self._square(self.slopes(*Y, *given))
         growths = column[self.size - 2 * d * (self.stages + 1) :]
@@ -236,7 +172,7 @@ class _InRegisters(NewtonCode):
     @cached_property
     def _iterations(self) -> tuple[Program, Program]:
         """The first iteration, of y and the column's numbers, and the others, of K and the sizes too."""
-        n, N, size = self.n_out, self.unknowns, self.size + self.stages * len(self._lettered[1])
+        n, N, size = self.n_out, self.unknowns, self.size + self.stages * len(self.lettered.letters)
 
         def first(*numbers: Any) -> list[Any]:
             return self._iteration(numbers[:n], [0.0] * N, numbers[n:], ())
@@ -252,9 +188,8 @@ class _InRegisters(NewtonCode):
         """The K of a step, the iterations taken, and where they were in vain."""
         N, type = self.unknowns, y[0].type
         first, other = self._iterations
-        if self._driven:
-            parameters, (t, h) = column[1 : 1 + self._parameters], (column[1 + self._parameters], column[0])
-            column = [*column, *(x for c in self._nodes for x in self._letters(t + c * h, parameters))]
+        if self.driven:
+            column = [*column, *(x for c in self._nodes for x in self.letters_at(column, c))]
         (*outputs,) = (code.operand(x, type) for x in first(*y, *column))
         K, size, sizes = [code.variable(x) for x in outputs[:N]], code.variable(outputs[N]), outputs[N + 1 :]
         taken, small = code.variable(code.constant(1.0, type)), code.variable(size.value <= TOLERANCE)
@@ -279,13 +214,14 @@ class _InMemory(NewtonCode):
 
     lanes = 1
 
-    def __init__(self, symbols: SymbolicHamiltonian, tableau: Tableau, compensated: bool, damped: bool) -> None:
-        super().__init__(symbols, tableau, compensated, damped)
+    def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
+        super().__init__(lettered, tableau, compensated, damped)
+        symbols = lettered.symbols
         self._large = is_large(symbols)
-        self._families = families(self._lettered[0], (*symbols.q, *symbols.p)) if self._large else []
+        self._families = families(lettered.expressions[0], (*symbols.q, *symbols.p)) if self._large else []
         self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]
         n, N = self.n_out, self.unknowns
-        self._numbers = self.size + self.stages * len(self._lettered[1])
+        self._numbers = self.size + self.stages * len(self.lettered.letters)
         self._sizes = [N, self._numbers, N * self._wide, n, n, n * n, N]
         self.room = sum(self._sizes)
 
@@ -298,7 +234,7 @@ class _InMemory(NewtonCode):
         """One step in place: y, the errors of compensated sums, and the count of iterations."""
         code, n, N = room.code, self.n_out, self.unknowns
         K, column, M, Y, g, S, sizes = (room.part(sum(self._sizes[:i]), room.work) for i in range(7))
-        given = self._column(code, numbers, step)
+        given = self.column(code, numbers, step)
         for i, x in enumerate(given):
             code.store(x, column, i)
         self._store_letters(code, given, column)
@@ -325,12 +261,11 @@ class _InMemory(NewtonCode):
 
     def _store_letters(self, code: Code, given: Sequence[Value], column: Value) -> None:
         """The letters of all stages, behind the numbers of the column."""
-        letters = len(self._lettered[1])
+        letters = len(self.lettered.letters)
         if letters:
             nodes = code.array("nodes", self._nodes)
             with code.over(self.stages) as i:
-                t = given[1 + self._parameters] + code.load(nodes, i) * given[0]
-                for k, x in enumerate(self._letters(t, given[1 : 1 + self._parameters])):
+                for k, x in enumerate(self.letters_at(given, code.load(nodes, i))):
                     code.store(x, column, i * letters + (self.size + k))
 
     def _advance(self, room: Room, K: Value, m: Value, small: Value) -> None:
@@ -396,8 +331,8 @@ class _InMemory(NewtonCode):
         self, code: Code, numbers: Value, Y: Value, g: Value, S: Value, i: Value, data: Sequence[Value]
     ) -> None:
         """∇H into g and ∇²H into S, of a stage."""
-        n, letters = self.n_out, len(self._lettered[1])
-        given = [code.load(numbers, 1 + k) for k in range(self._parameters)]
+        n, letters = self.n_out, len(self.lettered.letters)
+        given = [code.load(numbers, 1 + k) for k in range(self.parameters)]
         given += [code.load(numbers, i * letters + (self.size + k)) for k in range(letters)]
         if self._large:
             self._add_terms(code, given, Y, g, S, data)
@@ -414,11 +349,11 @@ class _InMemory(NewtonCode):
         self, code: Code, given: Sequence[Value], Y: Value, g: Value, S: Value, data: Sequence[Value]
     ) -> None:
         """The same by a loop over the terms of each kind."""
-        n, symbols = self.n_out, self._symbols
+        n = self.n_out
         _fill(code, g, n)
         _fill(code, S, n * n)
         for family, (coordinates, constants) in zip(self._families, zip(*[iter(data)] * 2, strict=True), strict=True):
-            program = _recorded([family.f], (*family.x, *family.c, *symbols.parameters, *self._lettered[1]))
+            program = recorded([family.f], (*family.x, *family.c, *self.lettered.given))
             x, d = program.inputs[: len(family.x)], len(family.x)
             slope = gradient(program.outputs[0], x)
             both = Program(program.inputs, [*slope, *(entry for s in slope for entry in gradient(s, x))])
@@ -557,15 +492,6 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
             total = fma(-rows[k][j], solution[j], total)
         solution[k] = total * rows[k][k]
     return solution
-
-
-def _recorded(expressions: Sequence[sp.Expr], inputs: Sequence[sp.Symbol]) -> Program:
-    """Expressions as a program of symbols."""
-
-    def values(*numbers: Any) -> list[Any]:
-        return list(map(evaluator(dict(zip(inputs, numbers, strict=True))), expressions))
-
-    return traced(values, *(s.name for s in inputs))
 
 
 def _total(terms: Sequence[Any]) -> Any:

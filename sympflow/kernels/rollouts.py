@@ -53,6 +53,8 @@ class Rollouts:
         Steps between two looks for a state that is not finite, or a stop, where nothing is saved.
     counted : bool
         True if the last of `n_values` is a count, which is no part of the running state.
+    closing : bool
+        False if outputs are never closed, so that the code need not hold a stage for that.
     """
 
     lanes = 16
@@ -62,6 +64,7 @@ class Rollouts:
     every: int | None = None
     block = BLOCK
     counted = False
+    closing = True
 
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
@@ -105,8 +108,9 @@ class Rollouts:
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
+        own = name == "run own"
         return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, name == "run own", memory, look, every
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing
         )
 
     def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:

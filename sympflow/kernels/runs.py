@@ -39,6 +39,7 @@ def run_function(
     memory: bool = False,
     look: Callable[[Any], Any] | None = None,
     every: int = BLOCK,
+    closing: bool = True,
 ) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side.
 
@@ -59,6 +60,8 @@ def run_function(
         outputs are the same but for what it knows of; of states in memory ``look(room)`` in place.
     every : int
         Steps between two looks, for a state that is not finite too.
+    closing : bool
+        False if `closes` is always 0.
 
     Returns
     -------
@@ -106,8 +109,9 @@ def run_function(
                 j.value = code.select(code.apply("eq", (at, link)), one, at + 1)
                 step.value = code.select(code.apply("eq", (j.value, link)), step.value + 1, step.value)
             state.end()
-            with code.over(closes):
-                state.change(column, link + 1, step.value, end=True)
+            if closing:
+                with code.over(closes):
+                    state.change(column, link + 1, step.value, end=True)
             alive.value = alive.value & state.finite()
             good = code.any(alive.value)
             going.value = good & code.apply("eq", (code.load(stop, 0, INT, shared=True), zero))
