@@ -166,6 +166,10 @@ def literal(x: float, type: Type) -> str:
     return text if type.width == 1 else f"splat ({type.scalar} {text})"
 
 
+def _vector(scalar: str, numbers: Iterable[int]) -> str:
+    return f"<{', '.join(f'{scalar} {x}' for x in numbers)}>"
+
+
 _PLAIN = {"add": "fadd", "sub": "fsub", "mul": "fmul", "times": "fmul", "div": "fdiv"}
 _INTEGER = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or"}
 _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "eq": ("oeq", "eq")}
@@ -352,6 +356,25 @@ class Code:
         first = self._new(type, f"insertelement {type} poison, {x.type} {x.name}, i64 0")
         return self._new(type, f"shufflevector {type} {first.name}, {type} poison, <{width} x i32> zeroinitializer")
 
+    def lane_numbers(self, width: int) -> Value:
+        """0, 1, … in the lanes."""
+        return Value(self, INT, "0") if width == 1 else Value(self, Type("i64", width), _vector("i64", range(width)))
+
+    def total(self, x: Value) -> Value:
+        """The sum of all lanes, halves added to halves."""
+        while x.type.width > 2:
+            half = Type(x.type.scalar, x.type.width // 2)
+            n, rest = half.width, f"{x.type} poison"
+            low, high = (
+                self._new(half, f"shufflevector {x.type} {x.name}, {rest}, <{n} x i32> {_vector('i32', lanes)}")
+                for lanes in (range(n), range(n, 2 * n))
+            )
+            x = low + high
+        if x.type.width == 1:
+            return x
+        first, last = (self._new(Type(x.type.scalar), f"extractelement {x.type} {x.name}, i64 {k}") for k in (0, 1))
+        return first + last
+
     def any(self, condition: Value) -> Value:
         """True if a condition holds in any lane."""
         if condition.type.width == 1:
@@ -370,12 +393,21 @@ class Code:
     def load(self, pointer: Value, index: Any = 0, type: Type = DOUBLE, shared: bool = False) -> Value:
         """The value at an index of an array of scalars, aligned as these are; `shared` if another thread changes it."""
         place = self.at(pointer, index, type.scalar)
-        kind = "load volatile" if shared else "load"
-        return self._new(type, f"{kind} {type}, ptr {place.name}, align {_SIZES[type.scalar]}")
+        kind, order = ("load atomic volatile", " seq_cst") if shared else ("load", "")
+        return self._new(type, f"{kind} {type}, ptr {place.name}{order}, align {_SIZES[type.scalar]}")
 
     def store(self, x: Value, pointer: Value, index: Any = 0) -> None:
         place = self.at(pointer, index, x.type.scalar)
         self._lines.append(f"  store {x.type} {x.name}, ptr {place.name}, align {_SIZES[x.type.scalar]}")
+
+    def added(self, x: Value, pointer: Value, index: Any = 0) -> Value:
+        """Add to a whole number that several threads change, and return it as it was."""
+        place = self.at(pointer, index, x.type.scalar)
+        return self._new(x.type, f"atomicrmw add ptr {place.name}, {x.type} {x.name} seq_cst")
+
+    def address(self, x: Value) -> Value:
+        """A whole number as the address of memory, which others may read and write too."""
+        return self._new(POINTER, f"inttoptr i64 {x.name} to ptr")
 
     def memory(self, count: int, type: Type = DOUBLE) -> Value:
         """Room for so many values on the stack, aligned to 64 bytes."""

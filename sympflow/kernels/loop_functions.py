@@ -284,16 +284,7 @@ def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> 
     return LatticeLoops(system.local, level, compensated, system.friction is not None)
 
 
-def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
-    """The loops of bodies in pairs, of which only the potential, and not their number, is part of the code."""
-    from sympflow.hamiltonian.bodies import PairsHamiltonian
-    from sympflow.kernels.pair_forces import PairLoops
-
-    assert isinstance(system.local, PairsHamiltonian)
-    return PairLoops(system.local, level, compensated, system.friction is not None)
-
-
-LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
+LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops}
 """Makers of the loops of systems that are given by one piece."""
 
 

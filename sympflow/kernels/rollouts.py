@@ -11,7 +11,7 @@ import numpy as np
 
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
-from sympflow.kernels.runs import BLOCK, Numbers, map_function, run_function
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
 
 __all__ = ["Columns", "Rollouts", "aligned"]
 
@@ -45,6 +45,8 @@ class Rollouts:
         Trajectories that run in lanes rather than one after the other.
     room : int, optional
         Where states are in memory, how many numbers more stages need there; None where they are in registers.
+    memory : callable
+        How they are there: `sympflow.kernels.runs.Memory`, or such a class.
     data : sequence of ndarray
         Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
     every : int, optional
@@ -61,6 +63,7 @@ class Rollouts:
     fewest = 2
     room: int | None = None
     data: Sequence[np.ndarray] = ()
+    memory: Callable[..., Memory] = Memory
     every: int | None = None
     block = BLOCK
     counted = False
@@ -92,6 +95,11 @@ class Rollouts:
         """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
         raise NotImplementedError
 
+    @property
+    def place(self) -> Callable[..., Memory] | None:
+        """What is made of states in memory; None where they are in registers."""
+        return None if self.room is None else self.memory
+
     def function(self, name: str, width: int) -> Callable[..., None]:
         """The compiled function of a name, see `made`."""
         found = self._functions.get((name, width))
@@ -104,7 +112,7 @@ class Rollouts:
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "run", "run own" or "map"."""
-        memory = self.room is not None
+        memory = self.place
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)

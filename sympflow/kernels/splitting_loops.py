@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.loop_functions import LoopFunctions
     from sympflow.kernels.rollouts import Rollouts
+    from sympflow.kernels.splittings import Splitting
 
     Functions = LoopFunctions | Rollouts
 
@@ -79,7 +80,9 @@ class SplittingLoops:
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = self.traced = False
-        self._symbols = system.symbols
+        self._symbols: Any = system.symbols
+        self._written: Callable[..., Splitting] | None = None
+        self._compile: Callable[..., Functions]
         self._codes: dict[tuple[int, bool, Monomials], Functions] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
@@ -124,11 +127,18 @@ class SplittingLoops:
                     f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
                     "backend='array'."
                 )
-            from sympflow.kernels.loop_functions import local_loops
+            if system.local.loops == "pairs":
+                from sympflow.kernels.pairs import few, pair_code
 
-            self.closes = True
+                self._written, self.values = few(system.local)
+                self._compile = partial(pair_code, system.local, system.friction is not None)
+            else:
+                from sympflow.kernels.loop_functions import local_loops
+
+                self.closes = True
+                self._compile = partial(local_loops, system)
             self._has_force_gradient = system.quadratic_kinetic
-            self._compile = partial(local_loops, system)
+            self.traced = self._written is not None
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
@@ -223,9 +233,9 @@ class SplittingLoops:
 
         key = level, compensated, monomials
         if key not in self._codes:
-            assert self._symbols is not None
             ndim = None if self.friction is None else self.friction.damping.ndim
-            splitting = Splitting(self._symbols.parametric, level, monomials, compensated, ndim)
+            make = self._written or partial(Splitting, self._symbols.parametric)
+            splitting = make(level, monomials, compensated, ndim)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
 

@@ -28,7 +28,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["Splitting", "SplittingCode", "shared"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "shared"]
 
 MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
@@ -86,14 +86,14 @@ class Splitting:
 
     def _arranged(self, terms: int) -> Arranged:
         """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
-        cost, shape = _Shape(self, terms, True).arranged()
+        cost, shape = Shape(self, terms, True).arranged()
         if terms > 1 and len(shape.body) > LONG:
-            other_cost, other = _Shape(self, terms, False).arranged()
+            other_cost, other = Shape(self, terms, False).arranged()
             return shape if cost <= other_cost else other
         return shape
 
 
-class _Shape:
+class Shape:
     """One way to write a stage: products of sums multiplied out, or left."""
 
     def __init__(self, splitting: Splitting, terms: int, expand: bool) -> None:
@@ -114,19 +114,22 @@ class _Shape:
     def arranged(self) -> tuple[int, Arranged]:
         """The cost of the stage, and its programs."""
         made, d = self.made, self.d
-        changes = self._changes()
         errors: list[Any] = []
         if self.splitting.compensated:
-            momenta, errors_p = self._compensated(self.p, [made.written(x) for x in changes], self.errors[d:])
+            changes = [made.written(x) for x in self._changes()]
+            momenta, errors_p = self._compensated(self.p, changes, self.errors[d:])
             moves = [made.written(x) for x in self._velocity(momenta, self.number["a"])]
             positions, errors_q = self._compensated(self.q, moves, self.errors[:d])
             errors = [*errors_q, *errors_p]
         else:
-            momenta = [made.written(p + x) for p, x in zip(self.p, changes, strict=True)]
-            positions, momenta = self._drifted(momenta)
+            positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
         arranged = made.finish(outputs)
         return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
+
+    def _kicked(self) -> list[Any]:
+        """The momenta after a kick, numbers of the body."""
+        return [self.made.written(p + x) for p, x in zip(self.p, self._changes(), strict=True)]
 
     def _changes(self) -> list[Any]:
         """The change of p by a kick."""
@@ -307,9 +310,8 @@ class SplittingCode(Rollouts):
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
             return self._executed(last, values, numbers)
 
-        own_numbers, memory = self._own if own else 0, self.room is not None
-        table = self._kinds[last].table
-        return step_function(self.n_values, self.n_out, powers, own_numbers, table, stage, width, memory)
+        own_numbers, table = self._own if own else 0, self._kinds[last].table
+        return step_function(self.n_values, self.n_out, powers, own_numbers, table, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
 
