@@ -6,9 +6,10 @@ depend on the size of a system; or functions at an address.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, POINTER, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.program import gradient, traced
+from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Numbers, Room, step_function
 from sympflow.kernels.splittings import Splitting, SplittingCode
 from sympflow.kernels.stages import kicks_of
@@ -23,7 +25,7 @@ from sympflow.kernels.stages import kicks_of
 if TYPE_CHECKING:
     from sympflow.kernels.terms import Terms
 
-__all__ = ["ArrayCode", "Forces", "Functions", "TermForces"]
+__all__ = ["ArrayCode", "Functions", "TermForces", "function_code", "term_code"]
 
 ARRAYS = 4  # of d numbers that a kick needs: slopes, velocities, products with the Hessian, curvatures
 
@@ -51,7 +53,7 @@ class Forces(Protocol):
     def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         """½ ∇³V(q)(v, v)."""
 
-    def velocity(self, room: Room, p: Value, out: Value, d: Value) -> None:
+    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         """∇T(p)."""
 
 
@@ -82,14 +84,14 @@ class TermForces:
     def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         self._V.added(room, self._V.bends, [q, v], out, d, letters)
 
-    def velocity(self, room: Room, p: Value, out: Value, d: Value) -> None:
+    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         place = len(self._V.data)
         if self._T is None or isinstance(self._T, np.ndarray):
             with room.code.over(d) as i:
                 x = room.load(i, p)
                 room.store(x if self._T is None else x * room.code.load(room.data(place), i), i, out)
             return
-        self._T.added(room, self._T.slopes, [p], out, d, (), place)
+        self._T.added(room, self._T.slopes, [p], out, d, letters, place)
 
 
 class Functions:
@@ -97,9 +99,9 @@ class Functions:
 
     Parameters
     ----------
-    addresses : ndarray of int64
-        Of functions of places in memory and their length: ∇V(q, out, d), and ∇²V v as (q, v, out, d); with the time
-        before these where it counts.
+    functions : sequence
+        With an `address`, of places in memory and their length: ∇V(q, out, d), and ∇²V v as (q, v, out, d); with the
+        time before these where it counts.
     inverse_mass : ndarray, optional
         (d,) or (d, d).
     timed : bool
@@ -107,8 +109,9 @@ class Functions:
 
     lanes = 1
 
-    def __init__(self, addresses: np.ndarray, inverse_mass: np.ndarray | None, timed: bool) -> None:
-        self._mass, self._timed = inverse_mass, timed
+    def __init__(self, functions: Sequence[Any], inverse_mass: np.ndarray | None, timed: bool) -> None:
+        self._functions, self._mass, self._timed = functions, inverse_mass, timed  # functions are kept alive
+        addresses = np.array([f.address for f in functions], dtype=np.int64)
         self.data = [addresses, *([] if inverse_mass is None else [np.ascontiguousarray(inverse_mass)])]
 
     def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
@@ -129,7 +132,7 @@ class Functions:
         address = code.load(room.data(0), which, POINTER)
         code.call_at(address, [*(letters[-1:] if self._timed else ()), *given, out, d])
 
-    def velocity(self, room: Room, p: Value, out: Value, d: Value) -> None:
+    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         code, M = room.code, self._mass
         with code.over(d) as i:
             if M is None:
@@ -140,6 +143,68 @@ class Functions:
                 room.store(code.constant(0.0), i, out)
                 with code.over(d) as j:
                     room.add(code.load(room.data(1), i * d + j) * room.load(j, p), i, out)
+
+
+def term_code(splitting: Splitting) -> ArrayCode:
+    """The compiled functions of a symbolic system of many terms."""
+    from sympflow.kernels.terms import Terms
+
+    symbols = splitting.symbols
+    M = symbols.inverse_mass
+    T: Any = Terms(symbols.T, symbols.p, symbols.parameters)
+    if M is not None and M.is_diagonal() and not M.free_symbols:
+        masses = np.array([float(x) for x in M.diagonal()])
+        T = None if (masses == 1).all() else masses
+    return ArrayCode(splitting, TermForces(Terms(symbols.V, symbols.q, symbols.parameters), T))
+
+
+def function_code(
+    ndof: int,
+    gradient: Any,
+    hessian_vector: Any | None,
+    inverse_mass: np.ndarray | None,
+    friction: int | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
+) -> ArrayCode:
+    """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
+    found = [gradient, *([hessian_vector] if level else [])]
+    forces = Functions([addressed(f) for f in found], inverse_mass, False)
+    return ArrayCode(Splitting(Sizes(ndof), level, monomials, compensated, friction), forces)
+
+
+class Sizes(NamedTuple):
+    """In place of the symbols of a system that has none."""
+
+    ndof: int
+    parameters: tuple[()] = ()
+
+
+def addressed(function: Any) -> Any:
+    """A Numba function of arrays as one of places in memory, which C can call; what it raises makes its result NaN."""
+    from numba import carray, cfunc, types
+
+    place, n_arrays = types.CPointer(types.float64), len(inspect.signature(function.py_func).parameters)
+    if n_arrays == 2:
+
+        @cfunc(types.void(place, place, types.int64))
+        def called(q, out, n):  # type: ignore[no-untyped-def]
+            try:
+                function(carray(q, (n,)), carray(out, (n,)))
+            except Exception:
+                out[0] = np.nan
+
+        return called
+
+    @cfunc(types.void(place, place, place, types.int64))
+    def called_along(q, v, out, n):  # type: ignore[no-untyped-def]
+        try:
+            function(carray(q, (n,)), carray(v, (n,)), carray(out, (n,)))
+        except Exception:
+            out[0] = np.nan
+
+    return called_along
 
 
 class ArrayCode(SplittingCode):
@@ -200,7 +265,7 @@ class ArrayCode(SplittingCode):
         forces.gradient(room, q, slope, d, letters)
         factors = [(-kicks[0], slope)]
         if terms > 1:
-            forces.velocity(room, slope, velocity, d)
+            forces.velocity(room, slope, velocity, d, letters)
             forces.product(room, q, velocity, product, d, letters)
             factors.append((kicks[1], product))
         if terms > 2:
@@ -209,7 +274,7 @@ class ArrayCode(SplittingCode):
                 bend = kicks[2] * room.load(i, bent)
                 change = fma(kicks[1], room.load(i, product), -(kicks[0] * room.load(i, slope)))
                 room.store(change - bend, i, slope)
-            forces.velocity(room, product, velocity, d)
+            forces.velocity(room, product, velocity, d, letters)
             forces.product(room, q, velocity, product, d, letters)
             factors = [(1.0, slope), (-kicks[2], product)]
         if splitting.monomials:
@@ -251,7 +316,7 @@ class ArrayCode(SplittingCode):
                 room.store(mean[k] * x, i, spread)
                 room.store(decay[k] * x, i, p)
             moved, a = spread, 1.0
-        forces.velocity(room, moved, velocity, d)
+        forces.velocity(room, moved, velocity, d, given[len(given) - self._own :])
         with code.over(d) as i:
             self._move(room, q, i, [(a, room.load(i, velocity))], 2)
 

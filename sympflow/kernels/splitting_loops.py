@@ -79,11 +79,12 @@ class SplittingLoops:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
-        self._has_ranges = self.closes = self.traced = False
+        self._has_ranges = self.closes = self.traced = self._large = False
         self._symbols: Any = system.symbols
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Functions]
         self._codes: dict[tuple[int, bool, Monomials], Functions] = {}
+        self._longs: dict[int, bool] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not system.separable:
@@ -93,7 +94,8 @@ class SplittingLoops:
             from sympflow.kernels.terms import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
-            if is_large(system.symbols):
+            self._large = is_large(system.symbols)
+            if self._large and self.driven:
                 from sympflow.kernels.loop_functions import family_loops
 
                 self._compile = partial(family_loops, system, damped_drift(system, True))
@@ -108,19 +110,26 @@ class SplittingLoops:
                 V = system.symbols.V
                 check_recorded(V)
                 check_recorded(system.symbols.T)
-                damped_drift(system, False)
+                damped_drift(system, self._large)
                 self.values = system.symbols.parametric.values
-                self._has_ranges = self.traced = True
+                self._has_ranges, self.traced = not self._large, True
                 self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial(*system.symbols.q) else LANES
         elif system.numba_functions is not None:
-            from sympflow.kernels.loop_functions import array_loops
-
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
             damped = damped_drift(system, True)
-            self._compile = partial(
-                array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, self.driven, damped
-            )
+            if self.driven:
+                from sympflow.kernels.loop_functions import array_loops
+
+                self._compile = partial(
+                    array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, True, damped
+                )
+            else:
+                from sympflow.kernels.array_splittings import function_code
+
+                ndim = None if system.damping is None else system.damping.ndim
+                given = gradient, hessian_vector, system.inverse_mass
+                self._compile = partial(function_code, system.ndof, *given, ndim)
         elif system.local is not None:
             if system.damping is not None and system.damping.ndim:
                 raise ValueError(
@@ -178,8 +187,10 @@ class SplittingLoops:
         kernel._functions()
         return kernel
 
-    def takes_values(self, level: int, ranges: Ranges | None = None) -> bool:
+    def takes_values(self, level: int, ranges: Ranges | None = None, varied: bool = False) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
+        if not varied and self._long(level):
+            return False
         traced = self.traced and not ranges
         return bool(self.values) and (traced or (self.friction is None and takes_values(level)))
 
@@ -221,19 +232,33 @@ class SplittingLoops:
             more: dict[str, Any] = {"varied": True} if varied else {}
             return self._compile(level, compensated, monomials, **more)
         if not ranges:
-            return self._traced(level, compensated, monomials)
+            return self._traced(level, compensated, monomials, varied)
         from sympflow.kernels.loop_functions import symbolic_loops
 
         assert self._symbols is not None
         return symbolic_loops(self._symbols, None, level, compensated, monomials, varied, ranges)
 
-    def _traced(self, level: int, compensated: bool, monomials: Monomials) -> Functions:
+    def _long(self, level: int) -> bool:
+        """True of stages that are loops over the terms of H."""
+        if not self._large or not self.traced:
+            return False
+        from sympflow.kernels.terms import is_long
+
+        if level not in self._longs:
+            self._longs[level] = is_long(self._symbols, level)
+        return self._longs[level]
+
+    def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool) -> Functions:
         """The functions over traced numbers, which serve batches with own values too."""
         from sympflow.kernels.splittings import Splitting, SplittingCode, shared
 
         key = level, compensated, monomials
+        ndim = None if self.friction is None else self.friction.damping.ndim
+        if not varied and self._long(level):
+            from sympflow.kernels.array_splittings import term_code
+
+            return term_code(Splitting(self._symbols, *key, ndim))
         if key not in self._codes:
-            ndim = None if self.friction is None else self.friction.damping.ndim
             make = self._written or partial(Splitting, self._symbols.parametric)
             splitting = make(level, monomials, compensated, ndim)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))

@@ -17,23 +17,42 @@ import sympy as sp
 
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import INT, Value
-from sympflow.compiler.program import Program, gradient, tangent, traced
+from sympflow.compiler.program import Program, derivatives, gradient, tangent, traced
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.runs import Room
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
-__all__ = ["Terms", "families", "is_large", "warn_if_long", "written_out"]
+__all__ = ["Terms", "families", "is_large", "is_long", "warn_if_long", "written_out"]
 
 MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more than a few seconds
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
 MOST_COMPILED = 5000  # operations of all formulas, before a warning
 MOST_SEPARATE = 8  # slopes of a formula that have nothing in common
-MOST_OPERATIONS = 300  # in one function of terms that stand alone
+MOST_TOGETHER = 75  # operations of terms that stand alone in one loop
+MOST_OPERATIONS = 1000  # of derivatives that are written out
 
 
 def is_large(symbols: SymbolicHamiltonian) -> bool:
     """True of a system whose terms are better looped over than written out."""
     return symbols.ndof > MOST_IN_REGISTERS or written_out(symbols.H, symbols.q + symbols.p) > MOST_WRITTEN_OUT
+
+
+def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
+    """True where the derivatives of V that kicks of a level need have more operations than are written out."""
+    n = {FORCE_GRADIENT: 2, CURVATURE: 3}.get(level, 1)
+    known = set(symbols.q)
+    roughly = sum(sp.count_ops(f) * len(f.free_symbols & known) ** n for f in sp.Add.make_args(symbols.V))
+    if not MOST_OPERATIONS < roughly < 20 * MOST_OPERATIONS:
+        return bool(roughly > MOST_OPERATIONS)
+
+    def orders(*q: Any) -> list[Any]:
+        found = [gradient(evaluator(dict(zip(symbols.q, q, strict=True)))(symbols.V), q)]
+        for _ in range(1, n):
+            found.append([x for row in derivatives(found[-1], q) for x in row])
+        return [x for order in found for x in order]
+
+    return len(traced(orders, *(s.name for s in symbols.q))) > MOST_OPERATIONS
 
 
 def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
@@ -74,7 +93,7 @@ class Family(NamedTuple):
 
 
 def families(f: sp.Expr, variables: Sequence[sp.Symbol]) -> list[Family]:
-    """The terms of f by their kinds; those of which there is one each, together, up to `MOST_OPERATIONS`."""
+    """The terms of f by their kinds; those of which there is one each, together, up to `MOST_TOGETHER`."""
     place = {s: i for i, s in enumerate(variables)}
     members: dict[tuple[str, tuple[int, ...]], list[tuple[sp.Expr, _Tree, list[int]]]] = {}
     for term in _terms(f, set(variables)):
@@ -115,7 +134,7 @@ def _chunks(terms: Sequence[sp.Expr]) -> Iterator[list[sp.Expr]]:
     size = 0
     for term in terms:
         cost = sp.count_ops(term)
-        if chunk and size + cost > MOST_OPERATIONS // 4:  # slopes are several times as long
+        if chunk and size + cost > MOST_TOGETHER:
             yield chunk
             chunk, size = [], 0
         chunk.append(term)
@@ -192,10 +211,14 @@ class Terms:
     """
 
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
+        self._given = f, tuple(variables), tuple(letters)
         self._families, self._letters = families(f, variables), tuple(letters)
         self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
         for family in self._families:
             self.data += [family.coordinates.astype(np.int64), family.constants]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Terms, self._given
 
     @cached_property
     def slopes(self) -> list[Program]:
