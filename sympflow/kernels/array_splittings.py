@@ -6,8 +6,7 @@ depend on the size of a system; or functions at an address.
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -18,9 +17,8 @@ from sympflow.compiler.control import INT, POINTER, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.program import gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.kernels.runs import Numbers, Room, step_function
+from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splittings import Splitting, SplittingCode
-from sympflow.kernels.stages import kicks_of
 
 if TYPE_CHECKING:
     from sympflow.kernels.terms import Terms
@@ -41,7 +39,7 @@ class Forces(Protocol):
         Trajectories side by side.
     """
 
-    data: Sequence[np.ndarray]
+    data: list[np.ndarray]
     lanes: int
 
     def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
@@ -100,17 +98,15 @@ class Functions:
     Parameters
     ----------
     functions : sequence
-        With an `address`, of places in memory and their length: ∇V(q, out, d), and ∇²V v as (q, v, out, d); with the
-        time before these where it counts.
+        With an `address`, see `addressed`: of ∇V, and of ∇²V v.
     inverse_mass : ndarray, optional
         (d,) or (d, d).
-    timed : bool
     """
 
     lanes = 1
 
-    def __init__(self, functions: Sequence[Any], inverse_mass: np.ndarray | None, timed: bool) -> None:
-        self._functions, self._mass, self._timed = functions, inverse_mass, timed  # functions are kept alive
+    def __init__(self, functions: Sequence[Any], inverse_mass: np.ndarray | None) -> None:
+        self._functions, self._mass = functions, inverse_mass  # functions are kept alive
         addresses = np.array([f.address for f in functions], dtype=np.int64)
         self.data = [addresses, *([] if inverse_mass is None else [np.ascontiguousarray(inverse_mass)])]
 
@@ -130,7 +126,8 @@ class Functions:
         with code.over(d) as i:
             room.store(float("nan"), i, out)  # what a function does not write ends the run
         address = code.load(room.data(0), which, POINTER)
-        code.call_at(address, [*(letters[-1:] if self._timed else ()), *given, out, d])
+        time = letters[0] if letters else code.constant(0.0)
+        code.call_at(address, [time, given[0], given[-1], out, d])
 
     def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         code, M = room.code, self._mass
@@ -163,48 +160,64 @@ def function_code(
     gradient: Any,
     hessian_vector: Any | None,
     inverse_mass: np.ndarray | None,
+    driven: bool,
     friction: int | None,
     level: int,
     compensated: bool,
     monomials: Monomials,
 ) -> ArrayCode:
     """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
-    found = [gradient, *([hessian_vector] if level else [])]
-    forces = Functions([addressed(f) for f in found], inverse_mass, False)
-    return ArrayCode(Splitting(Sizes(ndof), level, monomials, compensated, friction), forces)
+    functions = [addressed(gradient, False, driven), *([addressed(hessian_vector, True, driven)] if level else [])]
+    forces = Functions(functions, inverse_mass)
+    sizes: Any = Sizes(ndof, (Letter("time"),) if driven else ())
+    clock: Any = Clock() if driven else None
+    return ArrayCode(Splitting(sizes, level, monomials, compensated, friction, clock), forces)
+
+
+class Letter(NamedTuple):
+    """A number of a stage."""
+
+    name: str
 
 
 class Sizes(NamedTuple):
     """In place of the symbols of a system that has none."""
 
     ndof: int
-    parameters: tuple[()] = ()
+    parameters: tuple[Letter, ...]
+    values: tuple[()] = ()
 
 
-def addressed(function: Any) -> Any:
-    """A Numba function of arrays as one of places in memory, which C can call; what it raises makes its result NaN."""
-    from numba import carray, cfunc, types
+class Clock:
+    """In place of the driving of a system that has no symbols: its letter is the time."""
 
-    place, n_arrays = types.CPointer(types.float64), len(inspect.signature(function.py_func).parameters)
-    if n_arrays == 2:
+    def values_at(self, time: Value, length: Value, fixed: Sequence[Value]) -> list[Value]:
+        return [time]
 
-        @cfunc(types.void(place, place, types.int64))
-        def called(q, out, n):  # type: ignore[no-untyped-def]
-            try:
-                function(carray(q, (n,)), carray(out, (n,)))
-            except Exception:
-                out[0] = np.nan
 
-        return called
+def addressed(function: Any, along: bool, timed: bool) -> Any:
+    """A Numba function of arrays as one that C can call, with t, places q, v, out and their length.
 
-    @cfunc(types.void(place, place, place, types.int64))
-    def called_along(q, v, out, n):  # type: ignore[no-untyped-def]
+    What the function raises makes its result NaN. `along` is true of one that takes v, `timed` of one that takes t.
+    """
+    from numba import carray, cfunc, njit, types
+
+    calls = {
+        (False, False): lambda t, q, v, out: function(q, out),
+        (True, False): lambda t, q, v, out: function(q, v, out),
+        (False, True): lambda t, q, v, out: function(t, q, out),
+        (True, True): lambda t, q, v, out: function(t, q, v, out),
+    }
+    call, place = njit(calls[along, timed]), types.CPointer(types.float64)
+
+    @cfunc(types.void(types.float64, place, place, place, types.int64))
+    def called(t, q, v, out, n):  # type: ignore[no-untyped-def]
         try:
-            function(carray(q, (n,)), carray(v, (n,)), carray(out, (n,)))
+            call(t, carray(q, (n,)), carray(v, (n,)), carray(out, (n,)))
         except Exception:
             out[0] = np.nan
 
-    return called_along
+    return called
 
 
 class ArrayCode(SplittingCode):
@@ -233,33 +246,18 @@ class ArrayCode(SplittingCode):
         return [Arranged(same, same) for _ in self._splitting.terms]
 
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
-        given = [numbers(i) for i in range(self.size)]
-        for k, terms in enumerate(self._splitting.terms):
+        for k in range(len(self._kinds)):
             with room.code.given(room.code.apply("eq", (kind, k))):
-                self._kicked(room, terms, given)
-        self._drifted(room, given)
+                self._executed(k, room, self._column(k, room.type, numbers, step))
 
-    def made(self, name: str, width: int) -> Callable[..., None]:
-        what, _, own = name.partition(" ")
-        if what != "step":
-            return super().made(name, width)
-        kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
-        powers = [1, *kick.powers, *[0] * self._own]
-
-        def stage(room: Room, numbers: Numbers, kind: Value, step: Value) -> None:
-            given = [numbers(i) for i in range(len(powers))]
-            self._kicked(room, self._splitting.terms[-1], given)
-            self._drifted(room, given)
-
-        numbers = self._own if own else 0
-        return step_function(
-            self.n_values, self.n_out, powers, numbers, lambda *given: given, stage, width, memory=True
-        )
+    def _executed(self, k: int, room: Room, column: Sequence[Any]) -> None:
+        self._kicked(room, self._splitting.terms[k], column)
+        self._drifted(room, column)
 
     def _kicked(self, room: Room, terms: int, given: Sequence[Any]) -> None:
         splitting, code, forces = self._splitting, room.code, self._forces
         d, kicks = self._ndof(room), given[1 : 1 + len(splitting.kick_numbers)]
-        letters = given[len(given) - self._own :]
+        letters = self._letters(given)
         q, p = room.state, room.part(d)
         slope, velocity, product, bent = (room.part(d * i, room.work) for i in range(ARRAYS))
         forces.gradient(room, q, slope, d, letters)
@@ -316,7 +314,7 @@ class ArrayCode(SplittingCode):
                 room.store(mean[k] * x, i, spread)
                 room.store(decay[k] * x, i, p)
             moved, a = spread, 1.0
-        forces.velocity(room, moved, velocity, d, given[len(given) - self._own :])
+        forces.velocity(room, moved, velocity, d, self._letters(given))
         with code.over(d) as i:
             self._move(room, q, i, [(a, room.load(i, velocity))], 2)
 
@@ -343,6 +341,9 @@ class ArrayCode(SplittingCode):
         total = old + corrected
         room.store((total - old) - corrected, i, place)
         room.store(total, i, x)
+
+    def _letters(self, given: Sequence[Any]) -> Sequence[Any]:
+        return given[len(given) - len(self._splitting.symbols.parameters) :]
 
     def _ndof(self, room: Room) -> Value:
         return room.code.op("sdiv", INT, room.size, room.code.constant(2 * (1 + self._splitting.compensated), INT))

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.loop_functions import LoopFunctions
     from sympflow.kernels.rollouts import Rollouts
     from sympflow.kernels.splittings import Splitting
+    from sympflow.kernels.stage_times import Driving
 
     Functions = LoopFunctions | Rollouts
 
@@ -81,6 +82,8 @@ class SplittingLoops:
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = self.traced = self._large = False
         self._symbols: Any = system.symbols
+        self._form: Any = system.symbols
+        self._driving: Driving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Functions]
         self._codes: dict[tuple[int, bool, Monomials], Functions] = {}
@@ -95,41 +98,35 @@ class SplittingLoops:
 
             self._has_force_gradient = system.quadratic_kinetic
             self._large = is_large(system.symbols)
-            if self._large and self.driven:
-                from sympflow.kernels.loop_functions import family_loops
-
-                self._compile = partial(family_loops, system, damped_drift(system, True))
-            elif self.driven:
-                from sympflow.kernels.loop_functions import driven_loops
+            damped_drift(system, self._large)
+            if self.driven:
                 from sympflow.kernels.stage_times import driven_form
 
-                driving = driven_form(system.symbols.parametric)
-                self.values = driving.form.values
-                self._compile = partial(driven_loops, driving, damped_drift(system, False))
+                self._driving = driven_form(system.symbols if self._large else system.symbols.parametric)
+                if self._large and self._driving.means:
+                    raise ValueError(
+                        "`system` has many terms and a kinetic energy that depends on t: use backend='array'."
+                    )
+                self._driving.check()
+                self._form = self._driving.form
+                self.values, self.traced = self._form.values, True
+                self.abreast = LANES
             else:
                 V = system.symbols.V
                 check_recorded(V)
                 check_recorded(system.symbols.T)
-                damped_drift(system, self._large)
                 self.values = system.symbols.parametric.values
                 self._has_ranges, self.traced = not self._large, True
                 self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial(*system.symbols.q) else LANES
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
-            damped = damped_drift(system, True)
-            if self.driven:
-                from sympflow.kernels.loop_functions import array_loops
+            damped_drift(system, True)
+            from sympflow.kernels.array_splittings import function_code
 
-                self._compile = partial(
-                    array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, True, damped
-                )
-            else:
-                from sympflow.kernels.array_splittings import function_code
-
-                ndim = None if system.damping is None else system.damping.ndim
-                given = gradient, hessian_vector, system.inverse_mass
-                self._compile = partial(function_code, system.ndof, *given, ndim)
+            given = gradient, hessian_vector, system.inverse_mass, self.driven
+            ndim = None if system.damping is None else system.damping.ndim
+            self._compile = partial(function_code, system.ndof, *given, ndim)
         elif system.local is not None:
             if system.damping is not None and system.damping.ndim:
                 raise ValueError(
@@ -245,7 +242,7 @@ class SplittingLoops:
         from sympflow.kernels.terms import is_long
 
         if level not in self._longs:
-            self._longs[level] = is_long(self._symbols, level)
+            self._longs[level] = is_long(self._form, level)
         return self._longs[level]
 
     def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool) -> Functions:
@@ -257,9 +254,13 @@ class SplittingLoops:
         if not varied and self._long(level):
             from sympflow.kernels.array_splittings import term_code
 
-            return term_code(Splitting(self._symbols, *key, ndim))
+            splitting = Splitting(self._form, level, monomials, compensated, ndim, self._driving)
+            return term_code(splitting)
         if key not in self._codes:
-            make = self._written or partial(Splitting, self._symbols.parametric)
+            make = self._written
+            if make is None:
+                symbols = self._form.parametric if self._driving is None else self._form
+                make = partial(Splitting, symbols, driving=self._driving)
             splitting = make(level, monomials, compensated, ndim)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]

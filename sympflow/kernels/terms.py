@@ -46,13 +46,16 @@ def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
     if not MOST_OPERATIONS < roughly < 20 * MOST_OPERATIONS:
         return bool(roughly > MOST_OPERATIONS)
 
-    def orders(*q: Any) -> list[Any]:
-        found = [gradient(evaluator(dict(zip(symbols.q, q, strict=True)))(symbols.V), q)]
+    given = (*symbols.q, *symbols.parameters)
+
+    def orders(*numbers: Any) -> list[Any]:
+        q = numbers[: symbols.ndof]
+        found = [gradient(evaluator(dict(zip(given, numbers, strict=True)))(symbols.V), q)]
         for _ in range(1, n):
             found.append([x for row in derivatives(found[-1], q) for x in row])
         return [x for order in found for x in order]
 
-    return len(traced(orders, *(s.name for s in symbols.q))) > MOST_OPERATIONS
+    return len(traced(orders, *(s.name for s in given))) > MOST_OPERATIONS
 
 
 def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
