@@ -534,6 +534,11 @@ class Hamiltonian:
         """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         return self._definition if self._definition.loops else None
 
+    @property
+    def written(self) -> SymbolicHamiltonian | None:
+        """The symbolic definition, or that of a few bodies in pairs, written out when it is asked for; else None."""
+        return self.symbols if self.local is None else self.local.written
+
     @cached_property
     def expression(self) -> str | None:
         """H as a text, in q1 … qd, p1 … pd, the time t and numbers, of a symbolic system; else None."""

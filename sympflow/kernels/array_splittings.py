@@ -206,9 +206,9 @@ def addressed(function: Any, along: bool, timed: bool) -> Any:
         (False, False): lambda t, q, v, out: function(q, out),
         (True, False): lambda t, q, v, out: function(q, v, out),
         (False, True): lambda t, q, v, out: function(t, q, out),
-        (True, True): lambda t, q, v, out: function(t, q, v, out),
     }
-    call, place = njit(calls[along, timed]), types.CPointer(types.float64)
+    call = function if along and timed else njit(calls[along, timed])
+    place = types.CPointer(types.float64)
 
     @cfunc(types.void(types.float64, place, place, place, types.int64))
     def called(t, q, v, out, n):  # type: ignore[no-untyped-def]

@@ -247,23 +247,29 @@ class SplittingLoops:
 
     def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool) -> Functions:
         """The functions over traced numbers, which serve batches with own values too."""
-        from sympflow.kernels.splittings import Splitting, SplittingCode, shared
+        from sympflow.kernels.splittings import SplittingCode, shared
 
         key = level, compensated, monomials
-        ndim = None if self.friction is None else self.friction.damping.ndim
         if not varied and self._long(level):
             from sympflow.kernels.array_splittings import term_code
 
-            splitting = Splitting(self._form, level, monomials, compensated, ndim, self._driving)
-            return term_code(splitting)
+            return term_code(self.splitting(level, monomials, compensated, parametric=False))
         if key not in self._codes:
-            make = self._written
-            if make is None:
-                symbols = self._form.parametric if self._driving is None else self._form
-                make = partial(Splitting, symbols, driving=self._driving)
-            splitting = make(level, monomials, compensated, ndim)
+            splitting = self.splitting(level, monomials, compensated)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
+
+    def splitting(
+        self, level: int, monomials: Monomials = (), compensated: bool = False, parametric: bool = True
+    ) -> Splitting:
+        """The kicks and drifts of a level, of a system whose loops are made of traced numbers."""
+        from sympflow.kernels.splittings import Splitting
+
+        ndim, driving = None if self.friction is None else self.friction.damping.ndim, self._driving
+        if self._written is not None:
+            return self._written(level, monomials, compensated, ndim)
+        symbols = self._form.parametric if parametric and driving is None else self._form
+        return Splitting(symbols, level, monomials, compensated, ndim, driving)
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""

@@ -23,7 +23,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.runs import Room
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
-__all__ = ["Terms", "families", "is_large", "is_long", "warn_if_long", "written_out"]
+__all__ = ["Family", "Terms", "families", "is_large", "is_long", "warn_if_long", "written_out"]
 
 MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more than a few seconds
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
