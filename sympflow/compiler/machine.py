@@ -83,10 +83,12 @@ def compiled(text: str, name: str, signature: Any) -> Any:
 
 
 def address(array: Any) -> int:
-    """Return where the numbers of a NumPy array lie in memory."""
+    """Return where the numbers of a NumPy array lie in memory; 0 of one without numbers."""
+    if not array.size:
+        return 0
     try:
         return ctypes.addressof(_BYTE(array))  # a fifth of the time of what follows
-    except (TypeError, ValueError):  # read-only, not contiguous, or empty
+    except (TypeError, ValueError):  # read-only, or not contiguous
         return int(array.ctypes.data)
 
 

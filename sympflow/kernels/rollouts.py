@@ -27,7 +27,8 @@ Columns = tuple[np.ndarray, np.ndarray]
 def aligned(n: int) -> np.ndarray:
     """Numbers in memory, of any values, that begin with a line of it."""
     memory = np.empty(n + LINE)
-    return memory[-(memory.ctypes.data // 8) % LINE :][:n]
+    begin = -(address(memory) // 8) % LINE
+    return memory[begin : begin + n]
 
 
 class Rollouts:
