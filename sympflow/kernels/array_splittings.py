@@ -186,6 +186,8 @@ class Sizes(NamedTuple):
     ndof: int
     parameters: tuple[Letter, ...]
     values: tuple[()] = ()
+    V: None = None
+    T: None = None
 
 
 class Clock:
@@ -232,7 +234,7 @@ class ArrayCode(SplittingCode):
 
     def __init__(self, splitting: Splitting, forces: Forces) -> None:
         super().__init__(splitting)
-        self._forces, self.data, self.lanes = forces, forces.data, forces.lanes
+        self._forces, self.data, self.lanes, self.chunked = forces, forces.data, forces.lanes, False
         self.room = ARRAYS * splitting.symbols.ndof
 
     def __reduce__(self) -> tuple[Any, ...]:
