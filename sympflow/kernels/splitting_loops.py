@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
-from sympflow.kernels.stages import StageTable, damped_drift, run_table, step_table, takes_values
+from sympflow.kernels.stages import StageTable, damped_drift, run_table, step_table
 from sympflow.kernels.threads import given
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
@@ -85,7 +85,7 @@ class SplittingLoops:
         self._driving: Driving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Functions]
-        self._codes: dict[tuple[int, bool, Monomials], Functions] = {}
+        self._codes: dict[Any, Functions] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not system.separable:
@@ -183,8 +183,7 @@ class SplittingLoops:
 
     def takes_values(self, level: int, ranges: Ranges | None = None) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
-        traced = self.traced and not ranges
-        return bool(self.values) and (traced or (self.friction is None and takes_values(level)))
+        return bool(self.values) and not ranges
 
     def functions(
         self,
@@ -196,8 +195,7 @@ class SplittingLoops:
     ) -> Functions:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
-        Where `ranges` of positions are given, which may be none, kicks and drifts are joined, and faster in these
-        ranges, see `kicks_source`: equal but for rounding.
+        Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
 
         Raises
         ------
@@ -223,32 +221,29 @@ class SplittingLoops:
         if not self.traced:
             more: dict[str, Any] = {"varied": True} if varied else {}
             return self._compile(level, compensated, monomials, **more)
-        if not ranges:
-            return self._traced(level, compensated, monomials)
-        from sympflow.kernels.loop_functions import symbolic_loops
+        return self._traced(level, compensated, monomials, ranges or ())
 
-        assert self._symbols is not None
-        return symbolic_loops(self._symbols, None, level, compensated, monomials, varied, ranges)
-
-    def _traced(self, level: int, compensated: bool, monomials: Monomials) -> Functions:
+    def _traced(self, level: int, compensated: bool, monomials: Monomials, ranges: Ranges) -> Functions:
         """The functions over traced numbers, which serve batches with own values too."""
         from sympflow.kernels.splittings import SplittingCode, shared
 
-        key = level, compensated, monomials
+        key = level, compensated, monomials, ranges
         if key not in self._codes:
-            splitting = self.splitting(level, monomials, compensated)
+            splitting = self.splitting(level, monomials, compensated, ranges)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
 
-    def splitting(self, level: int, monomials: Monomials = (), compensated: bool = False) -> Splitting:
+    def splitting(
+        self, level: int, monomials: Monomials = (), compensated: bool = False, ranges: Ranges = ()
+    ) -> Splitting:
         """The kicks and drifts of a level, of a system whose loops are made of traced numbers."""
         from sympflow.kernels.splittings import Splitting
 
         ndim, driving = None if self.friction is None else self.friction.damping.ndim, self._driving
         if self._written is not None:
             return self._written(level, monomials, compensated, ndim)
-        symbols = self._symbols.parametric if driving is None else driving.form
-        return Splitting(symbols, level, monomials, compensated, ndim, driving)
+        symbols = self._symbols if ranges else self._symbols.parametric if driving is None else driving.form
+        return Splitting(symbols, level, monomials, compensated, ndim, driving, ranges)
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""
