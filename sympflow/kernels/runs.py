@@ -16,7 +16,19 @@ from typing import Any
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Lanes", "Memory", "Numbers", "Room", "finished", "groups", "map_function", "run_function", "step_function"]
+__all__ = [
+    "Lanes",
+    "Memory",
+    "Numbers",
+    "Room",
+    "column_of",
+    "finished",
+    "groups",
+    "map_function",
+    "run_function",
+    "step_function",
+    "there",
+]
 
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
@@ -88,7 +100,7 @@ def run_function(
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         place = code.at(table, group * (link + 2) * (size * width)) if own else table
-        column = _column(code, place, kinds, size, width if own else 1, width, stage)
+        column = column_of(code, place, kinds, size, width if own else 1, width, stage)
         state.open(rows, begin, n_rows)
         n, saved, longest = code.variable(first), code.variable(zero), code.variable(state.block(every))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
@@ -165,7 +177,7 @@ def map_function(
     code = Module(host().fused).function("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
     state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
-    column = _column(code, table, kinds, size, 1, width, stage)
+    column = column_of(code, table, kinds, size, 1, width, stage)
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         state.open(rows, begin, n_rows, n_out)
@@ -399,7 +411,7 @@ class Memory:
         self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
 
     def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        with self.code.over(_there(self.code, self.width, begin, n_rows)) as lane:
+        with self.code.over(there(self.code, self.width, begin, n_rows)) as lane:
             start = self.code.at(out, ((begin + lane) * stride + at) * n)
             with self.code.over(n) as i:
                 self.code.store(self.code.load(room.state, i * self.width + lane), start, i)
@@ -426,7 +438,8 @@ def groups(code: Code, n_rows: Value, width: int) -> Value:
     return code.op("sdiv", INT, n_rows + (width - 1), code.constant(width, INT))
 
 
-def _there(code: Code, width: int, begin: Value, n_rows: Value) -> Value:
+def there(code: Code, width: int, begin: Value, n_rows: Value) -> Value:
+    """How many rows there are of `width` from `begin` on."""
     return code.apply("min", (code.constant(width, INT), n_rows - begin))
 
 
@@ -435,7 +448,7 @@ def _mark(code: Code, alive: Value, n: Value, finite: Value, begin: Value, n_row
     width = alive.type.width
     marks = code.memory(1, Type("i64", width))
     code.store(code.select(alive, code.splat(n, width), code.constant(-1, Type("i64", width))), marks)
-    with code.over(_there(code, width, begin, n_rows)) as lane:
+    with code.over(there(code, width, begin, n_rows)) as lane:
         code.store(code.load(marks, lane, INT), finite, begin + lane)
 
 
@@ -472,13 +485,13 @@ class Lanes:
             return
         for i, value in enumerate(x):
             code.store(value, self._buffer, i * self.width)
-        with code.over(_there(code, self.width, begin, n_rows)) as lane:
+        with code.over(there(code, self.width, begin, n_rows)) as lane:
             start = code.at(out, ((begin + lane) * stride + at) * n)
             for i in range(n):
                 code.store(code.load(self._buffer, lane + i * self.width), start, i)
 
 
-def _column(
+def column_of(
     code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Stage | MemoryStage
 ) -> Callable[[Value, Any, Value], Any]:
     """The stage of a column, the numbers of which are those of all lanes, or one for each."""
