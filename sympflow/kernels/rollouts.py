@@ -13,7 +13,7 @@ from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
 
-__all__ = ["Columns", "Rollouts", "aligned"]
+__all__ = ["Columns", "Rollouts", "aligned", "filled"]
 
 NONE = np.empty(0)
 LINE = 8  # numbers in a line of memory
@@ -29,6 +29,16 @@ def aligned(n: int) -> np.ndarray:
     memory = np.empty(n + LINE)
     begin = -(address(memory) // 8) % LINE
     return memory[begin : begin + n]
+
+
+def filled(x: np.ndarray, lanes: int, times: int = 1) -> np.ndarray:
+    """Columns (…, J N), of each of J times the last one again where there are fewer than lanes."""
+    n = x.shape[-1] // times
+    if n >= lanes:
+        return np.ascontiguousarray(x)
+    each = x.reshape(*x.shape[:-1], times, n)
+    more = np.repeat(each[..., -1:], lanes - n, axis=-1)
+    return np.concatenate([each, more], axis=-1).reshape(*x.shape[:-1], times * lanes)
 
 
 class Rollouts:
@@ -51,6 +61,8 @@ class Rollouts:
         How they are there: `sympflow.kernels.runs.Memory`, or such a class.
     data : sequence of ndarray
         Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
+    chunked : bool
+        True if many trajectories of a batch are in memory, and pass through registers in each stage.
     timed : bool
         True if stages depend on the step.
     every : int, optional
@@ -70,6 +82,7 @@ class Rollouts:
     memory: Callable[..., Memory] = Memory
     every: int | None = None
     timed = False
+    chunked = False
     block = BLOCK
     counted = False
     closing = True
@@ -82,6 +95,10 @@ class Rollouts:
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
         raise NotImplementedError
+
+    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
+        """One column of many states: see `sympflow.kernels.runs.Over`."""
+        each(lambda values: self.stage(values, numbers, kind, step))
 
     def look(self, values: Any) -> Any:
         """The running state changed, where there is `every`: see `sympflow.kernels.runs.run_function`."""
@@ -125,9 +142,9 @@ class Rollouts:
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
-        own = name == "run own"
+        own, over = name == "run own", self.over if self.chunked else None
         return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over
         )
 
     def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:

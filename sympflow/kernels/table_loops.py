@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
+from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.machine import address, compiled, host
 from sympflow.compiler.program import Program, fused, gradient, tangent, traced
@@ -26,7 +26,7 @@ from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.rollouts import aligned
+from sympflow.kernels.rollouts import aligned, filled
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["LabelErrors", "TableLoops", "table_loops"]
@@ -105,7 +105,7 @@ class TableLoops:
     def opened(self, y: np.ndarray, t0: np.ndarray | None) -> np.ndarray:
         """States (2d, N) with the times (N,) of a driven system after the positions, and its work after the momenta."""
         if not self._driven:
-            return np.ascontiguousarray(y)
+            return y
         assert t0 is not None
         d = len(y) // 2
         return np.concatenate([y[:d], t0[None], y[d:], 0 * t0[None]])
@@ -166,7 +166,7 @@ class LabelErrors:
         self.matrices = np.ascontiguousarray(design[:, leaders])
         used = np.flatnonzero(factors)
         used = used[np.argsort(leader[used], kind="stable")]
-        given = [_at_least(loops.opened(x, t0), 1), *(_at_least(a, times) for a in (y, scale, slope))]
+        given = [filled(loops.opened(x, t0), LANES), *(filled(a, LANES, times) for a in (y, scale, slope))]
         places = np.stack([leader[used], used], axis=1)
         self._arrays = [np.ascontiguousarray(a) for a in (*given, places, factors[used])]
         self._addresses = [*map(address, self._arrays)]
@@ -197,15 +197,6 @@ class LabelErrors:
             loops.rows(linearized, addresses, times, *self._sizes, first, last)
         errors, J = r[..., : self._count].ravel(), J[..., : self._count]
         return errors, np.ascontiguousarray(J).reshape(len(J), len(errors))
-
-
-def _at_least(x: np.ndarray, times: int) -> np.ndarray:
-    """Columns of labels (…, J N), of each time the last one again where there are fewer than lanes."""
-    n = x.shape[1] // times
-    if n >= LANES:
-        return x
-    each = x.reshape(len(x), times, n)
-    return np.concatenate([each, np.repeat(each[..., -1:], LANES - n, axis=-1)], axis=-1).reshape(len(x), times * LANES)
 
 
 def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -323,22 +314,6 @@ def _product(A: Sequence[Sequence[Any]], x: Sequence[Any]) -> list[Any]:
     return [_dot(row, x) for row in A]
 
 
-class _Rows:
-    """Rows of memory, each a register of lanes."""
-
-    def __init__(self, code: Code, place: Value) -> None:
-        self.code, self.place = code, place
-
-    def __getitem__(self, i: Any) -> Value:
-        return self.code.load(self.place, i * LANES, REGISTER)
-
-    def __setitem__(self, i: Any, x: Any) -> None:
-        self.code.store(self.code.operand(x, REGISTER), self.place, i * LANES)
-
-    def part(self, i: Any) -> _Rows:
-        return _Rows(self.code, self.code.at(self.place, i * LANES))
-
-
 class _Errors:
     """The function of the errors r of labels, and of their derivatives J.
 
@@ -368,7 +343,7 @@ class _Errors:
             self.n_places, self.n_parameters, self.first, self.last,
         ) = code.arguments[13:]  # fmt: skip
         w = maps.width
-        self.W, self.A, self.B = (_Rows(code, code.at(memory, i * w * LANES)) for i in (0, 2, 4))
+        self.W, self.A, self.B = (Rows(code.at(memory, i * w * LANES), REGISTER) for i in (0, 2, 4))
         self.tape = self.B.part(self.n_numbers)
         self.zero = code.constant(0.0, REGISTER)
 
@@ -407,7 +382,7 @@ class _Errors:
         return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *types))
 
     @contextmanager
-    def stages(self, back: bool = False) -> Iterator[tuple[Value, Value, Value, _Rows]]:
+    def stages(self, back: bool = False) -> Iterator[tuple[Value, Value, Value, Rows]]:
         """Each stage: whether it is a kick, where its numbers begin, which drift it is, its tape."""
         code, terms = self.code, self.maps.terms
         none = code.constant(0, INT)
@@ -443,7 +418,7 @@ class _Errors:
 
     # the way there ----------------------------------------------------------------------------------------------------
 
-    def kicked(self, number: Value, tape: _Rows) -> None:
+    def kicked(self, number: Value, tape: Rows) -> None:
         maps, w = self.maps, self.maps.width
         program = maps.kick if self.linearized else Program(maps.kick.inputs, maps.kick.outputs[:w])
         c = [self.number(number + k) for k in range(maps.terms)]
@@ -453,7 +428,7 @@ class _Errors:
         for i, x in enumerate(changes[:w]):
             self.W[w + i] = self.W[w + i] + x
 
-    def drifted(self, number: Value, drift: Value, tape: _Rows) -> None:
+    def drifted(self, number: Value, drift: Value, tape: Rows) -> None:
         """The tape holds M⁻¹p and −Γp at the end."""
         d, w, friction = self.maps.d, self.maps.width, self.maps.friction
         a, y = self.number(number), [self.W[w + i] for i in range(d)]
@@ -496,7 +471,7 @@ class _Errors:
             with code.given(~kick):
                 self.drift_back(number, drift, tape)
 
-    def kick_back(self, number: Value, tape: _Rows) -> None:
+    def kick_back(self, number: Value, tape: Rows) -> None:
         w, terms = self.maps.width, self.maps.terms
         b = [self.A[w + i] for i in range(w)]
         for k in range(terms):
@@ -505,7 +480,7 @@ class _Errors:
         for i in range(w):
             self.A[i] = _fused(b, [slope[min(i, j), max(i, j)] for j in range(w)], self.A[i])
 
-    def drift_back(self, number: Value, drift: Value, tape: _Rows) -> None:
+    def drift_back(self, number: Value, drift: Value, tape: Rows) -> None:
         d, w = self.maps.d, self.maps.width
         a = [self.A[i] for i in range(w)]
         by_time = _fused(a, [tape[i] for i in range(w)])
