@@ -19,7 +19,7 @@ import numpy as np
 from sympflow.compiler.control import DOUBLE, INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import host
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.runs import Lanes, column_of, finished, groups, there
+from sympflow.kernels.runs import ColumnStage, Lanes, finished, groups, there
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import SplittingCode
 from sympflow.kernels.stages import run_table, step_table
@@ -152,7 +152,7 @@ class _Reach:
         """The runs of some trajectories, until each is at its last time."""
         code, width, type = self.code, self.width, Type("double", self.width)
         state = [code.variable(x) for x in Lanes(code, self.n_values, width).loaded(self.rows, begin, self.n_rows)]
-        column = column_of(code, self.table, self.kinds, self.made.size, 1, width, self.made.stage)
+        column = ColumnStage(code, self.table, self.kinds, self.made.size, 1, width, self.made.stage)
         start, advance, then = code.memory(self.n_values, type), code.memory(1, type), code.memory(1, type)
         saved, now = code.memory(width, INT), code.memory(width)
         of_clock = self._advance(code.splat(self.h, width), state[-1].value)
@@ -243,7 +243,7 @@ class _Reach:
         False if one of them is not reached.
         """
         code = self.code
-        column = column_of(code, self.table, self.kinds, self.made.size, 1, 1, self.made.stage)
+        column = ColumnStage(code, self.table, self.kinds, self.made.size, 1, 1, self.made.stage)
         state, before = [code.variable(x) for x in start], [code.variable(x) for x in start]
         with code.given(self.zero < n):
             _set(before, column(self.link + 1, start, self.zero))

@@ -17,11 +17,11 @@ from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Type, Va
 from sympflow.compiler.machine import compiled, host
 
 __all__ = [
+    "ColumnStage",
     "Lanes",
     "Memory",
     "Numbers",
     "Room",
-    "column_of",
     "finished",
     "groups",
     "map_function",
@@ -104,13 +104,6 @@ def run_function(
         code.arguments[:15]
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
-<<<<<<< HEAD
-    state = _state(code, n_values, n_out, width, memory, code.arguments[15:], before=width == 1)
-    with code.over(groups(code, n_rows, width)) as group:
-        begin = group * width
-        place = code.at(table, group * (link + 2) * (size * width)) if own else table
-        column = column_of(code, place, kinds, size, width if own else 1, width, stage)
-=======
     state: _Registers | _Chunks | Memory
     if width > 1 and memory is None and over is not None:
         state = _Chunks(code, n_values, n_out, width, own, over)
@@ -121,8 +114,7 @@ def run_function(
         begin = group * (width * chunks)
         length = (link + 2) * (size * width)
         place = code.at(table, group * length * chunks) if own else table
-        column = _Column(code, place, kinds, size, width if own else 1, width, stage, length if own else None)
->>>>>>> main
+        column = ColumnStage(code, place, kinds, size, width if own else 1, width, stage, length if own else None)
         state.open(rows, begin, n_rows)
         n, saved, longest = code.variable(first), code.variable(zero), code.variable(state.block(every))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
@@ -201,11 +193,7 @@ def map_function(
     code = Module(host().fused).function("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
     state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
-<<<<<<< HEAD
-    column = column_of(code, table, kinds, size, 1, width, stage)
-=======
-    column = _Column(code, table, kinds, size, 1, width, stage)
->>>>>>> main
+    column = ColumnStage(code, table, kinds, size, 1, width, stage)
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         state.open(rows, begin, n_rows, n_out)
@@ -413,7 +401,7 @@ class _Chunks:
             for i, x in enumerate(body([code.load(start, i * width, self.type) for i in range(n)], c)):
                 code.store(x, start, i * width)
 
-    def change(self, column: _Column, j: Value, step: Value, end: bool = False) -> None:
+    def change(self, column: ColumnStage, j: Value, step: Value, end: bool = False) -> None:
         place = self._end if end else self._state
         if self._over is None:
             self._each(place, lambda x, c: column(j, x, step, c))
@@ -452,7 +440,7 @@ class _Chunks:
     def mark(self, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
         """Write n for the trajectories that are alive, else −1."""
         code = self.code
-        with code.over(self._there(begin, n_rows)) as i:
+        with code.over(self.there(begin, n_rows)) as i:
             alive = code.apply("eq", (code.load(self._watch, i), 0.0))
             code.store(code.select(alive, n, code.constant(-1, INT)), finite, begin + i)
 
@@ -463,12 +451,12 @@ class _Chunks:
         one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
         self._write(self._state, self._n, running, begin, n_rows, one, zero)
 
-    def _there(self, begin: Value, n_rows: Value) -> Value:
+    def there(self, begin: Value, n_rows: Value) -> Value:
         return self.code.apply("min", (self._used * self.width, n_rows - begin))
 
     def _write(self, place: Value, n: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         code, width = self.code, self.width
-        with code.over(self._there(begin, n_rows)) as row:
+        with code.over(self.there(begin, n_rows)) as row:
             c = code.op("sdiv", INT, row, code.constant(width, INT))
             source = code.at(place, c * ((self._n - 1) * width) + row)
             start = code.at(out, ((begin + row) * stride + at) * n)
@@ -618,15 +606,8 @@ class Lanes:
                 code.store(code.load(self._buffer, lane + i * self.width), start, i)
 
 
-<<<<<<< HEAD
-def column_of(
-    code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Stage | MemoryStage
-) -> Callable[[Value, Any, Value], Any]:
-    """The stage of a column, the numbers of which are those of all lanes, or one for each."""
-=======
-class _Column:
+class ColumnStage:
     """The stage of a column, the numbers of which are those of all lanes, or one for each in tables of a length."""
->>>>>>> main
 
     def __init__(
         self,
