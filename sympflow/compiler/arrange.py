@@ -104,6 +104,7 @@ class Arrangement:
         self._entries: dict[int, Traced] = {}
         self._from_table: list[Traced] = []
         self._plans: dict[Any, Plan] = {}
+        self._powers: dict[int, tuple[int, int]] = {}
         self._searched = 0
         self._states: list[Traced] = []
         for name, ready in states:
@@ -149,7 +150,56 @@ class Arrangement:
                 return self._product(args[0], self.number_of(1.0 / constants[1]))
             if constants[0] is None or constants[0] != 1.0:
                 return self._product(args[0], self.apply("div", [self.number(1.0), args[1]]))
-        return self.letter(self.operation(name, *[self.written(x) for x in args]))
+            if (inverse := self._inverse(args[1])) is not None:
+                return inverse
+        node = self.operation(name, *[self.written(x) for x in args])
+        if name in ("sqrt", "div") and isinstance(node, Traced) and isinstance(base := node.args[-1], Traced):
+            self._nodes[base.order] = base
+            self._powers |= {base.order: (base.order, 2), node.order: (base.order, 1 if name == "sqrt" else -2)}
+        return self.letter(node)
+
+    def _inverse(self, x: Polynomial) -> Polynomial | None:
+        """1/x where x is a product of roots and reciprocals: the same of other powers."""
+        if len(x.terms) != 1:
+            return None
+        ((m, c),) = x.terms.items()
+        if not all(y in self._powers and self._powers[y][1] != 2 for y, _ in m):
+            return None
+        halves = {self._powers[y][0]: 0 for y, _ in m}
+        for y, e in m:
+            base, power = self._powers[y]
+            halves[base] -= power * e
+        return Polynomial(self, {self._of_halves(halves): 1.0 if c == 1.0 else 1.0 / c})
+
+    def _reduced(self, m: Monomial) -> Monomial:
+        """A product of letters in which a base, its root and its reciprocal do not cancel."""
+        known = [(y, e) for y, e in m if y in self._powers]
+        bases = [self._powers[y][0] for y, _ in known]
+        if len(set(bases)) == len(bases) and not any(self._powers[y][1] == 1 and e > 1 for y, e in known):
+            return m
+        halves = dict.fromkeys(bases, 0)
+        for y, e in known:
+            base, power = self._powers[y]
+            halves[base] += power * e
+        return tuple(sorted([*((y, e) for y, e in m if y not in self._powers), *self._of_halves(halves)]))
+
+    def _of_halves(self, halves: dict[int, int]) -> Monomial:
+        """The product of bases to these powers, in halves: of the base, its root and its reciprocal."""
+        made: list[tuple[int, int]] = []
+        for base, n in halves.items():
+            whole, root = (n // 2, n % 2)
+            if root:
+                made.append((self._made("sqrt", base), 1))
+            if whole:
+                made.append((base, whole) if whole > 0 else (self._made("div", base), -whole))
+        return tuple(sorted(made))
+
+    def _made(self, name: str, base: int) -> int:
+        """The letter of the root or the reciprocal of a base."""
+        args = [self._nodes[base]] if name == "sqrt" else [1.0, self._nodes[base]]
+        node = self.operation(name, *args)
+        self._nodes[node.order], self._powers[node.order] = node, (base, 1 if name == "sqrt" else -2)
+        return node.order
 
     def number_of(self, coefficient: Any) -> Polynomial:
         return Polynomial(self, {(): coefficient})
@@ -170,7 +220,7 @@ class Arrangement:
         terms: Terms = {}
         for m, c in a.terms.items():
             for n, d in b.terms.items():
-                key = _times(m, n)
+                key = self._reduced(_times(m, n))
                 total = terms.get(key, 0.0) + c * d
                 terms[key] = total
         return Polynomial(self, {m: c for m, c in terms.items() if not (isinstance(c, float) and c == 0)})
@@ -181,7 +231,7 @@ class Arrangement:
         if len(a.terms) > 1:
             a = self.letter(self.written(a))
         ((m, c),) = a.terms.items()
-        return Polynomial(self, {tuple((x, int(e * n)) for x, e in m): 1.0 if c == 1.0 else c**n})
+        return Polynomial(self, {self._reduced(tuple((x, int(e * n)) for x, e in m)): 1.0 if c == 1.0 else c**n})
 
     # the body -----------------------------------------------------------------------------------------------------
 

@@ -431,6 +431,16 @@ class SplittingCode(Rollouts):
         fixed = given[clock.stop :]
         return [*given[: clock.start], *fixed, *driving.values_at(time, given[0], fixed)]
 
+    @property
+    def given_numbers(self) -> int:
+        """How many numbers of a column are given, from which those are computed that the code reads."""
+        return len(self._splitting.numbers)
+
+    def executed(self, given: Sequence[Any], values: list[Value]) -> list[Value]:
+        """The values after a stage of the last kind, by the numbers that are given."""
+        last = self._kinds[-1]
+        return last.body(*values, *last.table(*given))
+
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "step" and "step own" too."""
         what, _, own = name.partition(" ")
