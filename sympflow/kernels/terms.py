@@ -17,7 +17,7 @@ import sympy as sp
 
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import INT, Value
-from sympflow.compiler.program import Program, derivatives, gradient, tangent, traced
+from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.runs import Room
@@ -30,7 +30,7 @@ MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of number
 MOST_COMPILED = 5000  # operations of all formulas, before a warning
 MOST_SEPARATE = 8  # slopes of a formula that have nothing in common
 MOST_TOGETHER = 75  # operations of terms that stand alone in one loop
-MOST_OPERATIONS = 1000  # of derivatives that are written out
+MOST_OPERATIONS = 600  # of V, of which the slopes are written out
 
 
 def is_large(symbols: SymbolicHamiltonian) -> bool:
@@ -39,23 +39,16 @@ def is_large(symbols: SymbolicHamiltonian) -> bool:
 
 
 def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
-    """True where the derivatives of V that kicks of a level need have more operations than are written out."""
-    n = {FORCE_GRADIENT: 2, CURVATURE: 3}.get(level, 1)
-    known = set(symbols.q)
-    roughly = sum(sp.count_ops(f) * len(f.free_symbols & known) ** n for f in sp.Add.make_args(symbols.V))
-    if not MOST_OPERATIONS < roughly < 20 * MOST_OPERATIONS:
-        return bool(roughly > MOST_OPERATIONS)
-
-    given = (*symbols.q, *symbols.parameters)
-
-    def orders(*numbers: Any) -> list[Any]:
-        q = numbers[: symbols.ndof]
-        found = [gradient(evaluator(dict(zip(given, numbers, strict=True)))(symbols.V), q)]
-        for _ in range(1, n):
-            found.append([x for row in derivatives(found[-1], q) for x in row])
-        return [x for order in found for x in order]
-
-    return len(traced(orders, *(s.name for s in given))) > MOST_OPERATIONS
+    """True where kicks of a level have more operations than are written out, common subexpressions counted once."""
+    known, operations, variables, terms = set(symbols.q), set(), 0, sp.Add.make_args(symbols.V)
+    for term in terms:
+        nodes = set(sp.preorder_traversal(term))
+        variables += len(nodes & known)
+        operations |= {node for node in nodes if node.args}
+        if len(operations) > MOST_OPERATIONS:
+            return True
+    each = 4 * variables / len(terms)  # by how much a further derivative is longer
+    return bool(len(operations) * each ** {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0) > MOST_OPERATIONS)
 
 
 def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
