@@ -9,6 +9,7 @@ trajectory and the lanes of registers, so that their bits agree.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -321,6 +322,14 @@ class Arrangement:
 
     def _factors(self, terms: Terms, few: bool) -> list[Monomial]:
         """Products of letters to take out: those that terms share, and the last known of a term that shares none."""
+        single = _powers_of_one(terms)
+        if single is not None:
+            x, powers = single
+            step = math.gcd(*powers)
+            if powers[0] > 0 or step == powers[-1]:
+                return [((x, powers[0] or step),)]
+            doubled: list[Monomial] = [((x, step * 2**k),) for k in range((powers[-1] // step).bit_length())]
+            return doubled if few else doubled[-1:]
         counts: dict[Monomial, int] = {}
         for m in terms:
             for i, (x, e) in enumerate(m):
@@ -342,6 +351,8 @@ class Arrangement:
         inside = {_without(m, factor): c for m, c in terms.items() if _divides(factor, m)}
         outside = {m: c for m, c in terms.items() if not _divides(factor, m)}
         x, A, B = self._one(factor, 1.0), self._plan(inside), self._plan(outside)
+        if len(factor) == 1 and factor[0][1] > 2:  # powers of a polynomial in one letter, which others share
+            x = x._replace(operations=0)
         both, operations = max(x.depth, A.depth), x.operations + A.operations + B.operations
 
         def product() -> Any:
@@ -401,6 +412,14 @@ def _times(m: Monomial, n: Monomial) -> Monomial:
     for x, e in n:
         powers[x] = powers.get(x, 0) + e
     return tuple(sorted(powers.items()))
+
+
+def _powers_of_one(terms: Terms) -> tuple[int, list[int]] | None:
+    """The letter of a polynomial in one, and its powers in order; None where there are more letters."""
+    letters = {x for m in terms for x, _ in m}
+    if len(letters) != 1:
+        return None
+    return letters.pop(), sorted(m[0][1] if m else 0 for m in terms)
 
 
 def _divides(factor: Monomial, m: Monomial) -> bool:
