@@ -21,7 +21,7 @@ import numpy as np
 from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.machine import address, compiled, host
-from sympflow.compiler.program import Program, fused, gradient, tangent, traced
+from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
@@ -256,8 +256,7 @@ class _Maps:
         n_symbols = self.width + len(form.parameters)
         numbers = [f"x_{i}" for i in range(n_symbols)] + [f"c_{k}" for k in range(self.terms)]
         self.kick = fused(traced(self._kick, *numbers))
-        if len(self.kick) > MOST_OPERATIONS:
-            raise ValueError(f"`system` has a kick of {len(self.kick)} operations.")
+        _check_length(len(self.kick))
         self._functions: dict[bool, Callable[..., None]] = {}
 
     def _kick(self, *numbers: Any) -> list[Any]:
@@ -285,6 +284,7 @@ class _Maps:
                 terms.append([0.5 * (x + y) for x, y in zip(tangent(along, q, v), again, strict=True)])
         forces = [[-x for x in term] for term in terms]
         changes = [_dot(c, [force[i] for force in forces]) for i in range(width)]
+        _check_length(len(reached(changes)))
         slopes = [gradient(change, q) for change in changes]
         return [*changes, *(x for force in forces for x in force), *(slopes[i][j] for i, j in self.pairs)]
 
@@ -300,6 +300,11 @@ class _Maps:
         if linearized not in self._functions:
             self._functions[linearized] = _Errors(self, linearized).compiled()
         return self._functions[linearized]
+
+
+def _check_length(n: int) -> None:
+    if n > MOST_OPERATIONS:
+        raise ValueError(f"`system` has a kick of {n} operations.")
 
 
 def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
