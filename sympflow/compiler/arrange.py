@@ -20,6 +20,8 @@ __all__ = ["Arranged", "Arrangement"]
 
 MOST_TERMS = 64  # of a product that is multiplied out
 MOST_TRIED = 10  # terms of a polynomial for which all ways to nest it are compared
+MOST_RICH = 5  # terms for which products are tried that only letters share
+MOST_SEARCHED = 1000  # polynomials, and parts of these, for which they are
 
 Monomial = tuple[tuple[int, int], ...]
 """Letters, by their order in the recording, with their exponents; sorted."""
@@ -101,6 +103,7 @@ class Arrangement:
         self._entries: dict[int, Traced] = {}
         self._from_table: list[Traced] = []
         self._plans: dict[Any, Plan] = {}
+        self._searched = 0
         self._states: list[Traced] = []
         for name, ready in states:
             node = self._body.input(name)
@@ -261,12 +264,13 @@ class Arrangement:
         if len(terms) == 1:
             ((m, c),) = terms.items()
             return self._one(m, c)
-        few = len(terms) <= MOST_TRIED
+        few = len(terms) <= MOST_TRIED and self._searched < MOST_SEARCHED
+        self._searched += few
         plans = (plan for m in self._factors(terms, few) for plan in self._nested(terms, m))
         return min(plans, key=lambda plan: plan.cost if few else plan.cost[::-1])
 
     def _factors(self, terms: Terms, few: bool) -> list[Monomial]:
-        """Products of letters to take out."""
+        """Products of letters to take out: those that terms share, and the last known of a term that shares none."""
         counts: dict[Monomial, int] = {}
         for m in terms:
             for i, (x, e) in enumerate(m):
@@ -276,7 +280,11 @@ class Arrangement:
                     for y, _ in m[i + 1 :]:
                         counts[(x, 1), (y, 1)] = counts.get(((x, 1), (y, 1)), 0) + 1
         if few:
-            return list(counts)
+            rich = len(terms) <= MOST_RICH
+            shared = [m for m, n in counts.items() if n > 1 or (rich and all(counts[(x, 1),] > 1 for x, _ in m))]
+            alone = [m for m in terms if m and not any(_divides(factor, m) for factor in shared)]
+            last = max(((self._known[x], x) for m in alone for x, _ in m), default=None)
+            return shared if last is None else [*shared, ((last[1], 1),)]
         return sorted((m for m in counts if m[0][1] == 1), key=lambda m: -counts[m])[:1]
 
     def _nested(self, terms: Terms, factor: Monomial) -> Iterator[Plan]:
