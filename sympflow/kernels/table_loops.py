@@ -9,7 +9,6 @@ the time as one more position, with the work of the drive as its momentum.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -20,13 +19,14 @@ import numpy as np
 
 from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
 from sympflow.compiler.functions import fma
-from sympflow.compiler.machine import address, compiled, host
+from sympflow.compiler.machine import address, host
 from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.rollouts import aligned, filled
+from sympflow.kernels.runs import finished
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["LabelErrors", "TableLoops", "table_loops"]
@@ -382,9 +382,7 @@ class _Errors:
                 with code.over(n_errors) as row:
                     self.back(row)
                     self.derivatives((j * n_errors + row) * n + start, self.n_times * n_errors * n)
-        code.give()
-        types = [ctypes.c_void_p if t == POINTER else ctypes.c_int64 for t in self._types]
-        return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *types))
+        return finished(code, self._types)
 
     @contextmanager
     def stages(self, back: bool = False) -> Iterator[tuple[Value, Value, Value, Rows]]:
