@@ -398,11 +398,11 @@ class ClockedFlowKernel(Kernel):
         expected: float,
         numbers: tuple[float, ...] | None = None,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The states of rows of `y0` (N, 2d) at elapsed times: see `timed_loops.reach_times`.
+        """The states of rows of `y0` (N, 2d) at elapsed times: see `elapsed_times.reach_times`.
 
         `numbers` are those of the clock, if they have been asked for.
         """
-        from sympflow.kernels.timed_loops import reach_times
+        from sympflow.kernels.elapsed_times import reach_times
 
         numbers = self._numbers() if numbers is None else numbers
         return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)

@@ -26,7 +26,7 @@ from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import Columns, Rollouts, aligned
 from sympflow.kernels.runs import Memory, Numbers, Room, finished
-from sympflow.kernels.splittings import Shape, Splitting
+from sympflow.kernels.splittings import Shape, Splitting, WithinRange
 from sympflow.kernels.teams import Team, meet
 from sympflow.kernels.threads import NEVER, threads_for
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
@@ -227,7 +227,7 @@ class FewSplitting(Splitting):
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
 
-    def kinds(self) -> list[Arranged]:
+    def kinds(self) -> Sequence[Arranged | WithinRange]:
         _check_level(self.level)
         return super().kinds()
 

@@ -124,12 +124,16 @@ class Rollouts:
 
     def function(self, name: str, width: int) -> Callable[..., None]:
         """The compiled function of a name, see `made`."""
-        found = self._functions.get((name, width))
+        return self.kept((name, width), lambda: self.made(name, width))
+
+    def kept(self, key: Any, make: Callable[[], Callable[..., None]]) -> Callable[..., None]:
+        """The result of `make`, made once for each key."""
+        found = self._functions.get(key)
         if found is None:
             with self._lock:
-                found = self._functions.get((name, width))
+                found = self._functions.get(key)
                 if found is None:
-                    found = self._functions[name, width] = self.made(name, width)
+                    found = self._functions[key] = make()
         return found
 
     def made(self, name: str, width: int) -> Callable[..., None]:

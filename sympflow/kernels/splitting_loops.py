@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
-from sympflow.kernels.stages import StageTable, damped_drift, run_table, step_table, takes_values
+from sympflow.kernels.stages import StageTable, damped_drift, run_table, step_table
 from sympflow.kernels.threads import given
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
@@ -86,7 +86,7 @@ class SplittingLoops:
         self._driving: Driving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Functions]
-        self._codes: dict[tuple[int, bool, Monomials], Functions] = {}
+        self._codes: dict[Any, Functions] = {}
         self._longs: dict[int, bool] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
@@ -186,10 +186,7 @@ class SplittingLoops:
 
     def takes_values(self, level: int, ranges: Ranges | None = None, varied: bool = False) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
-        if not varied and self._long(level):
-            return False
-        traced = self.traced and not ranges
-        return bool(self.values) and (traced or (self.friction is None and takes_values(level)))
+        return bool(self.values) and not ranges and (varied or not self._long(level))
 
     def functions(
         self,
@@ -201,8 +198,7 @@ class SplittingLoops:
     ) -> Functions:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
-        Where `ranges` of positions are given, which may be none, kicks and drifts are joined, and faster in these
-        ranges, see `kicks_source`: equal but for rounding.
+        Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
 
         Raises
         ------
@@ -228,12 +224,7 @@ class SplittingLoops:
         if not self.traced:
             more: dict[str, Any] = {"varied": True} if varied else {}
             return self._compile(level, compensated, monomials, **more)
-        if not ranges:
-            return self._traced(level, compensated, monomials, varied)
-        from sympflow.kernels.loop_functions import symbolic_loops
-
-        assert self._symbols is not None
-        return symbolic_loops(self._symbols, None, level, compensated, monomials, varied, ranges)
+        return self._traced(level, compensated, monomials, varied, ranges or ())
 
     def _long(self, level: int) -> bool:
         """True of stages that are loops over the terms of H."""
@@ -245,22 +236,27 @@ class SplittingLoops:
             self._longs[level] = is_long(self._form, level)
         return self._longs[level]
 
-    def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool) -> Functions:
+    def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges) -> Functions:
         """The functions over traced numbers, which serve batches with own values too."""
         from sympflow.kernels.splittings import SplittingCode, shared
 
-        key = level, compensated, monomials
+        key = level, compensated, monomials, ranges
         if not varied and self._long(level):
             from sympflow.kernels.array_splittings import term_code
 
             return term_code(self.splitting(level, monomials, compensated, parametric=False))
         if key not in self._codes:
-            splitting = self.splitting(level, monomials, compensated)
+            splitting = self.splitting(level, monomials, compensated, ranges)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
 
     def splitting(
-        self, level: int, monomials: Monomials = (), compensated: bool = False, parametric: bool = True
+        self,
+        level: int,
+        monomials: Monomials = (),
+        compensated: bool = False,
+        ranges: Ranges = (),
+        parametric: bool = True,
     ) -> Splitting:
         """The kicks and drifts of a level, of a system whose loops are made of traced numbers."""
         from sympflow.kernels.splittings import Splitting
@@ -268,8 +264,8 @@ class SplittingLoops:
         ndim, driving = None if self.friction is None else self.friction.damping.ndim, self._driving
         if self._written is not None:
             return self._written(level, monomials, compensated, ndim)
-        symbols = self._form.parametric if parametric and driving is None else self._form
-        return Splitting(symbols, level, monomials, compensated, ndim, driving)
+        symbols = self._form.parametric if parametric and driving is None and not ranges else self._form
+        return Splitting(symbols, level, monomials, compensated, ndim, driving, ranges)
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""
