@@ -7,7 +7,6 @@ however many there are.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -23,12 +22,11 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.runs import Room
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
-__all__ = ["Family", "Terms", "families", "is_large", "is_long", "warn_if_long", "written_out"]
+__all__ = ["Family", "Terms", "families", "is_large", "is_long", "written_out"]
 
 MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more than a few seconds
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
-MOST_COMPILED = 5000  # operations of all formulas, before a warning
-MOST_SEPARATE = 8  # slopes of a formula that have nothing in common
+MOST_COMPILED = 50_000  # operations of the slopes of all formulas, which take some ten seconds
 MOST_TOGETHER = 75  # operations of terms that stand alone in one loop
 MOST_OPERATIONS = 600  # of V, of which the slopes are written out
 
@@ -55,18 +53,6 @@ def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
     """Operations of ∇f, roughly: those of each term as often as it has variables."""
     known = set(variables)
     return sum(sp.count_ops(term) * len(term.free_symbols & known) for term in sp.Add.make_args(f))
-
-
-def warn_if_long(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> None:
-    """Warn of a function whose formulas, one for each kind of term, take Numba more than half a minute."""
-    n = sum(sp.count_ops(family.f) * min(len(family.x), MOST_SEPARATE) for family in families(f, variables))
-    if n > MOST_COMPILED:
-        warnings.warn(
-            f"`system` {name!r} has so many terms of different kinds, about {n:,} operations, that compiling takes "
-            "minutes. Give it by Numba functions that loop over its terms: HamiltonianSystem(V, ndof=…, gradient=…, "
-            "hessian_vector=…).",
-            stacklevel=2,
-        )
 
 
 class Family(NamedTuple):
@@ -204,11 +190,23 @@ class Terms:
     ----------
     data : list of ndarray
         How many terms each kind has, then the coordinates and the constants of each kind.
+
+    Raises
+    ------
+    ValueError
+        If the formulas of all kinds have too many operations.
     """
 
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
         self._given = f, tuple(variables), tuple(letters)
         self._families, self._letters = families(f, variables), tuple(letters)
+        n = sum(4 * sp.count_ops(family.f) for family in self._families)
+        if n > MOST_COMPILED:
+            raise ValueError(
+                f"`system` has so many terms of different kinds, about {n:,} operations, that it is not compiled. Give "
+                "it by Numba functions that loop over its terms: HamiltonianSystem(V, ndof=…, gradient=…, "
+                "hessian_vector=…), or use backend='array'."
+            )
         self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
         for family in self._families:
             self.data += [family.coordinates.astype(np.int64), family.constants]
