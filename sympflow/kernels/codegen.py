@@ -20,7 +20,6 @@ __all__ = [
     "gradient_kick_source",
     "parameter_lines",
     "polynomial_kick_source",
-    "polynomial_slope_source",
     "printed",
     "sampled_name",
     "statements",
@@ -234,18 +233,6 @@ def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -
                 slopes.append(slope)
     results = ["".join(terms) for terms in places]
     return _function(symbols, "polynomial_kick", "q, numbers, work", slopes, results, "b") + "\n"
-
-
-def polynomial_slope_source(symbols: SymbolicHamiltonian, monomials: Monomials) -> str:
-    """``polynomial_slope(q, numbers, out)``: Σ_m e_m ∇q^m into out, of arrays."""
-    q = symbols.q
-    letters = [sp.Symbol(f"e_{m}", real=True) for m in range(len(monomials))]
-    P = sp.Add(*[e * sp.Mul(*map(sp.Pow, q, m)) for e, m in zip(letters, monomials, strict=True)])
-    lines = ["@njit(**OPTIONS)", "def polynomial_slope(q, numbers, out):"]
-    lines += [f"    {s} = q[{i}]" for i, s in enumerate(q) if P.has(s)]
-    lines += [f"    {e} = numbers[{m + 1}]" for m, e in enumerate(letters)]
-    slopes = statements([f"out[{i}]" for i in range(len(q))], [sp.diff(P, s) for s in q])
-    return "\n".join([*lines, *(f"    {line}" for line in slopes)])
 
 
 def as_factor(number: sp.Expr) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
-from sympflow.kernels.stages import StageTable, damped_drift, run_table, step_table
+from sympflow.kernels.stages import StageTable, check_damping, run_table, step_table
 from sympflow.kernels.threads import given
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
@@ -98,7 +98,7 @@ class SplittingLoops:
 
             self._has_force_gradient = system.quadratic_kinetic
             self._large = is_large(system.symbols)
-            damped_drift(system, self._large)
+            check_damping(system, self._large)
             if self.driven:
                 from sympflow.kernels.stage_times import driven_form
 
@@ -121,7 +121,7 @@ class SplittingLoops:
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
-            damped_drift(system, True)
+            check_damping(system, True)
             from sympflow.kernels.array_splittings import function_code
 
             given = gradient, hessian_vector, system.inverse_mass, self.driven
@@ -266,6 +266,12 @@ class SplittingLoops:
             return self._written(level, monomials, compensated, ndim)
         symbols = self._form.parametric if parametric and driving is None and not ranges else self._form
         return Splitting(symbols, level, monomials, compensated, ndim, driving, ranges)
+
+    def kick_cycles(self, level: int, ranges: Ranges = ()) -> float:
+        """About how long a single trajectory takes for a kick of a level and a drift, in cycles."""
+        if self._long(level):
+            return float(self._form.V.count_ops() * (1 + level))
+        return self.splitting(level, ranges=ranges).cycles
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""
