@@ -12,10 +12,8 @@ from sympflow.kernels.modules import (
     constants_source,
     template,
 )
-from sympflow.schemes import CURVATURE, POLYNOMIAL
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.sized_loops import SizedLoops
 
 
@@ -37,16 +35,6 @@ def states_source(ndof: int, compensated: bool = False, n_values: int = 0) -> st
     constants = constants_source(COMPENSATED=compensated, NDOF=ndof, N_VALUES=n_values)
     texts = map(template, ("running_states", "aligned", "lane_blocks"))
     return "\n\n\n".join([constants, tuple_algebra(ndof), *texts])
-
-
-def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Monomials) -> list[str]:
-    """The kicks of a level, beside that of the algebra, where they are not scheduled."""
-    from sympflow.kernels.codegen import curvature_kick_source, gradient_kick_source, polynomial_kick_source
-
-    if level == POLYNOMIAL:
-        return [polynomial_kick_source(symbols, monomials)]
-    sources = [gradient_kick_source(symbols)] if level else []
-    return [*sources, curvature_kick_source(symbols)] if level == CURVATURE else sources
 
 
 def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:

@@ -19,12 +19,9 @@ __all__ = [
     "StageTable",
     "check_damping",
     "kicks_of",
-    "numbers_source",
     "run_table",
     "single_table",
-    "stages_source",
     "step_table",
-    "takes_values",
     "with_last_stage",
 ]
 
@@ -177,7 +174,7 @@ def single_table(scheme: Scheme, h: float) -> StageTable:
 
 @lru_cache(maxsize=256)
 def run_table(scheme: Scheme, h: float) -> StageTable:
-    """The table [opening, inner …, link, closing] of a run whose steps are h: see `text/loops.py`."""
+    """The table [opening, inner …, link, closing] of a run whose steps are h: see `runs.run_function`."""
     stages = _stages(scheme)
     first, last = stages[0], stages[-1]
     opening = replace(
@@ -210,15 +207,7 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
     return replace(after, **columns, times=np.concatenate([run.times[-1:], of_kicks[merged:]]))
 
 
-def takes_values(level: int) -> bool:
-    """True of kicks whose code is the same for all values of parameters.
-
-    In those with force gradients sums such as g ω⁴ − b ω² would round in another way than with numbers in the code.
-    """
-    return level not in (FORCE_GRADIENT, CURVATURE)
-
-
-# kinds of kick as code --------------------------------------------------------------------------------------------
+# kinds of kick --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -231,31 +220,13 @@ class Kick:
         Its numbers, the rows 1, 2, … of a table. A kick applies where the last one is not 0, else one with fewer.
     powers : tuple of int
         The powers of the step length with which they grow.
-    lines : tuple of str
-        Source of one application, for GPUs.
     """
 
     numbers: tuple[str, ...]
     powers: tuple[int, ...]
-    lines: tuple[str, ...]
 
 
-def _added(change: str) -> tuple[str, ...]:
-    return (f"p, p_error = move(p, p_error, {change}(q, numbers, work))",)
-
-
-PLAIN = Kick(("b",), (1,), _added("kick"))
-GRADIENT = Kick(
-    ("b", "g"),
-    (1, 3),
-    (
-        "first, second = gradient_kick(q, numbers, work)",
-        "p, p_error = move(p, p_error, first)",
-        "if COUPLED:",
-        "    p, p_error = move(p, p_error, second)",
-    ),
-)
-CURVED = Kick(("b", "g", "c"), (1, 3, 5), _added("curvature_kick"))
+PLAIN, GRADIENT, CURVED = Kick(("b",), (1,)), Kick(("b", "g"), (1, 3)), Kick(("b", "g", "c"), (1, 3, 5))
 KICKS = {0: (PLAIN,), FORCE_GRADIENT: (GRADIENT, PLAIN), CURVATURE: (CURVED, GRADIENT, PLAIN)}
 """The kinds of kick of a level, that with most numbers first."""
 
@@ -264,8 +235,7 @@ def kicks_of(level: int, n_monomials: int = 0) -> tuple[Kick, ...]:
     """The kinds of kick of a level, that with most numbers first; a polynomial of n monomials stands alone."""
     if level != POLYNOMIAL:
         return KICKS[level]
-    letters = tuple(f"e_{m}" for m in range(n_monomials))
-    return (Kick(("b", *letters), (1,) + (3,) * n_monomials, _added("polynomial_kick")),)
+    return (Kick(("b", *(f"e_{m}" for m in range(n_monomials))), (1,) + (3,) * n_monomials),)
 
 
 MOST_COUPLED = 6
@@ -284,69 +254,3 @@ def check_damping(system: HamiltonianSystem, in_memory: bool) -> None:
             f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "
             f"{MOST_COUPLED} degrees of freedom: use backend='array'."
         )
-
-
-# source text for GPUs ---------------------------------------------------------------------------------------------
-
-
-_DRIFT_OF = """@njit(**OPTIONS, forceinline=True)
-def drift_of(table, j):
-    return table[0, j]"""
-_TABLE = """@njit(**OPTIONS, forceinline=True)
-def columns_of(table):
-    return table.shape[1]
-
-
-@njit(**OPTIONS)
-def first_coefficients(table):
-    return table[:, :, 0]
-
-
-@njit(**OPTIONS)
-def drift_at(table, j, x):
-    return polynomial(table[0, j], x)"""
-
-
-def numbers_source(kinds: Sequence[Kick], n_parameters: int) -> str:
-    """The functions of the text `loops` that read the numbers of stages.
-
-    ``numbers_of(table, j, k)`` are the numbers of kick j of step k, ``numbers_at(table, j, x, h, t)`` those of a step h
-    by polynomials in x; the values of the parameters of H come after them. ``drift_of(table, j)`` are those of a drift.
-    `FIRST_VALUE` is the row of a table with the first of the values.
-    """
-    first = 1 + len(kinds[0].numbers)
-    steps, constant = {1: "h", 3: "h ** 3", 5: "h ** 5"}, range(first, first + n_parameters)
-    numbers = [f"table[{i}, j]" for i in (*range(1, first), *constant)]
-    values = [f"{steps[n]} * polynomial(table[{i}, j], x)" for i, n in enumerate(kinds[0].powers, 1)]
-    values += [f"table[{i}, j, 0]" for i in constant]
-    return f"""FIRST_VALUE = {first}
-
-
-@njit(**OPTIONS)
-def numbers_of(table, j, k=0):
-    return ({", ".join(numbers)}, )
-
-
-@njit(**OPTIONS)
-def numbers_at(table, j, x, h, t):
-    return ({", ".join(values)}, )
-
-
-{_TABLE}
-
-
-{_DRIFT_OF}"""
-
-
-def stages_source(kinds: Sequence[Kick], n_parameters: int) -> str:
-    """``stage`` of the text `loops`, a kick and a drift of one trajectory."""
-    given = "numbers, " if n_parameters else ""
-    end = [f"q, q_error = move(q, q_error, drift(p, a, {given}work))", "return q, p, q_error, p_error"]
-    lines: list[str] = []
-    for kick in kinds[:-1]:
-        condition = f"numbers[{len(kick.numbers) - 1}] != 0.0"
-        lines += [f"{'elif' if lines else 'if'} {condition}:", *(f"    {line}" for line in [*kick.lines, *end])]
-    last = [*kinds[-1].lines, *end]
-    lines += ["else:", *(f"    {line}" for line in last)] if lines else last
-    body = "\n    ".join(lines)
-    return f"@njit(**OPTIONS, forceinline=True)\ndef stage(q, p, q_error, p_error, numbers, a, j, work):\n    {body}"
