@@ -8,13 +8,13 @@ reassociates or fuses: a scalar and every lane of a register get the same operat
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from sympflow.compiler.numbers import Number
 
-__all__ = ["BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Type", "Value", "Variable"]
+__all__ = ["BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Sweep", "Type", "Value", "Variable"]
 
 
 class Type(NamedTuple):
@@ -164,6 +164,10 @@ def literal(x: float, type: Type) -> str:
     else:
         text = str(int(x))
     return text if type.width == 1 else f"splat ({type.scalar} {text})"
+
+
+def _vector(scalar: str, numbers: Iterable[int]) -> str:
+    return f"<{', '.join(f'{scalar} {x}' for x in numbers)}>"
 
 
 _PLAIN = {"add": "fadd", "sub": "fsub", "mul": "fmul", "times": "fmul", "div": "fdiv"}
@@ -339,6 +343,31 @@ class Code:
         first = self._new(type, f"insertelement {type} poison, {x.type} {x.name}, i64 0")
         return self._new(type, f"shufflevector {type} {first.name}, {type} poison, <{width} x i32> zeroinitializer")
 
+    def shuffle(self, x: Value, y: Value, lanes: Sequence[int]) -> Value:
+        """Lanes of x, and behind them those of y, in another order."""
+        order = ", ".join(f"i32 {k}" for k in lanes)
+        pair = f"{x.type} {x.name}, {y.type} {y.name}"
+        return self._new(Type(x.type.scalar, len(lanes)), f"shufflevector {pair}, <{len(lanes)} x i32> <{order}>")
+
+    def lane_numbers(self, width: int) -> Value:
+        """0, 1, … in the lanes."""
+        return Value(self, INT, "0") if width == 1 else Value(self, Type("i64", width), _vector("i64", range(width)))
+
+    def total(self, x: Value) -> Value:
+        """The sum of all lanes, halves added to halves."""
+        while x.type.width > 2:
+            half = Type(x.type.scalar, x.type.width // 2)
+            n, rest = half.width, f"{x.type} poison"
+            low, high = (
+                self._new(half, f"shufflevector {x.type} {x.name}, {rest}, <{n} x i32> {_vector('i32', lanes)}")
+                for lanes in (range(n), range(n, 2 * n))
+            )
+            x = low + high
+        if x.type.width == 1:
+            return x
+        first, last = (self._new(Type(x.type.scalar), f"extractelement {x.type} {x.name}, i64 {k}") for k in (0, 1))
+        return first + last
+
     def any(self, condition: Value) -> Value:
         """True if a condition holds in any lane."""
         if condition.type.width == 1:
@@ -357,12 +386,21 @@ class Code:
     def load(self, pointer: Value, index: Any = 0, type: Type = DOUBLE, shared: bool = False) -> Value:
         """The value at an index of an array of scalars, aligned as these are; `shared` if another thread changes it."""
         place = self.at(pointer, index, type.scalar)
-        kind = "load volatile" if shared else "load"
-        return self._new(type, f"{kind} {type}, ptr {place.name}, align {_SIZES[type.scalar]}")
+        kind, order = ("load atomic volatile", " seq_cst") if shared else ("load", "")
+        return self._new(type, f"{kind} {type}, ptr {place.name}{order}, align {_SIZES[type.scalar]}")
 
     def store(self, x: Value, pointer: Value, index: Any = 0) -> None:
         place = self.at(pointer, index, x.type.scalar)
         self._lines.append(f"  store {x.type} {x.name}, ptr {place.name}, align {_SIZES[x.type.scalar]}")
+
+    def added(self, x: Value, pointer: Value, index: Any = 0) -> Value:
+        """Add to a whole number that several threads change, and return it as it was."""
+        place = self.at(pointer, index, x.type.scalar)
+        return self._new(x.type, f"atomicrmw add ptr {place.name}, {x.type} {x.name} seq_cst")
+
+    def address(self, x: Value) -> Value:
+        """A whole number as the address of memory, which others may read and write too."""
+        return self._new(POINTER, f"inttoptr i64 {x.name} to ptr")
 
     def memory(self, count: int, type: Type = DOUBLE) -> Value:
         """Room for so many values on the stack, aligned to 64 bytes."""
@@ -434,6 +472,37 @@ class Code:
         self._lines[place:place] = phis
         self._begin(after, head)
         return values
+
+    @contextmanager
+    def sweep(self, first: Value, last: Value, read: Callable[[Any, Value], Value]) -> Iterator[Sweep]:
+        """Execute what is written inside for k = first … last − 1, with values of other turns: see `Sweep`."""
+        sweep = Sweep(self, first, read)
+        outside, self._lines = self._lines, []
+        head, inside, after, before = self._label(), self._label(), self._label(), self._block
+        self._begin(inside, head)
+        yield sweep
+        following = sweep.k + 1
+        self._branch(head)
+        end, body, self._lines = self._block, self._lines, outside
+        phis, begun, made = sweep.finished(before, end, following)
+        self._lines += begun
+        self._branch(head)
+        self._begin(head, before)
+        self._lines += phis
+        self._lines.append(f"  br i1 {(sweep.k < last).name}, label %{inside}, label %{after}")
+        self._lines += [body[0], *made, *body[1:]]
+        self._begin(after, head)
+
+    @contextmanager
+    def elsewhere(self, lines: list[str]) -> Iterator[None]:
+        """Put what is written inside behind these lines."""
+        here, self._lines = self._lines, lines
+        yield
+        self._lines = here
+
+    def phi(self, value: Value, first: Value, before: str, following: Value, end: str) -> str:
+        """The line of a value that is `first` when a loop begins, and then that of the turn before."""
+        return f"  {value.name} = phi {value.type} [ {first.name}, %{before} ], [ {following.name}, %{end} ]"
 
     def repeat(self, carried: Sequence[Value], body: Callable[..., tuple[Value, Sequence[Value]]]) -> list[Value]:
         """Execute `body(values)`, which returns whether to go on and the new values, at least once."""
@@ -510,4 +579,63 @@ class Code:
         self._lines.append(f"  br label %{label}")
 
 
-_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1, "ptr": 8}
+class Sweep:
+    """Turns k of a loop over places, in which values of places further on stay in registers until their turn comes.
+
+    Attributes
+    ----------
+    k : Value
+    """
+
+    def __init__(self, code: Code, first: Value, read: Callable[[Any, Value], Value]) -> None:
+        self.code, self.k = code, code._name(INT)
+        self._first, self._read = first, read
+        self._values: dict[Any, dict[int, Value]] = {}
+        self._made: set[Any] = set()
+        self._begun: list[str] = []
+        self._types: dict[Any, Type] = {}
+
+    def get(self, key: Any, d: int, type: Type) -> Value:
+        """The value of a key at the place k + d: read from memory when that is met first, unless it is put there.
+
+        A value that is put is 0 for places before the first one where it was.
+        """
+        self._types[key] = type
+        values = self._values.setdefault(key, {})
+        if d not in values:
+            values[d] = self.code._name(type)
+        return values[d]
+
+    def put(self, key: Any, d: int, x: Value) -> None:
+        """Set the value of a key at the place k + d, the furthest one at which it is asked for."""
+        self._types[key] = x.type
+        self._values.setdefault(key, {})[d] = x
+        self._made.add(key)
+
+    @contextmanager
+    def before(self) -> Iterator[None]:
+        """Put what is written inside before the loop."""
+        with self.code.elsewhere(self._begun):
+            yield
+
+    def finished(self, before: str, end: str, following: Value) -> tuple[list[str], list[str], list[str]]:
+        """Lines that carry values over, lines before the loop, and those where a turn begins."""
+        code, made = self.code, list[str]()
+        phis = [code.phi(self.k, self._first, before, following, end)]
+        for key, values in self._values.items():
+            most, type = max(values), self._types[key]
+            if key not in self._made:
+                with code.elsewhere(made):
+                    x = self._read(key, self.k + most)
+                made.append(f"  {values[most].name} = bitcast {type} {x.name} to {type}")
+            for d in range(min(values), most):
+                value = self.get(key, d, type)
+                first = code.constant(0.0, type)
+                if key not in self._made:
+                    with code.elsewhere(self._begun):
+                        first = self._read(key, self._first + d)
+                phis.append(code.phi(value, first, before, self.get(key, d + 1, type), end))
+        return phis, self._begun, made
+
+
+_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1}

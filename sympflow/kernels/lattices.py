@@ -1,0 +1,808 @@
+"""Splitting methods on lattices of any size: the code of one site and of one bond, over traced numbers.
+
+An axis is cut into slabs, one for each lane of the registers: a place in memory holds the sites at one place of all
+slabs, so that what is beside a site lies in the same lane, at the place beside. Only the planes before and behind the
+slabs, their ghosts, are taken from other lanes. A stage is one pass over the places: each bond is computed once, and
+what it does to the site at its other end is kept until that is reached. With a force gradient the accelerations are
+made some places ahead of the kicks. What is made of a site is the same in all lanes, pieces and threads, to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from sympflow.compiler.arrange import ALWAYS, Arrangement
+from sympflow.compiler.control import BOOL, INT, POINTER, Code, Sweep, Type, Value
+from sympflow.compiler.functions import FUNCTIONS, times
+from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
+from sympflow.hamiltonian.lattice import LatticeHamiltonian
+from sympflow.hamiltonian.recorded import evaluator
+from sympflow.schemes import CURVATURE
+
+__all__ = ["Form", "LatticeStages"]
+
+Key = tuple[Any, ...]
+"""A number of a site: its kind, and which one of these."""
+COSTLY = FUNCTIONS["div"].cost
+"""The cost of an operation from which second derivatives of U are kept, and not computed again."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """All that the code of a lattice depends on.
+
+    Attributes
+    ----------
+    lattice : LatticeHamiltonian
+        Its terms, and which parameters are arrays; not its size, nor values of parameters.
+    boundary : tuple of str
+        Of each axis, that of the lanes first.
+    level : int
+        See `Scheme`.
+    compensated : bool
+    damped : bool
+        True if there is friction −γp, whose numbers are the last two of a column.
+    width : int
+        Lanes.
+    """
+
+    lattice: LatticeHamiltonian
+    boundary: tuple[str, ...]
+    level: int
+    compensated: bool
+    damped: bool
+    width: int
+
+    @property
+    def _key(self) -> tuple[Any, ...]:
+        lattice = self.lattice
+        arrays = tuple(isinstance(value, np.ndarray) for value in lattice.params.values())
+        terms = lattice.U, lattice.T, tuple(sorted(lattice.bonds.items())), len(lattice.fields), arrays
+        return *terms, self.boundary, self.level, self.compensated, self.damped, self.width
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Form) and self._key == other._key
+
+    @property
+    def column(self) -> tuple[str, ...]:
+        """The names of the numbers of a column."""
+        return ("a", "b", "g", "c")[: 2 + self.level] + (("mean", "decay") if self.damped else ())
+
+    @property
+    def reach(self) -> int:
+        """The longest distance of two ends of a bond."""
+        return max(self.lattice.bonds, default=0)
+
+    def planes_before(self, passes: int) -> int:
+        """The planes before a slab from which a stage of so many passes begins."""
+        return (2 * passes - 1) * self.reach
+
+
+# the calculations of one site and of one bond -----------------------------------------------------------------------
+
+
+class Law:
+    """A calculation at one site or along one bond: from numbers by their keys to others.
+
+    Parameters
+    ----------
+    lattice : LatticeHamiltonian
+    keys : sequence of Key
+        Of numbers that it may read; those of a column have the kind "column".
+    outputs : callable
+        Of an arrangement, its numbers by their keys, and those of the parameters.
+
+    Attributes
+    ----------
+    numbers : list of str
+        The numbers that depend on parameters alone, written out.
+    """
+
+    def __init__(self, lattice: LatticeHamiltonian, keys: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> None:
+        states = [(f"{kind}{i}", ALWAYS if kind == "column" else 0) for kind, i in keys]
+        made = Arrangement(states, [s.name for s in lattice.c])
+        found = outputs(made, dict(zip(keys, made.states, strict=True)), made.constants)
+        self._keys, self.results = keys, list(found)
+        self.table, self._body = made.finish(list(found.values()))
+        used = {x.order for x in reached(self._body.outputs)}
+        self._reads = [x.order in used for x in self._body.inputs]
+        self.numbers = [_formula(x) for x in self.table.outputs]
+
+    def __call__(self, get: Callable[[Key], Any]) -> Iterator[tuple[Key, Any]]:
+        keys = [*self._keys, *(("number", name) for name in self.numbers)]
+        values = [get(key) if reads else 0.0 for key, reads in zip(keys, self._reads, strict=True)]
+        return zip(self.results, self._body(*values), strict=True)
+
+
+def _formula(x: Any) -> str:
+    if not isinstance(x, Traced):
+        return repr(x)
+    return f"{x.name}({', '.join(map(_formula, x.args))})" if x.name != "input" else str(x.args[0])
+
+
+class Potential:
+    """A term of one site or of one bond, with its derivatives by what it depends on.
+
+    Attributes
+    ----------
+    slopes, bends, bent : Program
+        ∇f; ∇²f, row by row; and ∇²f w + ½ ∇³f(v, v); of x, v, w and the parameters.
+    """
+
+    def __init__(self, lattice: LatticeHamiltonian, f: Any, x: Sequence[Any]) -> None:
+        n = self.n = len(x)
+        letters = (*x, *lattice.v, *lattice.w, *lattice.c)
+        program = traced(
+            lambda *numbers: [evaluator(dict(zip(letters, numbers, strict=True)))(f)], *(s.name for s in letters)
+        )
+        given, (y,) = program.inputs, program.outputs
+        self.x, v, w = given[:n], given[n : 2 * n], given[2 * n : 3 * n]
+        slopes = gradient(y, self.x)
+        bends = [a for row in derivatives(slopes, self.x) for a in row]
+        twice = tangent(tangent(slopes, self.x, v), self.x, v)
+        bent = [a + 0.5 * b for a, b in zip(tangent(slopes, self.x, w), twice, strict=True)]
+        self.slopes, self.bends, self.bent = (Program(given, list(values)) for values in (slopes, bends, bent))
+
+    def kept(self, costly: bool) -> list[int]:
+        """The second derivatives that are no constants, of those that are alike the first; or the costly ones alone."""
+        found: dict[int, int] = {}
+        for k, f in enumerate(self.bends.outputs):
+            needs = reached([f])
+            if {x.order for x in self.x} & {x.order for x in needs} and (
+                not costly or any(x.name in FUNCTIONS and FUNCTIONS[x.name].cost >= COSTLY for x in needs)
+            ):
+                found.setdefault(f.order, k)
+        return list(found.values())
+
+    def product(self, made: Arrangement, bends: Sequence[Any], v: Sequence[Any]) -> list[Any]:
+        """∇²f v; kept second derivatives are letters."""
+        rows = (bends[i * self.n : (i + 1) * self.n] for i in range(self.n))
+        return [sum((times(a, b) for a, b in zip(row, v, strict=True)), made.number(0.0)) for row in rows]
+
+
+KICK, OPEN, TURN, MIDDLE, LAST = "kick", "open", "turn", "middle", "last"
+"""Passes: a kick without force gradient; accelerations; a kick with force gradient; the same, and the direction that
+curvature terms need; these. All but the second and the fourth end with a drift."""
+KINDS = (KICK,), (OPEN, TURN), (OPEN, MIDDLE, LAST)
+"""The passes of each kind of stage."""
+
+
+class Pass:
+    """A pass over sites: what is computed along bonds, and at a site of what these give.
+
+    Attributes
+    ----------
+    bonds : dict of int to Law
+        By their distance: ("flux", f), by which bonds act on field f at both ends, and second derivatives to be kept.
+    site : Law
+    """
+
+    def __init__(self, form: Form, name: str, terms: dict[Any, Potential]) -> None:
+        self.form, self.name, self.lattice = form, name, form.lattice
+        self._terms, self._fields = terms, range(len(form.lattice.fields))
+        ranks = [("r", "q"), ("dv", "v"), ("dw", "w")][: {KICK: 1, OPEN: 1, TURN: 2, MIDDLE: 2, LAST: 3}[name]]
+        self._vectors = [vector for _, vector in ranks]
+        self.differences = dict(ranks)
+        keeps_all = len(form.boundary) == 1
+        self._kept = {k: f.kept(k == "site" or not keeps_all) for k, f in terms.items()}
+        self.bonds = {k: self._bond(k) for k in form.lattice.bonds}
+        self.site = self._site()
+
+    def _law(self, kinds: Sequence[str], more: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> Law:
+        return Law(self.lattice, [*((kind, f) for kind in kinds for f in self._fields), *more], outputs)
+
+    def _gradient(self, term: Any, kind: str, made: Any, get: dict[Key, Any], c: Sequence[Any]) -> dict[Key, Any]:
+        """What this pass takes of a term: ("flux", f), and ("kept", (term, k))."""
+        potential, fields = self._terms.get(term), self._fields
+        if potential is None:
+            return {("flux", f): made.number(0.0) for f in fields}
+        vectors = ("r", "dv", "dw") if term != "site" else ("q", "v", "w")
+        x, v, w = ([get.get((vector, f), 0.0) for f in fields] for vector in vectors)
+        found, kept = {}, self._kept[term]
+        if self.name in (KICK, OPEN):
+            slopes = potential.slopes(*x, *v, *w, *c)
+        elif self.name == LAST:
+            slopes = potential.bent(*x, *v, *w, *c)
+        else:
+            wanted = [f if k not in self._alike(term) else 0.0 for k, f in enumerate(potential.bends.outputs)]
+            bends = Program(potential.bends.inputs, wanted)(*x, *v, *w, *c)
+            bends = [
+                get["kept", (term, self._alike(term)[k])] if k in self._alike(term) else made.number(f)
+                for k, f in enumerate(bends)
+            ]
+            slopes = potential.product(made, bends, v)
+        found = {("flux", f): made.number(y) for f, y in enumerate(slopes)}
+        if self.name == OPEN and self.form.level:
+            bends = Program(potential.bends.inputs, [potential.bends.outputs[k] for k in kept])(*x, *v, *w, *c)
+            found |= {("kept", (term, k)): made.number(y) for k, y in zip(kept, bends, strict=True)}
+        return found
+
+    def _alike(self, term: Any) -> dict[int, int]:
+        """Each kept second derivative, and those that equal it, by the one that is kept."""
+        outputs = self._terms[term].bends.outputs
+        of = {outputs[k].order: k for k in self._kept[term]}
+        return {k: of[f.order] for k, f in enumerate(outputs) if isinstance(f, Traced) and f.order in of}
+
+    def _of_kept(self, term: Any) -> list[Key]:
+        if term not in self._terms or self.name not in (TURN, MIDDLE):
+            return []
+        return [("kept", (term, k)) for k in self._kept[term]]
+
+    def _bond(self, k: int) -> Law:
+        def outputs(made: Any, get: dict[Key, Any], c: Sequence[Any]) -> dict[Key, Any]:
+            return {key: made.written(x) for key, x in self._gradient(k, "bond", made, get, c).items()}
+
+        return self._law(list(self.differences), self._of_kept(k), outputs)
+
+    def _site(self) -> Law:
+        momentum = "turned" if self.name == LAST else "p"
+        kinds = ["q", *self._vectors[1:], "flux", *([self._slope] if self.name in (TURN, MIDDLE) else []), momentum]
+        kinds += [f"{momentum}_error", "q_error"] if self.form.compensated else []
+        more = [*self._of_kept("site"), *(("column", name) for name in self.form.column)]
+        return self._law(list(dict.fromkeys(kinds)), more, self._moved)
+
+    @property
+    def _slope(self) -> str:
+        """∇V, which is the acceleration where masses are 1."""
+        return "slope" if self.lattice.inverse_mass is not None else "v"
+
+    def _moved(self, made: Any, get: dict[Key, Any], c: Sequence[Any]) -> dict[Key, Any]:
+        """The numbers of a site after the pass."""
+        fields, name = self._fields, self.name
+        terms = self._gradient("site", "site", made, get, c)
+        total = [terms.pop(("flux", f)) - get["flux", f] for f in fields]
+        found = {key: made.written(x) for key, x in terms.items()}
+        if name == OPEN:
+            slopes = [made.written(x) for x in total]
+            found |= {(self._slope, f): x for f, x in enumerate(slopes)}
+            return found | {("v", f): x for f, x in enumerate(self._velocity(made, slopes, c))}
+        kick, *more = (get["column", x] for x in self.form.column[1 : 2 + self.form.level])
+        if name == KICK:
+            changes = [-times(kick, x) for x in total]
+        elif name == LAST:
+            changes = [-times(more[1], x) for x in total]
+        else:
+            products = [made.letter(made.written(x)) for x in total] if name == MIDDLE else total
+            slopes = [get[self._slope, f] for f in fields]
+            changes = [times(more[0], x) - times(kick, s) for x, s in zip(products, slopes, strict=True)]
+            if name == MIDDLE:
+                nodes = [made.node(x) for x in products]
+                found |= {("w", f): x for f, x in enumerate(self._velocity(made, nodes, c))}
+        momenta, errors = self._added(made, get, "turned" if name == LAST else "p", changes)
+        if name == MIDDLE:
+            found |= {("turned", f): x for f, x in enumerate(momenta)}
+            return found | {("turned_error", f): x for f, x in enumerate(errors)}
+        found |= {("p_error", f): x for f, x in enumerate(errors)}
+        drift = get["column", "mean" if self.form.damped else "a"]
+        moves = [made.number(times(drift, made.letter(x))) for x in self._velocity(made, momenta, c)]
+        positions, errors = self._added(made, get, "q", moves)
+        found |= {("q", f): x for f, x in enumerate(positions)} | {("q_error", f): x for f, x in enumerate(errors)}
+        if self.form.damped:
+            momenta = [made.written(times(get["column", "decay"], made.letter(x))) for x in momenta]
+        return found | {("p", f): x for f, x in enumerate(momenta)}
+
+    def _velocity(self, made: Any, momenta: Sequence[Any], c: Sequence[Any]) -> list[Any]:
+        """∇T of momenta, numbers of the body."""
+        nothing = [0.0] * (2 * len(momenta))
+        slopes = self._terms["kinetic"].slopes(*(made.letter(x) for x in momenta), *nothing, *c)
+        return [made.written(made.number(x)) for x in slopes]
+
+    def _added(
+        self, made: Any, get: dict[Key, Any], vector: str, changes: Sequence[Any]
+    ) -> tuple[list[Any], list[Any]]:
+        """A vector with changes, and the errors of compensated sums."""
+        x = [get[vector, f] for f in self._fields]
+        if not self.form.compensated:
+            return [made.written(a + b) for a, b in zip(x, changes, strict=True)], []
+        sums, left, op = [], [], made.operation
+        for f, (value, change) in enumerate(zip(map(made.node, x), map(made.written, changes), strict=True)):
+            corrected = op("sub", change, made.node(get[f"{vector}_error", f]))
+            sums.append(op("add", value, corrected))
+            left.append(op("sub", op("sub", sums[-1], value), corrected))
+        return sums, left
+
+
+# the code of a stage ------------------------------------------------------------------------------------------------
+
+SIZES = ("planes", "rows", "places", "vector", "plane", "row", "low")
+"""Numbers of a context: planes of a slab, rows of a plane, places of a row; how many numbers vectors, planes and rows
+take, and those of a vector before the first plane of a slab."""
+SITES = ("sites", "site_of_plane", "site_of_row", "site_of_place")
+"""How many sites there are, and how far apart those of neighbouring planes, rows and places are in a row [q, p]."""
+ADDRESSES = ("starts", "sizes", "full", "follows", "inside", "inside_1", "inside_2", "arrays", "values", "helpers")
+"""Arrays: of each slab its first plane and how many are its own; lanes of slabs whose own planes are all, and of those
+that follow one; where sites are; numbers of sites and of all, and room for what passes keep."""
+SHARED = ("left", "right", "members", "meeting", "stop")
+"""The rooms of pieces beside this one; threads, where they meet, and what ends them."""
+CONTEXT = ("own", "numbers", "row_of_q_p", "row_of_all", "longest", *SIZES, *SITES, *ADDRESSES, *SHARED)
+
+
+class LatticeStages:
+    """The code of stages that change a state in memory: vectors of each field of q, of p and, compensated, of errors."""
+
+    def __init__(self, form: Form) -> None:
+        lattice = form.lattice
+        self.form, self.fields = form, len(lattice.fields)
+        terms = {"kinetic": Potential(lattice, lattice.T, lattice.p)}
+        if lattice.U != 0:
+            terms["site"] = Potential(lattice, lattice.U, lattice.x)
+        terms |= {k: Potential(lattice, V, lattice.r) for k, V in lattice.bonds.items()}
+        names = dict.fromkeys(name for kind in KINDS[: 1 + form.level] for name in kind)
+        self.passes = {name: Pass(form, name, terms) for name in names}
+        self.sets = ("q", "p", "q_error", "p_error")[: 4 if form.compensated else 2]
+        self.vectors = [(kind, f) for kind in self.sets for f in range(self.fields)]
+        laws = [law for one in self.passes.values() for law in (one.site, *one.bonds.values())]
+        arrays = {s.name for s, v in zip(lattice.c, lattice.params.values(), strict=True) if isinstance(v, np.ndarray)}
+        self._made = {name: (law, i) for law in laws for i, name in enumerate(law.numbers)}
+        self.arrays, self.values = list[str](), list[str]()
+        for name, (law, i) in self._made.items():
+            needs = {x.args[0] for x in reached([law.table.outputs[i]]) if x.name == "input"}
+            (self.arrays if needs & arrays else self.values).append(name)
+        self.helpers, self.buffers = self._helpers()
+
+    def _helpers(self) -> tuple[dict[Any, int], dict[Any, int]]:
+        """Where planes begin that passes keep, and rows, of lattices of several axes; how many there are by None."""
+        axes, helpers, rows = range(len(self.form.boundary)), {}, {}
+        planes = count = 0
+        if len(axes) > 1:
+            for one in self.passes.values():
+                kept = [key for key in one.site.results if key not in self.vectors]
+                kept += [(key, a) for law in one.bonds.values() for key in law.results if key[0] == "kept" for a in axes]
+                for key in kept:
+                    helpers[key], planes = planes, planes + self.slots
+                for k in one.bonds:
+                    for f in range(self.fields):
+                        helpers[one.name, 0, k, f], planes = planes, planes + k
+                        rows[one.name, 1, k, f], count = count, count + k
+        return {**helpers, None: planes}, {**rows, None: count if len(axes) > 2 else 0}
+
+    @property
+    def slots(self) -> int:
+        """Planes of a number that passes keep."""
+        return self.form.level * self.form.reach + 1
+
+    def numbers(self, lattice: LatticeHamiltonian) -> tuple[list[float], list[np.ndarray]]:
+        """The numbers of all sites and those of each, of a lattice of this form."""
+        given = list(lattice.params.values())
+        with np.errstate(all="ignore"):
+            found = {name: law.table(*given)[i] for name, (law, i) in self._made.items()}
+        return [float(found[name]) for name in self.values], [np.asarray(found[name]) for name in self.arrays]
+
+    def load(self, code: Code, context: Value, row: Value, state: Value, whole: bool) -> None:
+        """Make a state of a row [q, p], with errors behind it if it is the `whole` of one."""
+        self._each(_Scene(self, state, context), row, whole, True)
+
+    def keep(self, code: Code, context: Value, state: Value, row: Value, whole: bool) -> None:
+        """Write a state to a row, each thread its own sites."""
+        self._each(_Scene(self, state, context), row, whole, False)
+
+    def _each(self, scene: _Scene, row: Value, whole: bool, loads: bool) -> None:
+        code, at, width = row.code, scene.numbers, self.form.width
+        starts, sizes = scene.address("starts"), scene.address("sizes")
+        for v, key in enumerate(self.vectors[: len(self.vectors) if whole else 2 * self.fields]):
+            x = scene.vectors[key]
+            first = code.constant(v, INT) * at["sites"]
+            with code.over(code.constant(width, INT)) as lane:
+                start = code.load(starts, lane, INT)
+                planes = at["planes"] if loads else code.load(sizes, lane, INT)
+                with code.over(planes) as i, code.over(at["rows"]) as r, code.over(at["places"]) as j:
+                    place = i * at["plane"] + r * at["row"] + j * width + lane
+                    site = first + (start + i) * at["site_of_plane"] + r * at["site_of_row"] + j * at["site_of_place"]
+                    if loads:
+                        code.store(code.load(row, site), x, place)
+                    else:
+                        code.store(code.load(x, place), row, site)
+
+    def stage(self, values: list[Value], numbers: Callable[[int], Value], kind: Value, step: Value) -> list[Value]:
+        """See `sympflow.kernels.runs.Stage`; the values are the addresses of the state and the context."""
+        given = [numbers(i) for i in range(len(self.form.column))]
+        kind.code.outlined("stage", (*values, kind, *given), self._stage)
+        return values
+
+    def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
+        code = state.code
+        scene = _Scene(self, state, context, numbers)
+        for k, names in enumerate(KINDS[: 1 + self.form.level]):
+            with code.given(code.apply("eq", (kind, k))):
+                scene.refresh(len(names) * self.form.reach)
+                scene.sweep([self.passes[name] for name in names])
+
+
+class _Scene:
+    """The code of one stage: the numbers and arrays that it reads, and loops over sites."""
+
+    def __init__(self, stages: LatticeStages, state: Value, context: Value, column: Sequence[Value] = ()) -> None:
+        self.stages, self.form, self.code = stages, stages.form, state.code
+        self.state, self._context = state, context
+        self.n_axes, self.reach, self.width = len(self.form.boundary), self.form.reach, self.form.width
+        self.type, self.bits = Type("double", self.width), Type("i64", self.width)
+        self.numbers = {name: self._number(name) for name in (*SIZES, *SITES)}
+        inner = self.numbers["row"] * self.reach if self.n_axes > 2 else 0
+        self.inner = inner + self.reach * self.width if self.n_axes > 1 else 0
+        self.origin = self.numbers["low"] + self.inner
+        self.vectors: dict[Key, Value] = {key: self.code.at(self.vector(key), self.origin) for key in stages.vectors}
+        if not column:
+            return
+        arrays = self.address("arrays")
+        self.vectors |= {
+            ("array", name): self.code.at(arrays, self.numbers["vector"] * i + self.origin)
+            for i, name in enumerate(stages.arrays)
+        }
+        values = self.address("values")
+        self.values: dict[Key, Value] = {
+            ("column", name): self.code.splat(x, self.width) for name, x in zip(self.form.column, column, strict=True)
+        }
+        for i, name in enumerate(stages.values):
+            self.values["number", name] = self.code.splat(self.code.load(values, i), self.width)
+        self.helpers = self.address("helpers")
+
+    def _number(self, name: str) -> Value:
+        return self.code.load(self._context, CONTEXT.index(name), INT)
+
+    def address(self, name: str) -> Value:
+        return self.code.address(self._number(name))
+
+    def vector(self, key: Key) -> Value:
+        return self.code.at(self.state, self.numbers["vector"] * self.stages.vectors.index(key))
+
+    # ghosts ---------------------------------------------------------------------------------------------------------
+
+    def refresh(self, depth: int) -> None:
+        """Take so many planes of q before and behind the slabs from the lanes beside, and what is around planes."""
+        code, at, W = self.code, self.numbers, self.width
+        full, follows = (code.load(self.address(name), 0, self.bits) for name in ("full", "follows"))
+        distance = code.convert("ptrtoint", self.state, "i64") - self._number("own")
+        sides = [code.address(self._number(name) + distance) for name in ("left", "right")]
+        plane, planes = at["plane"], at["planes"]
+
+        def at_end(x: Value, mask: Value, yes: Value, no: Value, place: Value) -> Value:
+            a, b = (code.load(x, i * plane + place, self.type) for i in (yes, no))
+            return code.select(code.apply("eq", (mask, 0)), b, a)
+
+        self._meet()
+        for f in range(self.stages.fields):
+            x, left, right = (code.at(y, at["vector"] * f + at["low"]) for y in (self.state, *sides))
+            with code.over(depth) as k, code.over(code.op("sdiv", INT, plane, code.constant(W, INT))) as j:
+                last, place, first = planes - 1 - k, j * W, code.constant(-1, INT) - k
+                ends = [at_end(y, full, last, last - 1, place) for y in (x, left)]
+                self._put_ghost(code.shuffle(*ends, [2 * W - 1, *range(W - 1)]), x, first, place)
+                ends = [at_end(y, follows, k, k + 1, place) for y in (x, right)]
+                self._put_ghost(code.shuffle(*ends, list(range(1, W + 1))), x, planes + k, place)
+            if self.n_axes > 1:
+                with code.over(planes + 2 * depth) as k:
+                    self._wrap(code.at(self.vectors["q", f], (k - depth) * plane))
+        self._meet()
+
+    def _put_ghost(self, ghost: Value, x: Value, i: Value, place: Value) -> None:
+        if self.form.boundary[0] == "fixed":
+            ghost = self.within(ghost, self.code.load(self.inside(0), i * self.width, self.bits))
+        self.code.store(ghost, x, i * self.numbers["plane"] + place)
+
+    def _wrap(self, x: Value) -> None:
+        """Copy what is around a plane where its axes are periodic."""
+        rows, places, row = (self.numbers[name] for name in ("rows", "places", "row"))
+        if self.form.boundary[-1] == "periodic":
+            with self.code.over(rows) as r:
+                self._copy_around(self.code.at(x, r * row), self.code.constant(self.width, INT), places)
+        if self.n_axes > 2 and self.form.boundary[1] == "periodic":
+            with self.code.over(places + 2 * self.reach) as j:
+                self._copy_around(self.code.at(x, (j - self.reach) * self.width), row, rows)
+
+    def _copy_around(self, x: Value, distance: Value, n: Value) -> None:
+        with self.code.over(self.reach) as k:
+            for source, target in ((n - 1 - k, self.code.constant(-1, INT) - k), (k, n + k)):
+                self.code.store(self.code.load(x, source * distance, self.type), x, target * distance)
+
+    def _meet(self) -> None:
+        pass
+
+    # places in memory -----------------------------------------------------------------------------------------------
+
+    def inside(self, axis: int) -> Value:
+        return self.address("inside" if axis == 0 else f"inside_{axis}")
+
+    def within(self, x: Value, mask: Value) -> Value:
+        """A number where there are sites, else 0."""
+        return (x.bits & mask).real
+
+    def kept(self, key: Any, slots: int, plane: Value) -> Value:
+        """The plane of a number that passes keep, for so many planes at a time."""
+        slot = self._slot(plane, slots, self.stages.slots * self.reach + self.reach) + self.stages.helpers[key]
+        return self.code.at(self.helpers, slot * self.numbers["plane"] + self.inner)
+
+    def kept_row(self, key: Any, slots: int, row: Value) -> Value:
+        """The row of such a number."""
+        slot = self._slot(row, slots, self.reach) + self.stages.buffers[key]
+        start = self.numbers["plane"] * self.stages.helpers[None] + slot * self.numbers["row"]
+        return self.code.at(self.helpers, start + self.reach * self.width)
+
+    def _slot(self, i: Value, slots: int, before: int) -> Value:
+        return self.code.op("srem", INT, i + slots * before, self.code.constant(slots, INT))
+
+    def place_of(self, key: Any, plane: Value, row: Value) -> Value:
+        """The first place of a row."""
+        distance = row * self.numbers["row"]
+        if key in self.vectors:
+            return self.code.at(self.vectors[key], plane * self.numbers["plane"] + distance)
+        return self.code.at(self.kept(key, self.stages.slots, plane), distance)
+
+    # passes ---------------------------------------------------------------------------------------------------------
+
+    def sweep(self, passes: Sequence[Pass]) -> None:
+        """Execute passes one after the other at each plane, each of them so far behind the one before that it can be."""
+        code, R, m = self.code, self.reach, len(passes)
+        first, planes = -self.form.planes_before(m), self.numbers["planes"]
+        lags = [(m - 1 - k) * R for k in range(m)]
+        if self.n_axes == 1:
+            with code.sweep(code.constant(first, INT), planes, self._at_plane) as sweep:
+                for one, lag in zip(passes, lags, strict=True):
+                    _Place(self, one, sweep, lag).execute()
+            return
+        with code.over(planes - first) as k:
+            for one, lag in zip(passes, lags, strict=True):
+                plane = k + (first + lag)
+                with code.given(code.constant(-lag - R, INT) <= plane):
+                    if self.n_axes > 2:
+                        with code.over(self.numbers["rows"] + R) as r:
+                            self._row(one, plane, r - R)
+                    else:
+                        self._row(one, plane, code.constant(0, INT))
+                    for key in one.site.results:
+                        if key[0] in ("v", "w"):
+                            self._wrap(self.kept(key, self.stages.slots, plane))
+
+    def _row(self, one: Pass, plane: Value, row: Value) -> None:
+        place = _RowPlace(self, one, plane, row)
+        with self.code.sweep(self.code.constant(-self.reach, INT), self.numbers["places"], place.read) as place.sweep:
+            place.execute()
+
+    def _at_plane(self, key: Key, i: Value) -> Value:
+        """What a lattice of one axis reads from memory."""
+        if key == INSIDE:
+            return self.code.load(self.inside(0), i * self.width, self.bits)
+        return self.code.load(self.vectors[key], i * self.width, self.type)
+
+
+INSIDE = ("inside",)
+
+
+class _Place:
+    """A site of a lattice of one axis, at which a pass is executed: at the place `lag` places further on."""
+
+    def __init__(self, scene: _Scene, one: Pass, sweep: Sweep, lag: int) -> None:
+        self.scene, self.one, self.code, self.sweep, self._lag = scene, one, scene.code, sweep, lag
+
+    def execute(self) -> None:
+        """Write the calculations of the bonds that begin at a site, and of the site."""
+        total: dict[int, Value] = {}
+        for axis in range(self.scene.n_axes):
+            for k, law in self.one.bonds.items():
+                for key, x in law(partial(self._of_bond, axis, k)):
+                    if key[0] == "kept":
+                        self.keep((key, axis), x)
+                    elif not (isinstance(x, float) and x == 0):
+                        ahead = self._acting(axis, k, self.code.operand(x, self.scene.type))
+                        change = ahead - self.behind(axis, k, key[1], ahead)
+                        total[key[1]] = total[key[1]] + change if key[1] in total else change
+        with self.stored():
+            for key, x in self.one.site(partial(self._of_site, total)):
+                x = self.code.operand(x, self.scene.type)
+                if key in self.scene.stages.vectors:
+                    self.move(key, x)
+                else:
+                    self.keep(key, x)
+
+    def _of_bond(self, axis: int, k: int, key: Key) -> Any:
+        kind, i = key
+        if kind in self.one.differences:
+            vector = self.one.differences[kind], i
+            return self.get(vector, axis, k) - self.get(vector)
+        return self.get((key, axis)) if kind == "kept" else self._of_site({}, key)
+
+    def _of_site(self, total: dict[int, Value], key: Key) -> Any:
+        if key[0] == "flux":
+            return total.get(key[1], 0.0)
+        found = self.scene.values.get(key)
+        return found if found is not None else self.get(("array", key[1]) if key[0] == "number" else key)
+
+    def _acting(self, axis: int, k: int, x: Value) -> Value:
+        """What a bond does, 0 where a free end leaves it out."""
+        if self.scene.form.boundary[axis] != "free":
+            return x
+        return self.scene.within(x, self.inside(axis, 0) & self.inside(axis, k))
+
+    def _at_wall(self, key: Key, x: Value) -> Value:
+        """Velocities, 0 beyond walls."""
+        if key[0] not in ("v", "w") or self.scene.form.boundary[0] != "fixed":
+            return x
+        return self.scene.within(x, self.inside(0, 0))
+
+    def get(self, key: Any, axis: int = 0, k: int = 0) -> Value:
+        """A number of this site, or of the one so far along an axis."""
+        return self.sweep.get(key, self._lag + k, self.scene.type)
+
+    def inside(self, axis: int, k: int) -> Value:
+        """Where that is a site."""
+        return self.sweep.get(INSIDE, self._lag + k, self.scene.bits)
+
+    def behind(self, axis: int, k: int, f: int, x: Value) -> Value:
+        """Keep what a bond does for the site at its end, and return what the one that ends here does."""
+        key = "flux", self.one.name, k, f
+        self.sweep.put(key, self._lag, x)
+        return self.sweep.get(key, self._lag - k, x.type)
+
+    @contextmanager
+    def stored(self) -> Iterator[None]:
+        """Leave out what would be stored at places before the first one."""
+        if self.one.name in (OPEN, MIDDLE):
+            yield
+            return
+        with self.code.given(self.code.constant(0, INT) <= self.sweep.k):
+            yield
+
+    def move(self, key: Key, x: Value) -> None:
+        self.code.store(x, self.scene.vectors[key], self.sweep.k * self.scene.width)
+
+    def keep(self, key: Any, x: Value) -> None:
+        self.sweep.put(key, self._lag, self._at_wall(key, x))
+
+
+class _RowPlace(_Place):
+    """A site of a lattice of several axes, in a row of a plane."""
+
+    sweep: Sweep
+
+    def __init__(self, scene: _Scene, one: Pass, plane: Value, row: Value) -> None:
+        self.scene, self.one, self.code, self._plane, self._row = scene, one, scene.code, plane, row
+        self._known: dict[Any, Value] = {}
+        code, zero = self.code, scene.code.constant(0, INT)
+        there = zero <= row if one.name in (OPEN, MIDDLE) else (zero <= row) & (zero <= plane)
+        self._first = code.select(there, zero, scene.numbers["places"])
+
+    def _before(self, key: Any, make: Callable[[], Value]) -> Value:
+        """A value that is the same at all places of the row."""
+        if key not in self._known:
+            with self.sweep.before():
+                self._known[key] = make()
+        return self._known[key]
+
+    def _start(self, key: Any, axis: int = 0, k: int = 0) -> Value:
+        plane, row = (self._plane + k, self._row) if axis == 0 else (self._plane, self._row + k)
+        return self._before((key, axis, k), lambda: self.scene.place_of(key, plane, row))
+
+    def read(self, key: Any, j: Value) -> Value:
+        code, scene = self.code, self.scene
+        if key == INSIDE:
+            return code.splat(code.load(scene.inside(scene.n_axes - 1), j, INT), scene.width)
+        return code.load(self._start(*key), j * scene.width, scene.type)
+
+    def get(self, key: Any, axis: int = 0, k: int = 0) -> Value:
+        if axis == self.scene.n_axes - 1 or k == 0:
+            return self.sweep.get((key,), k, self.scene.type)
+        return self.sweep.get((key, axis, k), 0, self.scene.type)
+
+    def inside(self, axis: int, k: int) -> Value:
+        code, scene = self.code, self.scene
+        if axis == scene.n_axes - 1:
+            return self.sweep.get(INSIDE, k, scene.bits)
+
+        def mask() -> Value:
+            if axis == 0:
+                return code.load(scene.inside(0), (self._plane + k) * scene.width, scene.bits)
+            return code.splat(code.load(scene.inside(1), self._row + k, INT), scene.width)
+
+        return self._before((INSIDE, axis, k), mask)
+
+    def behind(self, axis: int, k: int, f: int, x: Value) -> Value:
+        if axis == self.scene.n_axes - 1:
+            key = "flux", k, f
+            self.sweep.put(key, 0, x)
+            return self.sweep.get(key, -k, x.type)
+        name = self.one.name, axis, k, f
+        if axis == 0:
+            start = self._before(name, lambda: self._in_plane(self.scene.kept(name, k, self._plane)))
+        else:
+            start = self._before(name, lambda: self.scene.kept_row(name, k, self._row))
+        place = self.sweep.k * self.scene.width
+        behind = self.code.load(start, place, x.type)
+        self.code.store(x, start, place)
+        return behind
+
+    def _in_plane(self, x: Value) -> Value:
+        return self.code.at(x, self._row * self.scene.numbers["row"])
+
+    @contextmanager
+    def stored(self) -> Iterator[None]:
+        with self.code.given(self._first <= self.sweep.k):
+            yield
+
+    def move(self, key: Key, x: Value) -> None:
+        self.code.store(x, self._start(key), self.sweep.k * self.scene.width)
+
+    def keep(self, key: Any, x: Value) -> None:
+        self.code.store(self._at_wall(key, x), self._start(key), self.sweep.k * self.scene.width)
+
+
+# the places of a lattice --------------------------------------------------------------------------------------------
+
+PAGE, NEAR = 512, 64  # numbers
+
+
+class Slabs:
+    """How the sites of a lattice lie in the memory of pieces, for so many threads.
+
+    Parameters
+    ----------
+    lattice : LatticeHamiltonian
+    stages : LatticeStages
+    order : sequence of int
+        The axes, that of the slabs first.
+    pieces : int
+    """
+
+    def __init__(self, lattice: LatticeHamiltonian, stages: LatticeStages, order: Sequence[int], pieces: int) -> None:
+        form, W, R = stages.form, stages.form.width, stages.form.reach
+        shape, strides = ([sizes[a] for a in order] for sizes in (lattice.shape, _strides(lattice.shape)))
+        n, others = shape[0], shape[1:]
+        bounds = np.arange(pieces * W + 1) * n // (pieces * W)
+        self._starts, self._sizes = bounds[:-1].reshape(pieces, W), np.diff(bounds).reshape(pieces, W)
+        planes, passes = int(self._sizes.max()), form.level + 1
+        before, behind = form.planes_before(passes), passes * R
+        row = (others[-1] + 2 * R) * W if others else W
+        plane = row * (others[0] + 2 * R) if len(others) > 1 else row
+        vector = -(-(before + planes + behind) * plane // 8) * 8
+        if vector > PAGE and min(vector % PAGE, -vector % PAGE) < NEAR:  # two streams so far apart evict each other
+            vector += (NEAR - vector) % PAGE
+        self.size = vector * len(stages.vectors)
+        self.helpers = stages.helpers[None] * plane + stages.buffers[None] * row
+        sizes = planes, others[0] if len(others) > 1 else 1, others[-1] if others else 1
+        self._numbers = [*sizes, vector, plane, row, before * plane, lattice.sites, strides[0]]
+        self._numbers += [strides[1] if len(others) > 1 else 0, strides[-1] if others else 0]
+        full = self._sizes == planes
+        self._full, self._follows = (-x.astype(np.int64) for x in (full, np.roll(full.ravel(), 1).reshape(full.shape)))
+        site = self._starts[:, None] + np.arange(-before, planes + behind)[:, None]  # (pieces, planes, W)
+        around = [np.arange(-R, m + R) for m in others]
+        periodic = [b == "periodic" for b in form.boundary]
+        self._inside = [
+            -(free | (0 <= i) & (i < m)).astype(np.int64)
+            for i, m, free in zip((site, *around), shape, periodic, strict=True)
+        ]
+        index = [
+            i % m if free else i.clip(0, m - 1) for i, m, free in zip((site, *around), shape, periodic, strict=True)
+        ]
+        values, arrays = stages.numbers(lattice)
+        self._values = np.array([*values, 0.0])
+        self._arrays = np.zeros((pieces, len(arrays), vector))
+        for k, array in enumerate(arrays):
+            found = np.broadcast_to(array, lattice.shape).transpose(order)[index[0]]
+            for axis, i in enumerate(index[1:]):
+                found = found.take(i, 3 + axis)
+            self._arrays[:, k, : found[0].size] = np.moveaxis(found, 2, -1).reshape(pieces, -1)
+        self._offset = before * W, *(R for _ in others)
+
+    def contexts(self, rooms: Sequence[int], helpers: Sequence[int], first: Sequence[int], shared: Sequence[int]) -> list[np.ndarray]:
+        """The context of each piece."""
+        found = []
+        for k, room in enumerate(rooms):
+            arrays = self._starts[k], self._sizes[k], self._full[k], self._follows[k]
+            inside = [self._inside[0][k], *self._inside[1:]]
+            places = [x.ctypes.data + 8 * offset for x, offset in zip(inside, self._offset, strict=True)]
+            places += [0] * (3 - len(places))
+            numbers = [room, self.size, *first, *self._numbers, *(x.ctypes.data for x in arrays), *places]
+            numbers += [self._arrays[k].ctypes.data, self._values.ctypes.data, helpers[k]]
+            found.append(np.array([*numbers, rooms[k - 1], rooms[(k + 1) % len(rooms)], *shared], dtype=np.int64))
+            assert len(found[-1]) == len(CONTEXT)
+        return found
+
+
+def _strides(shape: Sequence[int]) -> list[int]:
+    return [int(np.prod(shape[k + 1 :], dtype=np.int64)) for k in range(len(shape))]
