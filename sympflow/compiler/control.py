@@ -345,6 +345,8 @@ class Code:
 
     def shuffle(self, x: Value, y: Value, lanes: Sequence[int]) -> Value:
         """Lanes of x, and behind them those of y, in another order."""
+        if x.type.width == 1:
+            return (x, y)[lanes[0]]
         order = ", ".join(f"i32 {k}" for k in lanes)
         pair = f"{x.type} {x.name}, {y.type} {y.name}"
         return self._new(Type(x.type.scalar, len(lanes)), f"shufflevector {pair}, <{len(lanes)} x i32> <{order}>")

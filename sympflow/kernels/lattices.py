@@ -676,8 +676,11 @@ class _RowPlace(_Place):
         return self._known[key]
 
     def _start(self, key: Any, axis: int = 0, k: int = 0) -> Value:
-        plane, row = (self._plane + k, self._row) if axis == 0 else (self._plane, self._row + k)
-        return self._before((key, axis, k), lambda: self.scene.place_of(key, plane, row))
+        def start() -> Value:
+            plane, row = (self._plane + k, self._row) if axis == 0 else (self._plane, self._row + k)
+            return self.scene.place_of(key, plane, row)
+
+        return self._before((key, axis, k), start)
 
     def read(self, key: Any, j: Value) -> Value:
         code, scene = self.code, self.scene
