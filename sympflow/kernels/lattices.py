@@ -82,8 +82,8 @@ class Form:
         """The longest distance of two ends of a bond."""
         return max(self.lattice.bonds, default=0)
 
-    def planes_before(self, passes: int) -> int:
-        """The planes before a slab from which a stage of so many passes begins."""
+    def before(self, passes: int) -> int:
+        """How far before the first place, or plane, a stage of so many passes begins."""
         return (2 * passes - 1) * self.reach
 
 
@@ -259,7 +259,7 @@ class Pass:
         """The numbers of a site after the pass."""
         fields, name = self._fields, self.name
         terms = self._gradient("site", "site", made, get, c)
-        total = [terms.pop(("flux", f)) - get["flux", f] for f in fields]
+        total = [terms.pop(("flux", f)) + get["flux", f] for f in fields]
         found = {key: made.written(x) for key, x in terms.items()}
         if name == OPEN:
             slopes = [made.written(x) for x in total]
@@ -314,15 +314,18 @@ class Pass:
 # the code of a stage ------------------------------------------------------------------------------------------------
 
 SIZES = ("planes", "rows", "places", "vector", "plane", "row", "low")
-"""Numbers of a context: planes of a slab, rows of a plane, places of a row; how many numbers vectors, planes and rows
-take, and those of a vector before the first plane of a slab."""
+"""Numbers of a context: planes, rows of a plane, places of a row; how many numbers vectors, planes and rows take, and
+those of a vector before the first site."""
 SITES = ("sites", "site_of_plane", "site_of_row", "site_of_place")
 """How many sites there are, and how far apart those of neighbouring planes, rows and places are in a row [q, p]."""
-ADDRESSES = ("starts", "sizes", "full", "follows", "inside", "inside_1", "inside_2", "arrays", "values", "helpers")
-"""Arrays: of each slab its first plane and how many are its own; lanes of slabs whose own planes are all, and of those
-that follow one; where sites are; numbers of sites and of all, and room for what passes keep."""
-SHARED = ("left", "right", "members", "meeting", "stop")
-"""The rooms of pieces beside this one; threads, where they meet, and what ends them."""
+ADDRESSES = ("starts", "sizes", "full", "follows", "inside_0", "inside_1", "inside_2")
+"""Arrays: of each slab its first site and how many are its own; slabs of which all places are their own, and those that
+follow one; and, along each axis, where sites are."""
+ADDRESSES += ("arrays", "values", "helpers")
+"""Numbers of each site and of all, and room for what passes keep."""
+SHARED = ("left", "right", "left_size", "members", "meeting", "stop")
+"""Addresses of the states before and behind this piece, 0 where there are none, and the sites of the last slab before
+it; threads, where they meet, and what ends them."""
 CONTEXT = ("own", "numbers", "row_of_q_p", "row_of_all", "longest", *SIZES, *SITES, *ADDRESSES, *SHARED)
 
 
@@ -389,18 +392,16 @@ class LatticeStages:
         code, at, width = row.code, scene.numbers, self.form.width
         starts, sizes = scene.address("starts"), scene.address("sizes")
         for v, key in enumerate(self.vectors[: len(self.vectors) if whole else 2 * self.fields]):
-            x = scene.vectors[key]
-            first = code.constant(v, INT) * at["sites"]
-            with code.over(code.constant(width, INT)) as lane:
-                start = code.load(starts, lane, INT)
-                planes = at["planes"] if loads else code.load(sizes, lane, INT)
-                with code.over(planes) as i, code.over(at["rows"]) as r, code.over(at["places"]) as j:
-                    place = i * at["plane"] + r * at["row"] + j * width + lane
-                    site = first + (start + i) * at["site_of_plane"] + r * at["site_of_row"] + j * at["site_of_place"]
+            x, first = scene.vectors[key], code.constant(v, INT) * at["sites"]
+            with code.over(at["planes"]) as i, code.over(at["rows"]) as r, code.over(width) as lane:
+                start = first + i * at["site_of_plane"] + r * at["site_of_row"]
+                site, place = code.load(starts, lane, INT) + start, i * at["plane"] + r * at["row"] + lane
+                with code.over(at["places"] if loads else code.load(sizes, lane, INT)) as j:
+                    in_row, in_state = site + j * at["site_of_place"], place + j * width
                     if loads:
-                        code.store(code.load(row, site), x, place)
+                        code.store(code.load(row, in_row), x, in_state)
                     else:
-                        code.store(code.load(x, place), row, site)
+                        code.store(code.load(x, in_state), row, in_row)
 
     def stage(self, values: list[Value], numbers: Callable[[int], Value], kind: Value, step: Value) -> list[Value]:
         """See `sympflow.kernels.runs.Stage`; the values are the addresses of the state and the context."""
@@ -418,32 +419,40 @@ class LatticeStages:
 
 
 class _Scene:
-    """The code of one stage: the numbers and arrays that it reads, and loops over sites."""
+    """The code of one stage: the numbers and arrays that it reads, and loops over sites.
+
+    Attributes
+    ----------
+    numbers : dict of str to Value
+        Those of the context.
+    vectors : dict
+        The addresses of the first site in vectors of the state, and in arrays of sites.
+    values : dict
+        Numbers that are the same at all sites.
+    """
 
     def __init__(self, stages: LatticeStages, state: Value, context: Value, column: Sequence[Value] = ()) -> None:
-        self.stages, self.form, self.code = stages, stages.form, state.code
-        self.state, self._context = state, context
+        self.stages, self.form, self.code, self._context = stages, stages.form, state.code, context
         self.n_axes, self.reach, self.width = len(self.form.boundary), self.form.reach, self.form.width
         self.type, self.bits = Type("double", self.width), Type("i64", self.width)
+        code, width = self.code, self.width
         self.numbers = {name: self._number(name) for name in (*SIZES, *SITES)}
-        inner = self.numbers["row"] * self.reach if self.n_axes > 2 else 0
-        self.inner = inner + self.reach * self.width if self.n_axes > 1 else 0
-        self.origin = self.numbers["low"] + self.inner
-        self.vectors: dict[Key, Value] = {key: self.code.at(self.vector(key), self.origin) for key in stages.vectors}
+        vector, low = self.numbers["vector"], self.numbers["low"]
+        self.vectors = {key: code.at(state, vector * i + low) for i, key in enumerate(stages.vectors)}
         if not column:
             return
-        arrays = self.address("arrays")
-        self.vectors |= {
-            ("array", name): self.code.at(arrays, self.numbers["vector"] * i + self.origin)
-            for i, name in enumerate(stages.arrays)
-        }
-        values = self.address("values")
-        self.values: dict[Key, Value] = {
-            ("column", name): self.code.splat(x, self.width) for name, x in zip(self.form.column, column, strict=True)
-        }
-        for i, name in enumerate(stages.values):
-            self.values["number", name] = self.code.splat(self.code.load(values, i), self.width)
+        arrays, values = self.address("arrays"), self.address("values")
+        self.vectors |= {("array", name): code.at(arrays, vector * i + low) for i, name in enumerate(stages.arrays)}
+        self.values = {
+            ("column", name): code.splat(x, width) for name, x in zip(self.form.column, column, strict=True)
+        } | {("number", name): code.splat(code.load(values, i), width) for i, name in enumerate(stages.values)}
         self.helpers = self.address("helpers")
+        self._full, self._follows = (
+            code.apply("lt", (code.load(self.address(name), 0, self.bits), 0)) for name in ("full", "follows")
+        )
+        distance = code.convert("ptrtoint", state, "i64") - self._number("own")
+        self._sides = {name: self._number(name) for name in ("left", "right")}
+        self._beside = {name: code.address(x + distance) for name, x in self._sides.items()}
 
     def _number(self, name: str) -> Value:
         return self.code.load(self._context, CONTEXT.index(name), INT)
@@ -451,56 +460,86 @@ class _Scene:
     def address(self, name: str) -> Value:
         return self.code.address(self._number(name))
 
-    def vector(self, key: Key) -> Value:
-        return self.code.at(self.state, self.numbers["vector"] * self.stages.vectors.index(key))
-
     # ghosts ---------------------------------------------------------------------------------------------------------
 
     def refresh(self, depth: int) -> None:
-        """Take so many planes of q before and behind the slabs from the lanes beside, and what is around planes."""
-        code, at, W = self.code, self.numbers, self.width
-        full, follows = (code.load(self.address(name), 0, self.bits) for name in ("full", "follows"))
-        distance = code.convert("ptrtoint", self.state, "i64") - self._number("own")
-        sides = [code.address(self._number(name) + distance) for name in ("left", "right")]
-        plane, planes = at["plane"], at["planes"]
-
-        def at_end(x: Value, mask: Value, yes: Value, no: Value, place: Value) -> Value:
-            a, b = (code.load(x, i * plane + place, self.type) for i in (yes, no))
-            return code.select(code.apply("eq", (mask, 0)), b, a)
-
+        """Take what stands before and behind slabs and planes of q from where these are."""
+        if not depth:
+            return
+        code, at = self.code, self.numbers
         self._meet()
         for f in range(self.stages.fields):
-            x, left, right = (code.at(y, at["vector"] * f + at["low"]) for y in (self.state, *sides))
-            with code.over(depth) as k, code.over(code.op("sdiv", INT, plane, code.constant(W, INT))) as j:
-                last, place, first = planes - 1 - k, j * W, code.constant(-1, INT) - k
-                ends = [at_end(y, full, last, last - 1, place) for y in (x, left)]
-                self._put_ghost(code.shuffle(*ends, [2 * W - 1, *range(W - 1)]), x, first, place)
-                ends = [at_end(y, follows, k, k + 1, place) for y in (x, right)]
-                self._put_ghost(code.shuffle(*ends, list(range(1, W + 1))), x, planes + k, place)
-            if self.n_axes > 1:
-                with code.over(planes + 2 * depth) as k:
-                    self._wrap(code.at(self.vectors["q", f], (k - depth) * plane))
+            x = self.vectors["q", f]
+            if self.n_axes == 1:
+                self._ghosts(x, depth)
+                self._ghosts_of_pieces(f, depth)
+                continue
+            length, x = at["plane"] * depth, self.vectors["q", f]
+            with code.given(~code.apply("eq", (self._sides["left"], 0))):
+                last = self._of_piece("left", f, (self._number("left_size") - depth) * at["plane"])
+                self._copy(last, code.at(x, -length), length)
+            with code.given(~code.apply("eq", (self._sides["right"], 0))):
+                self._copy(self._of_piece("right", f, 0), code.at(x, at["planes"] * at["plane"]), length)
+            with code.over(at["planes"] + 2 * depth) as i:
+                self.around(code.at(x, (i - depth) * at["plane"]))
         self._meet()
 
-    def _put_ghost(self, ghost: Value, x: Value, i: Value, place: Value) -> None:
-        if self.form.boundary[0] == "fixed":
-            ghost = self.within(ghost, self.code.load(self.inside(0), i * self.width, self.bits))
-        self.code.store(ghost, x, i * self.numbers["plane"] + place)
+    def around(self, x: Value) -> None:
+        """What stands around a plane."""
+        code, (rows, row) = self.code, (self.numbers[name] for name in ("rows", "row"))
+        if self.n_axes == 2:
+            self._ghosts(x, self.reach)
+            return
+        if self.form.boundary[1] == "periodic":
+            length = row * self.reach
+            self._copy(code.at(x, (rows - self.reach) * row), code.at(x, -length), length)
+            self._copy(x, code.at(x, rows * row), length)
+        with code.over(rows) as r:
+            self._ghosts(code.at(x, r * row), self.reach)
 
-    def _wrap(self, x: Value) -> None:
-        """Copy what is around a plane where its axes are periodic."""
-        rows, places, row = (self.numbers[name] for name in ("rows", "places", "row"))
-        if self.form.boundary[-1] == "periodic":
-            with self.code.over(rows) as r:
-                self._copy_around(self.code.at(x, r * row), self.code.constant(self.width, INT), places)
-        if self.n_axes > 2 and self.form.boundary[1] == "periodic":
-            with self.code.over(places + 2 * self.reach) as j:
-                self._copy_around(self.code.at(x, (j - self.reach) * self.width), row, rows)
+    def _copy(self, source: Value, target: Value, length: Value) -> None:
+        with self.code.over(self.code.op("sdiv", INT, length, self.code.constant(self.width, INT))) as k:
+            self.code.store(self.code.load(source, k * self.width, self.type), target, k * self.width)
 
-    def _copy_around(self, x: Value, distance: Value, n: Value) -> None:
-        with self.code.over(self.reach) as k:
-            for source, target in ((n - 1 - k, self.code.constant(-1, INT) - k), (k, n + k)):
-                self.code.store(self.code.load(x, source * distance, self.type), x, target * distance)
+    def _ghosts(self, x: Value, depth: int) -> None:
+        """Places before and behind the slabs of a row, taken from the lanes beside."""
+        code, places, W = self.code, self.numbers["places"], self.width
+
+        def ends(k: Value) -> None:
+            for chosen, yes, no, order, at in (
+                (self._full, places - 1 - k, places - 2 - k, [W - 1, *range(W - 1)], code.constant(-1, INT) - k),
+                (self._follows, k, k + 1, [*range(1, W), 0], places + k),
+            ):
+                a, b = (code.load(x, i * W, self.type) for i in (yes, no))
+                ghost = code.select(chosen, a, b)
+                ghost = code.shuffle(ghost, ghost, order)
+                if self.form.boundary[-1] == "fixed":
+                    ghost = self.within(ghost, code.load(self.inside(self.n_axes - 1), at * W, self.bits))
+                code.store(ghost, x, at * W)
+
+        if depth <= FEW:
+            for k in range(depth):
+                ends(code.constant(k, INT))
+        else:
+            with code.over(depth) as k:
+                ends(k)
+
+    def _ghosts_of_pieces(self, f: int, depth: int) -> None:
+        """The same of the first slab and the last one, taken from other pieces."""
+        code, places, W, x = self.code, self.numbers["places"], self.width, self.vectors["q", f]
+        own_size = code.load(self.address("sizes"), W - 1, INT)
+        for side, first, other, lane, at in (
+            ("left", self._number("left_size") - 1, -1, W - 1, code.constant(-1, INT)),
+            ("right", places - own_size, 1, 0, places),
+        ):
+            with code.given(~code.apply("eq", (self._sides[side], 0))):
+                beside = self._of_piece(side, f, 0)
+                with code.over(depth) as k:
+                    number = code.load(beside, (first + k * other) * W + lane)
+                    code.store(number, x, (at + k * other) * W + (W - 1 - lane))
+
+    def _of_piece(self, side: str, f: int, distance: Any) -> Value:
+        return self.code.at(self._beside[side], self.numbers["vector"] * f + self.numbers["low"] + distance)
 
     def _meet(self) -> None:
         pass
@@ -508,71 +547,73 @@ class _Scene:
     # places in memory -----------------------------------------------------------------------------------------------
 
     def inside(self, axis: int) -> Value:
-        return self.address("inside" if axis == 0 else f"inside_{axis}")
+        return self.address(f"inside_{axis}")
 
     def within(self, x: Value, mask: Value) -> Value:
         """A number where there are sites, else 0."""
         return (x.bits & mask).real
 
+    def place_of(self, key: Any, plane: Value, row: Value) -> Value:
+        """The address of the first place of a row, of a number that is in memory."""
+        at = self.numbers
+        if key in self.vectors:
+            return self.code.at(self.vectors[key], plane * at["plane"] + row * at["row"])
+        return self.code.at(self.kept(key, self.stages.slots, plane), row * at["row"])
+
     def kept(self, key: Any, slots: int, plane: Value) -> Value:
-        """The plane of a number that passes keep, for so many planes at a time."""
-        slot = self._slot(plane, slots, self.stages.slots * self.reach + self.reach) + self.stages.helpers[key]
-        return self.code.at(self.helpers, slot * self.numbers["plane"] + self.inner)
+        """The address of a plane of a number that passes keep, so many planes at a time."""
+        slot = self._slot(plane, slots) + self.stages.helpers[key]
+        inner = self.numbers["row"] * self.reach if self.n_axes > 2 else 0
+        return self.code.at(self.helpers, slot * self.numbers["plane"] + (self.reach * self.width + inner))
 
     def kept_row(self, key: Any, slots: int, row: Value) -> Value:
-        """The row of such a number."""
-        slot = self._slot(row, slots, self.reach) + self.stages.buffers[key]
+        """The address of a row of such a number."""
+        slot = self._slot(row, slots) + self.stages.buffers[key]
         start = self.numbers["plane"] * self.stages.helpers[None] + slot * self.numbers["row"]
         return self.code.at(self.helpers, start + self.reach * self.width)
 
-    def _slot(self, i: Value, slots: int, before: int) -> Value:
-        return self.code.op("srem", INT, i + slots * before, self.code.constant(slots, INT))
-
-    def place_of(self, key: Any, plane: Value, row: Value) -> Value:
-        """The first place of a row."""
-        distance = row * self.numbers["row"]
-        if key in self.vectors:
-            return self.code.at(self.vectors[key], plane * self.numbers["plane"] + distance)
-        return self.code.at(self.kept(key, self.stages.slots, plane), distance)
+    def _slot(self, i: Value, slots: int) -> Value:
+        before = slots * (self.stages.slots + 1) * self.reach
+        return self.code.op("srem", INT, i + before, self.code.constant(slots, INT))
 
     # passes ---------------------------------------------------------------------------------------------------------
 
     def sweep(self, passes: Sequence[Pass]) -> None:
         """Execute passes one after the other at each plane, each of them so far behind the one before that it can be."""
-        code, R, m = self.code, self.reach, len(passes)
-        first, planes = -self.form.planes_before(m), self.numbers["planes"]
-        lags = [(m - 1 - k) * R for k in range(m)]
+        code, R, m, at = self.code, self.reach, len(passes), self.numbers
+        first, lags = -self.form.before(m), [(m - 1 - k) * R for k in range(m)]
         if self.n_axes == 1:
-            with code.sweep(code.constant(first, INT), planes, self._at_plane) as sweep:
+            with code.sweep(code.constant(first, INT), at["places"], self._at_place) as sweep:
                 for one, lag in zip(passes, lags, strict=True):
                     _Place(self, one, sweep, lag).execute()
             return
-        with code.over(planes - first) as k:
+        with code.over(at["planes"] - first) as k:
             for one, lag in zip(passes, lags, strict=True):
                 plane = k + (first + lag)
                 with code.given(code.constant(-lag - R, INT) <= plane):
                     if self.n_axes > 2:
-                        with code.over(self.numbers["rows"] + R) as r:
-                            self._row(one, plane, r - R)
+                        with code.over(at["rows"] + R) as r:
+                            self._row(one, plane, lag, r - R)
                     else:
-                        self._row(one, plane, code.constant(0, INT))
+                        self._row(one, plane, lag, code.constant(0, INT))
                     for key in one.site.results:
                         if key[0] in ("v", "w"):
-                            self._wrap(self.kept(key, self.stages.slots, plane))
+                            self.around(self.kept(key, self.stages.slots, plane))
 
-    def _row(self, one: Pass, plane: Value, row: Value) -> None:
-        place = _RowPlace(self, one, plane, row)
+    def _row(self, one: Pass, plane: Value, lag: int, row: Value) -> None:
+        place = _RowPlace(self, one, plane, lag, row)
         with self.code.sweep(self.code.constant(-self.reach, INT), self.numbers["places"], place.read) as place.sweep:
             place.execute()
 
-    def _at_plane(self, key: Key, i: Value) -> Value:
-        """What a lattice of one axis reads from memory."""
+    def _at_place(self, key: Key, i: Value) -> Value:
+        """Read a number of a lattice of one axis."""
         if key == INSIDE:
             return self.code.load(self.inside(0), i * self.width, self.bits)
         return self.code.load(self.vectors[key], i * self.width, self.type)
 
 
 INSIDE = ("inside",)
+FEW = 4
 
 
 class _Place:
@@ -591,7 +632,7 @@ class _Place:
                         self.keep((key, axis), x)
                     elif not (isinstance(x, float) and x == 0):
                         ahead = self._acting(axis, k, self.code.operand(x, self.scene.type))
-                        change = ahead - self.behind(axis, k, key[1], ahead)
+                        change = self.behind(axis, k, key[1], ahead) - ahead
                         total[key[1]] = total[key[1]] + change if key[1] in total else change
         with self.stored():
             for key, x in self.one.site(partial(self._of_site, total)):
@@ -620,7 +661,7 @@ class _Place:
             return x
         return self.scene.within(x, self.inside(axis, 0) & self.inside(axis, k))
 
-    def _at_wall(self, key: Key, x: Value) -> Value:
+    def at_wall(self, key: Key, x: Value) -> Value:
         """Velocities, 0 beyond walls."""
         if key[0] not in ("v", "w") or self.scene.form.boundary[0] != "fixed":
             return x
@@ -653,7 +694,7 @@ class _Place:
         self.code.store(x, self.scene.vectors[key], self.sweep.k * self.scene.width)
 
     def keep(self, key: Any, x: Value) -> None:
-        self.sweep.put(key, self._lag, self._at_wall(key, x))
+        self.sweep.put(key, self._lag, self.at_wall(key, x))
 
 
 class _RowPlace(_Place):
@@ -661,12 +702,12 @@ class _RowPlace(_Place):
 
     sweep: Sweep
 
-    def __init__(self, scene: _Scene, one: Pass, plane: Value, row: Value) -> None:
+    def __init__(self, scene: _Scene, one: Pass, plane: Value, lag: int, row: Value) -> None:
         self.scene, self.one, self.code, self._plane, self._row = scene, one, scene.code, plane, row
         self._known: dict[Any, Value] = {}
-        code, zero = self.code, scene.code.constant(0, INT)
-        there = zero <= row if one.name in (OPEN, MIDDLE) else (zero <= row) & (zero <= plane)
-        self._first = code.select(there, zero, scene.numbers["places"])
+        zero = self.code.constant(0, INT)
+        there = (zero <= row) & (zero <= plane + lag)
+        self._first = self.code.select(there, zero, scene.numbers["places"])
 
     def _before(self, key: Any, make: Callable[[], Value]) -> Value:
         """A value that is the same at all places of the row."""
@@ -685,7 +726,7 @@ class _RowPlace(_Place):
     def read(self, key: Any, j: Value) -> Value:
         code, scene = self.code, self.scene
         if key == INSIDE:
-            return code.splat(code.load(scene.inside(scene.n_axes - 1), j, INT), scene.width)
+            return code.load(scene.inside(scene.n_axes - 1), j * scene.width, scene.bits)
         return code.load(self._start(*key), j * scene.width, scene.type)
 
     def get(self, key: Any, axis: int = 0, k: int = 0) -> Value:
@@ -699,9 +740,8 @@ class _RowPlace(_Place):
             return self.sweep.get(INSIDE, k, scene.bits)
 
         def mask() -> Value:
-            if axis == 0:
-                return code.load(scene.inside(0), (self._plane + k) * scene.width, scene.bits)
-            return code.splat(code.load(scene.inside(1), self._row + k, INT), scene.width)
+            place = (self._plane, self._row)[axis] + k
+            return code.splat(code.load(scene.inside(axis), place, INT), scene.width)
 
         return self._before((INSIDE, axis, k), mask)
 
@@ -732,7 +772,7 @@ class _RowPlace(_Place):
         self.code.store(x, self._start(key), self.sweep.k * self.scene.width)
 
     def keep(self, key: Any, x: Value) -> None:
-        self.code.store(self._at_wall(key, x), self._start(key), self.sweep.k * self.scene.width)
+        self.code.store(self.at_wall(key, x), self._start(key), self.sweep.k * self.scene.width)
 
 
 # the places of a lattice --------------------------------------------------------------------------------------------
@@ -743,68 +783,90 @@ PAGE, NEAR = 512, 64  # numbers
 class Slabs:
     """How the sites of a lattice lie in the memory of pieces, for so many threads.
 
+    Pieces have so many planes each; of a lattice of one axis so many slabs.
+
     Parameters
     ----------
     lattice : LatticeHamiltonian
     stages : LatticeStages
     order : sequence of int
-        The axes, that of the slabs first.
+        The axes, that of the slabs last.
     pieces : int
     """
 
     def __init__(self, lattice: LatticeHamiltonian, stages: LatticeStages, order: Sequence[int], pieces: int) -> None:
-        form, W, R = stages.form, stages.form.width, stages.form.reach
+        form, W, R, one_axis = stages.form, stages.form.width, stages.form.reach, len(order) == 1
         shape, strides = ([sizes[a] for a in order] for sizes in (lattice.shape, _strides(lattice.shape)))
-        n, others = shape[0], shape[1:]
-        bounds = np.arange(pieces * W + 1) * n // (pieces * W)
-        self._starts, self._sizes = bounds[:-1].reshape(pieces, W), np.diff(bounds).reshape(pieces, W)
-        planes, passes = int(self._sizes.max()), form.level + 1
-        before, behind = form.planes_before(passes), passes * R
-        row = (others[-1] + 2 * R) * W if others else W
-        plane = row * (others[0] + 2 * R) if len(others) > 1 else row
-        vector = -(-(before + planes + behind) * plane // 8) * 8
+        slabs = np.arange(W * (pieces if one_axis else 1) + 1) * shape[-1] // (W * (pieces if one_axis else 1))
+        starts, sizes = slabs[:-1].reshape(-1, W), np.diff(slabs).reshape(-1, W)
+        bounds = np.zeros(2, dtype=int) if one_axis else np.arange(pieces + 1) * shape[0] // pieces
+        places, depth, outer = int(sizes.max()), (form.level + 1) * R, shape[:-1]
+        ends = (form.before(form.level + 1), depth) if one_axis else (R, R)
+        row = (ends[0] + places + ends[1]) * W
+        plane = row * (shape[1] + 2 * R) if len(order) > 2 else row
+        planes = int(np.diff(bounds).max()) + 2 * depth if outer else 1
+        vector = -(-planes * plane // 8) * 8
         if vector > PAGE and min(vector % PAGE, -vector % PAGE) < NEAR:  # two streams so far apart evict each other
             vector += (NEAR - vector) % PAGE
         self.size = vector * len(stages.vectors)
         self.helpers = stages.helpers[None] * plane + stages.buffers[None] * row
-        sizes = planes, others[0] if len(others) > 1 else 1, others[-1] if others else 1
-        self._numbers = [*sizes, vector, plane, row, before * plane, lattice.sites, strides[0]]
-        self._numbers += [strides[1] if len(others) > 1 else 0, strides[-1] if others else 0]
-        full = self._sizes == planes
-        self._full, self._follows = (-x.astype(np.int64) for x in (full, np.roll(full.ravel(), 1).reshape(full.shape)))
-        site = self._starts[:, None] + np.arange(-before, planes + behind)[:, None]  # (pieces, planes, W)
-        around = [np.arange(-R, m + R) for m in others]
-        periodic = [b == "periodic" for b in form.boundary]
-        self._inside = [
-            -(free | (0 <= i) & (i < m)).astype(np.int64)
-            for i, m, free in zip((site, *around), shape, periodic, strict=True)
-        ]
-        index = [
-            i % m if free else i.clip(0, m - 1) for i, m, free in zip((site, *around), shape, periodic, strict=True)
-        ]
+        low = ends[0] * W + (R * row if len(order) > 2 else 0) + (depth * plane if outer else 0)
+        full, periodic = sizes == places, [b == "periodic" for b in form.boundary]
+        follows = np.roll(full.ravel(), 1).reshape(full.shape)
         values, arrays = stages.numbers(lattice)
         self._values = np.array([*values, 0.0])
-        self._arrays = np.zeros((pieces, len(arrays), vector))
-        for k, array in enumerate(arrays):
-            found = np.broadcast_to(array, lattice.shape).transpose(order)[index[0]]
-            for axis, i in enumerate(index[1:]):
-                found = found.take(i, 3 + axis)
-            self._arrays[:, k, : found[0].size] = np.moveaxis(found, 2, -1).reshape(pieces, -1)
-        self._offset = before * W, *(R for _ in others)
+        distances = [strides[0] if outer else 0, strides[1] if len(order) > 2 else 0, strides[-1]]
+        self._pieces, self._closed = list[_Piece](), periodic[0] and not (one_axis and pieces == 1)
+        for k in range(pieces):
+            mine = k if one_axis else 0
+            first, n_planes = int(bounds[k if outer else 0]), int(bounds[k + 1] - bounds[k]) if outer else 1
+            sites = [np.arange(-d, n + d) for d, n in zip((depth, R), (n_planes, *shape[1:-1]), strict=False)][: len(outer)]
+            if outer:
+                sites[0] = sites[0] + first
+            sites.append(starts[mine] + np.arange(-ends[0], places + ends[1])[:, None])
+            inside = [-(p | (0 <= i) & (i < n)).astype(np.int64) for i, n, p in zip(sites, shape, periodic, strict=True)]
+            index = [i % n if p else i.clip(0, n - 1) for i, n, p in zip(sites, shape, periodic, strict=True)]
+            own = np.zeros((len(arrays), vector))
+            for x, array in zip(own, arrays, strict=True):
+                found = np.broadcast_to(array, lattice.shape).transpose(order)
+                for axis, i in enumerate(index):
+                    found = found.take(i, axis)
+                x[: found.size] = found.ravel()
+            masks = [-x[mine].astype(np.int64) for x in (full, follows)]
+            offsets = [depth, R][: len(outer)] + [ends[0] * W]
+            numbers = [n_planes, shape[1] if len(order) > 2 else 1, places, vector, plane, row, low, lattice.sites]
+            numbers += [*distances]
+            size = n_planes if outer else int(sizes[mine, -1])
+            self._pieces.append(_Piece(first, numbers, [starts[mine] * strides[-1], sizes[mine], *masks], inside, offsets, own, size))
+        self._distance = distances[0]
 
-    def contexts(self, rooms: Sequence[int], helpers: Sequence[int], first: Sequence[int], shared: Sequence[int]) -> list[np.ndarray]:
-        """The context of each piece."""
+    def contexts(
+        self, rooms: Sequence[int], helpers: Sequence[int], first: Sequence[int], shared: Sequence[int]
+    ) -> list[np.ndarray]:
+        """The numbers of `CONTEXT` of each piece: of the addresses of their states and helpers, and others."""
         found = []
-        for k, room in enumerate(rooms):
-            arrays = self._starts[k], self._sizes[k], self._full[k], self._follows[k]
-            inside = [self._inside[0][k], *self._inside[1:]]
-            places = [x.ctypes.data + 8 * offset for x, offset in zip(inside, self._offset, strict=True)]
+        for k, (piece, room) in enumerate(zip(self._pieces, rooms, strict=True)):
+            before, behind = k > 0 or self._closed, k + 1 < len(rooms) or self._closed
+            places = [x.ctypes.data + 8 * offset for x, offset in zip(piece.inside, piece.offsets, strict=True)]
             places += [0] * (3 - len(places))
-            numbers = [room, self.size, *first, *self._numbers, *(x.ctypes.data for x in arrays), *places]
-            numbers += [self._arrays[k].ctypes.data, self._values.ctypes.data, helpers[k]]
-            found.append(np.array([*numbers, rooms[k - 1], rooms[(k + 1) % len(rooms)], *shared], dtype=np.int64))
-            assert len(found[-1]) == len(CONTEXT)
+            numbers = [room, self.size, *first, *piece.numbers, *(x.ctypes.data for x in piece.arrays), *places]
+            numbers += [piece.sites.ctypes.data, self._values.ctypes.data, helpers[k]]
+            numbers += [rooms[k - 1] if before else 0, rooms[(k + 1) % len(rooms)] if behind else 0]
+            found.append(np.array([*numbers, self._pieces[k - 1].size, *shared], dtype=np.int64))
         return found
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One piece: its first plane; and what stands in its context."""
+
+    first: int
+    numbers: list[int]
+    arrays: list[np.ndarray]
+    inside: list[np.ndarray]
+    offsets: list[int]
+    sites: np.ndarray
+    size: int
 
 
 def _strides(shape: Sequence[int]) -> list[int]:
