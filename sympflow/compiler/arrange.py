@@ -85,6 +85,8 @@ class Arrangement:
         Names of what does not change in a run.
     expand : bool
         False leaves products of sums (`times`) as they are.
+    squares : bool
+        True takes out squares first, which several polynomials may share, where that costs as much.
 
     Attributes
     ----------
@@ -92,8 +94,14 @@ class Arrangement:
         The numbers, to be calculated with.
     """
 
-    def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = (), expand: bool = True) -> None:
-        self._expand = expand
+    def __init__(
+        self,
+        states: Sequence[tuple[str, int]],
+        constants: Sequence[str] = (),
+        expand: bool = True,
+        squares: bool = False,
+    ) -> None:
+        self._expand, self._squares = expand, squares
         self._table, self._body = Recording(), Recording()
         self._constants = [self._table.input(name) for name in constants]
         self._known: dict[int, int] = {}
@@ -276,7 +284,7 @@ class Arrangement:
                     for y, _ in m[i + 1 :]:
                         counts[(x, 1), (y, 1)] = counts.get(((x, 1), (y, 1)), 0) + 1
         if few:
-            return list(counts)
+            return sorted(counts, key=lambda m: -m[0][1]) if self._squares else list(counts)
         return sorted((m for m in counts if m[0][1] == 1), key=lambda m: -counts[m])[:1]
 
     def _nested(self, terms: Terms, factor: Monomial) -> Iterator[Plan]:

@@ -29,8 +29,6 @@ __all__ = ["Form", "LatticeStages"]
 
 Key = tuple[Any, ...]
 """A number of a site: its kind, and which one of these."""
-COSTLY = FUNCTIONS["div"].cost
-"""The cost of an operation from which second derivatives of U are kept, and not computed again."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +107,13 @@ class Law:
 
     def __init__(self, lattice: LatticeHamiltonian, keys: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> None:
         states = [(f"{kind}{i}", ALWAYS if kind == "column" else 0) for kind, i in keys]
-        made = Arrangement(states, [s.name for s in lattice.c])
-        found = outputs(made, dict(zip(keys, made.states, strict=True)), made.constants)
+        shapes = []
+        for squares in (False, True):
+            made = Arrangement(states, [s.name for s in lattice.c], squares=squares)
+            found = outputs(made, dict(zip(keys, made.states, strict=True)), made.constants)
+            shapes.append(made.finish(list(found.values())))
         self._keys, self.results = keys, list(found)
-        self.table, self._body = made.finish(list(found.values()))
+        self.table, self._body = min(shapes, key=lambda shape: len(shape.body))
         used = {x.order for x in reached(self._body.outputs)}
         self._reads = [x.order in used for x in self._body.inputs]
         self.numbers = [_formula(x) for x in self.table.outputs]
@@ -127,6 +128,12 @@ def _formula(x: Any) -> str:
     if not isinstance(x, Traced):
         return repr(x)
     return f"{x.name}({', '.join(map(_formula, x.args))})" if x.name != "input" else str(x.args[0])
+
+
+def _is_costly(x: Traced) -> bool:
+    if x.name == "pow" and isinstance(x.args[1], float) and x.args[1] % 1 == 0:
+        return False
+    return x.name in FUNCTIONS and FUNCTIONS[x.name].cost >= FUNCTIONS["div"].cost
 
 
 class Potential:
@@ -157,9 +164,7 @@ class Potential:
         found: dict[int, int] = {}
         for k, f in enumerate(self.bends.outputs):
             needs = reached([f])
-            if {x.order for x in self.x} & {x.order for x in needs} and (
-                not costly or any(x.name in FUNCTIONS and FUNCTIONS[x.name].cost >= COSTLY for x in needs)
-            ):
+            if {x.order for x in self.x} & {x.order for x in needs} and (not costly or any(map(_is_costly, needs))):
                 found.setdefault(f.order, k)
         return list(found.values())
 
@@ -574,7 +579,7 @@ class _Scene:
 
     def _slot(self, i: Value, slots: int) -> Value:
         before = slots * (self.stages.slots + 1) * self.reach
-        return self.code.op("srem", INT, i + before, self.code.constant(slots, INT))
+        return self.code.op("urem", INT, i + before, self.code.constant(slots, INT))
 
     # passes ---------------------------------------------------------------------------------------------------------
 
