@@ -19,7 +19,7 @@ from sympflow.compiler.program import Program, Recording, Traced
 __all__ = ["Arranged", "Arrangement"]
 
 MOST_TERMS = 64  # of a product that is multiplied out
-MOST_TRIED = 12  # terms of a polynomial for which all ways to nest it are compared
+MOST_TRIED = 10  # terms of a polynomial for which all ways to nest it are compared
 
 Monomial = tuple[tuple[int, int], ...]
 """Letters, by their order in the recording, with their exponents; sorted."""

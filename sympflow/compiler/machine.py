@@ -14,7 +14,7 @@ import llvmlite.binding as llvm
 
 from sympflow.compiler import elementary  # noqa: F401  (code of functions, which texts are made of)
 
-__all__ = ["Host", "compiled", "host"]
+__all__ = ["Host", "address", "compiled", "host"]
 
 
 class Host(NamedTuple):
@@ -80,6 +80,17 @@ def compiled(text: str, name: str, signature: Any) -> Any:
                 _store(key, code)
             engine = _LOADED[key] = _engine(code)
     return signature(engine.get_function_address(name))
+
+
+def address(array: Any) -> int:
+    """Return where the numbers of a NumPy array lie in memory."""
+    try:
+        return ctypes.addressof(_BYTE(array))  # a fifth of the time of what follows
+    except (TypeError, ValueError):  # read-only, not contiguous, or empty
+        return int(array.ctypes.data)
+
+
+_BYTE = ctypes.c_char.from_buffer
 
 
 def _object_code(text: str) -> bytes:

@@ -96,6 +96,9 @@ def _product(a: Any, b: Any) -> Any:
                 return -y
             if isinstance(y, Traced) and y.name == "neg":
                 return -x * y.args[0]
+            factor = y.args[0] if isinstance(y, Traced) and y.name == "mul" else None
+            if isinstance(factor, float) and (_halves(x) or _halves(factor)):  # exact
+                return (x * factor) * y.args[1]
         if isinstance(x, Traced) and x.name == "neg":
             return -(x.args[0] * y)
     return None
@@ -103,7 +106,7 @@ def _product(a: Any, b: Any) -> Any:
 
 def _quotient(a: Any, b: Any) -> Any:
     if isinstance(b, float) and b != 0:
-        return a * (1.0 / b) if math.frexp(b)[0] in (0.5, -0.5) else None  # exact
+        return a * (1.0 / b) if _halves(b) else None  # exact
     return 0.0 if _is(a, 0.0) else None
 
 
@@ -120,9 +123,9 @@ def _power(x: Any, n: Any) -> Any:
         return 1.0 / x
     if n == 0.5:
         return apply("sqrt", x)
-    if n % 1 == 0.5 and abs(n) <= MOST_ROOTS:  # of the root or its reciprocal, which other powers share
+    if n % 1 == 0.5 and abs(n) <= MOST_ROOTS:  # of the root, and of the reciprocal, which need not wait for it
         root = apply("sqrt", x)
-        return (root if n > 0 else 1.0 / root) ** abs(2 * n)
+        return root ** (2 * n) if n > 0 else root * (1.0 / x) ** (0.5 - n)
     return (1.0 / x) ** -n if n < 0 and n % 1 == 0 else None
 
 
@@ -149,6 +152,11 @@ _SIMPLER: dict[str, Callable[..., Any]] = {
     "fma": _fused,
     "where": _choice,
 }
+
+
+def _halves(x: float) -> bool:
+    """True of a power of two, with which products are exact."""
+    return math.frexp(x)[0] in (0.5, -0.5)
 
 
 def _is(x: Any, value: float) -> bool:

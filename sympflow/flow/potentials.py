@@ -27,8 +27,8 @@ from sympflow.lazy import announced, distribution, load_announced
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from importlib.metadata import EntryPoint
 
-    from sympflow.kernels.network_loops import NetworkLayer
     from sympflow.kernels.network_tangents import TrainedNetwork
+    from sympflow.kernels.networks import NetworkLayer
 
 Time = float | Tensor
 
@@ -518,7 +518,7 @@ class MLPPotential(Potential):
         return K, k, list(self.biases), list(self.weights), w
 
     def network(self, is_kick: bool) -> NetworkLayer:
-        from sympflow.kernels.network_loops import NetworkLayer
+        from sympflow.kernels.networks import NetworkLayer
 
         K, k, b, W, w = self.folded()
 
@@ -530,9 +530,10 @@ class MLPPotential(Potential):
         return NetworkLayer(*first, biases, weights, array(w), self._sigma.compiled)
 
     def trained(self) -> TrainedNetwork | None:
-        from sympflow.kernels.network_tangents import BENDING, TrainedNetwork
+        from sympflow.kernels.activations import SLOPES
+        from sympflow.kernels.network_tangents import TrainedNetwork
 
-        if self.activation not in BENDING or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
+        if self.activation not in SLOPES or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
             return None
         inner = [*self.biases, *self.weights]
         units = [1 / self.scale.expand_as(self.weight_x), 1 / self.tau.expand_as(self.weight_t)]

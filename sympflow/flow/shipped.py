@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from sympflow.hamiltonian.fingerprint import Identity, same_system, without_friction
 
 if TYPE_CHECKING:
+    from sympflow.flow.known import KnownFlow
     from sympflow.hamiltonian.system import HamiltonianSystem
 
 DEFAULT_TOL = 1e-6
@@ -131,6 +132,14 @@ class ShippedFlow:
         from sympflow.hamiltonian.time_transformation import time_transformed
 
         return load(self.path, system=time_transformed(system, self.shift))
+
+    def known(self, system: HamiltonianSystem) -> KnownFlow:
+        """The flow of a system for compiled runs: of a primed one in its own time the numbers, without torch."""
+        if self.stages is None or self.shift is not None:
+            return self.load(system)
+        from sympflow.flow.frozen import FrozenFlow
+
+        return FrozenFlow.of_file(self.path, system)
 
 
 class ShippedFlows(Sequence[ShippedFlow]):

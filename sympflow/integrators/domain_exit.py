@@ -17,7 +17,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome
 
 if TYPE_CHECKING:
-    from sympflow.flow.flow_map import FlowMap
+    from sympflow.flow.known import KnownFlow
 
 STATES_COMPARED, MOST_COMPARED = 16, 64
 """Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
@@ -26,7 +26,7 @@ MANY_TIMES = 1000.0
 """Times the certified energy error of a flow beyond which an error outside its domain is warned of."""
 
 
-def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
+def _surely_within(flow: KnownFlow | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
     """True if all states y (..., 2d) are in the domain of the flow and compiled code can tell."""
     domain = (None if flow is None else flow.domain) or system.domain
     if type(domain) is not EnergySublevel and type(domain) is not Box:
@@ -36,12 +36,12 @@ def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarra
 
 @cache
 def _compiled() -> Callable[..., bool]:
-    from sympflow.kernels.sublevel_loops import all_within
+    from sympflow.kernels.passes import all_within
 
     return all_within
 
 
-def _domain(flow: FlowMap | None, system: HamiltonianSystem) -> Domain | None:
+def _domain(flow: KnownFlow | None, system: HamiltonianSystem) -> Domain | None:
     return system.domain if flow is None else flow.domain_for(system)
 
 
@@ -138,7 +138,7 @@ def warn_of_loss(
 
     Looked at is the last output of a conservative system.
     """
-    flow = integrator.flow_for(system)
+    flow = integrator.known_flow(system)
     certificate = None if flow is None else flow.certified
     if certificate is None or "domain_exit" not in outcome.stats or not (system.conservative and system.autonomous):
         return
@@ -161,7 +161,7 @@ def warn_of_loss(
     )
 
 
-def check_start(flow: FlowMap, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
+def check_start(flow: KnownFlow, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
     """A flow that is taken for its accuracy must start where its accuracy was measured.
 
     Raises
@@ -188,7 +188,7 @@ def check_start(flow: FlowMap, system: HamiltonianSystem, y0: Array, compiled: b
         )
 
 
-def _meaning(flow: FlowMap | None) -> str:
+def _meaning(flow: KnownFlow | None) -> str:
     """The worth of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
     if flow is None or any(flow.evaluations(1, 1, 0, "array").values()):
         return ""
@@ -200,7 +200,7 @@ def _meaning(flow: FlowMap | None) -> str:
 
 def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
     """Note the first output outside the domain, or end the run there."""
-    flow = integrator.flow_for(system)
+    flow = integrator.known_flow(system)
     slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
     if outcome.stats.get("backend") == "compiled" and _surely_within(flow, system, outcome.y, slack):
         return

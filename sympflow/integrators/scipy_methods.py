@@ -199,6 +199,7 @@ class _Scipy(RungeKutta):
         solvers = [self._start(system, *t_span, y) if t_span[0] != t_span[1] else None for y in starts]
         t = np.full(len(starts), t_span[0], dtype=float)
         y, n_steps, most = starts.copy(), 0, self.most_steps(t_span[1], y0.shape[-1])
+        made: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         while any(solver is not None and solver.status == "running" for solver in solvers):
             h, y_next = np.zeros(len(starts)), y.copy()
             for i, solver in enumerate(solvers):
@@ -212,8 +213,21 @@ class _Scipy(RungeKutta):
                 h[i], y_next[i] = solver.t - t[i], solver.y
                 if hopeless(n_steps + 1, t_span[0], solver.t, t_span[1], most):
                     solvers[i] = None
-            yield t.reshape(1, *batch).copy(), y.reshape(1, *y0.shape), h.reshape(1, *batch)
+            made.append((t.reshape(batch), y.reshape(y0.shape), h.reshape(batch)))
+            if len(made) * y.size >= TOGETHER:
+                yield _together(made)
+                made = []
             t, y, n_steps = t + h, y_next, n_steps + 1
+        if made:
+            yield _together(made)
+
+
+TOGETHER = 4096  # numbers of states of the steps that are told at once
+
+
+def _together(steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    times, states, lengths = (np.stack(column) for column in zip(*steps, strict=True))
+    return times, states, lengths
 
 
 class _Lazily:

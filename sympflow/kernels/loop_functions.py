@@ -33,6 +33,7 @@ from sympflow.kernels.stages import (
     numbers_source,
     stages_source,
     step_constants,
+    takes_values,
 )
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
@@ -41,21 +42,6 @@ if TYPE_CHECKING:
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.sized_loops import SizedLoops
     from sympflow.kernels.stage_times import Driving
-
-MOST_COUPLED = 6
-"""Degrees of freedom of a damping matrix in compiled loops, where the two maps of each drift are 2d² numbers."""
-
-
-def damped_drift(system: HamiltonianSystem, in_place: bool) -> DampedDrift | None:
-    """The drift of a system with friction as code; None without."""
-    if system.damping is None:
-        return None
-    if system.damping.ndim == 2 and (in_place or system.ndof > MOST_COUPLED):
-        raise ValueError(
-            f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "
-            f"{MOST_COUPLED} degrees of freedom: use backend='array'."
-        )
-    return DampedDrift(system.damping.ndim, system.ndof, in_place)
 
 
 @dataclass(frozen=True)
@@ -69,17 +55,8 @@ class LoopFunctions:
     step_rows: Callable[..., None]
 
 
-def takes_values(level: int) -> bool:
-    """True of kicks whose code is the same for all values of parameters.
-
-    In those with force gradients sums such as g ω⁴ − b ω² would round in another way than with numbers in the code.
-    """
-    return level not in (FORCE_GRADIENT, CURVATURE)
-
-
 def symbolic_loops(
     symbols: SymbolicHamiltonian,
-    algebra: str,
     friction: DampedDrift | None,
     level: int,
     compensated: bool,
@@ -88,11 +65,11 @@ def symbolic_loops(
     ranges: Ranges | None = None,
 ) -> LoopFunctions:
     """The loops of an autonomous symbolic system of few terms; parameters are numbers where `takes_values`."""
-    if (varied or (friction is None and takes_values(level))) and symbols.parametric is not symbols:
-        from sympflow.kernels.codegen import algebra_source
+    from sympflow.kernels.codegen import algebra_source
 
+    if varied or (friction is None and takes_values(level)):
         symbols = symbols.parametric
-        algebra = algebra_source(symbols)
+    algebra = algebra_source(symbols)
     after = ("loops", "lanes")
     loops = symbolic_module(
         symbols, algebra, level, compensated, after, monomials, friction, varied=varied, ranges=ranges
@@ -307,16 +284,7 @@ def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> 
     return LatticeLoops(system.local, level, compensated, system.friction is not None)
 
 
-def _pair_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
-    """The loops of bodies in pairs, of which only the potential, and not their number, is part of the code."""
-    from sympflow.hamiltonian.bodies import PairsHamiltonian
-    from sympflow.kernels.pair_forces import PairLoops
-
-    assert isinstance(system.local, PairsHamiltonian)
-    return PairLoops(system.local, level, compensated, system.friction is not None)
-
-
-LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops, "pairs": _pair_loops}
+LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops}
 """Makers of the loops of systems that are given by one piece."""
 
 

@@ -176,6 +176,10 @@ class Kernel(Protocol):
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         ...
 
+    def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """The `step` from each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d); None where they are not compiled."""
+        return None
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int] | None:
         """Count the evaluations of the system's functions in a run; None where the method itself counts them."""
         return None

@@ -10,14 +10,23 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import Value
-from sympflow.kernels.runs import BLOCK, Numbers, map_function, run_function
+from sympflow.compiler.machine import address
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
 
-__all__ = ["Columns", "Rollouts"]
+__all__ = ["Columns", "Rollouts", "aligned"]
 
+NONE = np.empty(0)
+LINE = 8  # numbers in a line of memory
 AT_ONCE = 4096  # trajectories with tables of their own
 
 Columns = tuple[np.ndarray, np.ndarray]
 """The numbers (m, size) of columns and their kinds (m,), as compiled code reads them: see `run_function`."""
+
+
+def aligned(n: int) -> np.ndarray:
+    """Numbers in memory, of any values, that begin with a line of it."""
+    memory = np.empty(n + LINE)
+    return memory[-(memory.ctypes.data // 8) % LINE :][:n]
 
 
 class Rollouts:
@@ -32,18 +41,33 @@ class Rollouts:
     lanes : int
         Trajectories of a batch that run side by side: of two registers or four, so that one need not wait for the
         other.
+    fewest : int
+        Trajectories that run in lanes rather than one after the other.
     room : int, optional
         Where states are in memory, how many numbers more stages need there; None where they are in registers.
+    memory : callable
+        How they are there: `sympflow.kernels.runs.Memory`, or such a class.
     data : sequence of ndarray
         Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
     every : int, optional
         Steps after which `look` changes the running state.
+    block : int
+        Steps between two looks for a state that is not finite, or a stop, where nothing is saved.
+    counted : bool
+        True if the last of `n_values` is a count, which is no part of the running state.
+    closing : bool
+        False if outputs are never closed, so that the code need not hold a stage for that.
     """
 
     lanes = 16
+    fewest = 2
     room: int | None = None
     data: Sequence[np.ndarray] = ()
+    memory: Callable[..., Memory] = Memory
     every: int | None = None
+    block = BLOCK
+    counted = False
+    closing = True
 
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
@@ -71,6 +95,11 @@ class Rollouts:
         """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
         raise NotImplementedError
 
+    @property
+    def place(self) -> Callable[..., Memory] | None:
+        """What is made of states in memory; None where they are in registers."""
+        return None if self.room is None else self.memory
+
     def function(self, name: str, width: int) -> Callable[..., None]:
         """The compiled function of a name, see `made`."""
         found = self._functions.get((name, width))
@@ -83,22 +112,22 @@ class Rollouts:
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "run", "run own" or "map"."""
-        memory = self.room is not None
+        memory = self.place
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory)
-        look, every = (None, BLOCK) if self.every is None else (self.look, self.every)
+        look, every = (None, self.block) if self.every is None else (self.look, self.every)
+        own = name == "run own"
         return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, name == "run own", memory, look, every
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing
         )
 
-    def call(self, name: str, width: int, *arguments: Any) -> None:
+    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
         """Call the compiled function of a name with arrays and integers."""
         if self.room is not None:
-            work = np.empty((3 * self.n_values + self.room) * width)
-            places = np.array([x.ctypes.data for x in self.data], dtype=np.int64)
-            arguments = *arguments, self.n_values, self.n_out, work, places
-        given = (x.ctypes.data if isinstance(x, np.ndarray) else x for x in arguments)
-        self.function(name, width)(*given)
+            work = aligned((3 * self.n_values + self.room) * width)
+            places = np.array([*map(address, self.data)], dtype=np.int64)
+            arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, places
+        self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
 
     def rollout(
         self,
@@ -129,16 +158,20 @@ class Rollouts:
         first: int,
         running: np.ndarray,
         closed: bool = True,
+        counts: np.ndarray = NONE,
     ) -> None:
-        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it."""
+        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it.
+
+        The counts (N,) of stages that count go into `counts`.
+        """
         rest = n_steps, save, stop, first, closed
         if len(y0) == 1 or y0.shape[1] > self.n_out:
             size = AT_ONCE if y0.shape[1] > self.n_out else 1
             for k in range(0, len(y0), size):
                 rows = slice(k, k + size)
-                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], *rest)
+                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], counts[rows], *rest)
             return
-        self._some(table, y0, out, n_finite, running, *rest)
+        self._some(table, y0, out, n_finite, running, counts, *rest)
 
     def _some(
         self,
@@ -147,22 +180,24 @@ class Rollouts:
         out: np.ndarray,
         n_finite: np.ndarray,
         running: np.ndarray,
+        counts: np.ndarray,
         n_steps: int,
         save: np.ndarray,
         stop: np.ndarray,
         first: int,
         closed: bool,
     ) -> None:
-        """Rows side by side; those that end before the last step once more, by themselves, to find that end."""
+        """One row, or rows side by side; those that end early once more, by themselves, to find that end."""
         before = running.copy() if first > 0 else running
         rest = stop, first
-        width = self.lanes if len(y0) > 1 else 1
-        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width)
+        width = self.lanes if len(y0) >= self.fewest else 1
+        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width, counts)
         for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
             one = slice(i, i + 1)
             if len(before):
                 running[i] = before[i]
-            self._run(table, y0[one], n_steps, save, out[one], n_finite[one], *rest, running[one], closed, 1)
+            found = out[one], n_finite[one]
+            self._run(table, y0[one], n_steps, save, *found, *rest, running[one], closed, 1, counts[one])
 
     def _run(
         self,
@@ -177,37 +212,37 @@ class Rollouts:
         running: np.ndarray,
         closed: bool,
         width: int,
+        counts: np.ndarray = NONE,
     ) -> None:
         states = y0[:, : self.n_out]
         if y0.shape[1] > self.n_out:
             name, (entries, kinds) = "run own", self.own_columns(table, y0[:, self.n_out :], width)
         else:
             name, (entries, kinds) = "run", self.prepared(table)
-        begun = int(np.searchsorted(save, 0, side="right")) if len(save) and save[0] <= 0 else 0
+        begun = int(save.searchsorted(0, "right")) if len(save) and save[0] <= 0 else 0
         if begun:
             out[:, :begun] = states[:, None]
-        later, outputs = save[begun:], out
-        if begun or not out.flags.c_contiguous:
-            outputs = np.empty((len(y0), len(later), self.n_out))
-        if first > 0:
-            start = np.ascontiguousarray(running)
-        elif self.n_values > self.n_out:
-            start = np.concatenate([states, np.zeros((len(states), self.n_values - self.n_out))], axis=1)
-        else:
-            start = np.ascontiguousarray(states)
+        later, outputs = save[begun:], out[:, begun:]
+        apart = not outputs.flags.c_contiguous
+        if apart:
+            outputs = np.empty(outputs.shape)
+        start = np.ascontiguousarray(running if first > 0 else states)
+        if self.n_values > start.shape[1]:
+            start = np.concatenate([start, np.zeros((len(states), self.n_values - start.shape[1]))], axis=1)
         keeps = running.shape[-1] > 0
-        left = np.empty((len(y0), self.n_values)) if keeps else running
+        left = np.empty((len(y0), self.n_values)) if keeps or self.counted else running
         given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps, later, len(later)
-        self.call(name, width, *given, outputs, n_finite, left, int(keeps), stop)
-        if outputs is not out:
+        self.call(name, width, *given, outputs, n_finite, left, int(keeps or self.counted), stop)
+        if apart:
             out[:, begun:] = outputs
+        if self.counted:
+            counts[:], left = left[:, -1], left[:, :-1]
         if keeps:
             running[:] = left
-        if width == 1:
-            for i in np.flatnonzero(n_finite < n_steps):
-                out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
-                if keeps:
-                    running[i] = np.nan
+        if width == 1 and n_finite[0] < n_steps:
+            out[0, np.searchsorted(save, n_finite[0], side="right") :] = np.nan
+            if keeps:
+                running[0] = np.nan
 
     def rollout_processed(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> int:
         """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
@@ -232,6 +267,12 @@ class Rollouts:
             row = int(np.argmin(good[i]))
             if save[row] <= n_finite[i]:
                 out[i, row:], n_finite[i] = np.nan, save[row] - 1
+
+    def step_rows(
+        self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
+        raise NotImplementedError
 
     def mapped(self, table: Any, y: np.ndarray, out: np.ndarray) -> None:
         """All columns of a table, applied to rows `y` (N, 2d); `out` may be `y`."""

@@ -16,7 +16,7 @@ from typing import Any
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Numbers", "Room", "Stage", "map_function", "run_function", "step_function"]
+__all__ = ["Lanes", "Memory", "Numbers", "Room", "finished", "groups", "map_function", "run_function", "step_function"]
 
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
@@ -36,9 +36,10 @@ def run_function(
     stage: Stage | MemoryStage,
     width: int = 1,
     own: bool = False,
-    memory: bool = False,
+    memory: Callable[..., Memory] | None = None,
     look: Callable[[Any], Any] | None = None,
     every: int = BLOCK,
+    closing: bool = True,
 ) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side.
 
@@ -52,13 +53,15 @@ def run_function(
     width : int
     own : bool
         True if each trajectory has a table of its own.
-    memory : bool
-        True if states are in memory: then their sizes are arguments of the function, not `n_values` and `n_out`.
+    memory : callable, optional
+        How states are in memory: then their sizes are arguments of the function, not `n_values` and `n_out`.
     look : callable, optional
         ``look(values)``, the values of the running state after each `every` steps of the run, changed so that the
         outputs are the same but for what it knows of; of states in memory ``look(room)`` in place.
     every : int
         Steps between two looks, for a state that is not finite too.
+    closing : bool
+        False if `closes` is always 0.
 
     Returns
     -------
@@ -81,13 +84,13 @@ def run_function(
         code.arguments[:15]
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
-    state = _state(code, n_values, n_out, width, code.arguments[15:], before=width == 1)
-    with code.over(_groups(code, n_rows, width)) as group:
+    state = _state(code, n_values, n_out, width, memory, code.arguments[15:], before=width == 1)
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         place = code.at(table, group * (link + 2) * (size * width)) if own else table
         column = _column(code, place, kinds, size, width if own else 1, width, stage)
         state.open(rows, begin, n_rows)
-        n, saved, longest = code.variable(first), code.variable(zero), code.variable(code.constant(every, INT))
+        n, saved, longest = code.variable(first), code.variable(zero), code.variable(state.block(every))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
         alive = code.variable(code.constant(1, Type("i1", width)))
         going = code.variable(first < n_steps)
@@ -106,8 +109,9 @@ def run_function(
                 j.value = code.select(code.apply("eq", (at, link)), one, at + 1)
                 step.value = code.select(code.apply("eq", (j.value, link)), step.value + 1, step.value)
             state.end()
-            with code.over(closes):
-                state.change(column, link + 1, step.value, end=True)
+            if closing:
+                with code.over(closes):
+                    state.change(column, link + 1, step.value, end=True)
             alive.value = alive.value & state.finite()
             good = code.any(alive.value)
             going.value = good & code.apply("eq", (code.load(stop, 0, INT, shared=True), zero))
@@ -132,11 +136,16 @@ def run_function(
             _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
             state.keep(running, begin, n_rows)
-    return _finished(code, types)
+    return finished(code, types)
 
 
 def map_function(
-    n_values: int, n_out: int, size: int, stage: Stage | MemoryStage, width: int = 1, memory: bool = False
+    n_values: int,
+    n_out: int,
+    size: int,
+    stage: Stage | MemoryStage,
+    width: int = 1,
+    memory: Callable[..., Memory] | None = None,
 ) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table.
 
@@ -149,9 +158,9 @@ def map_function(
     types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
-    state = _state(code, n_values, n_out, width, code.arguments[8:])
+    state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
     column = _column(code, table, kinds, size, 1, width, stage)
-    with code.over(_groups(code, n_rows, width)) as group:
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         state.open(rows, begin, n_rows, n_out)
         step = code.load(steps, code.op("srem", INT, begin, n_steps), INT)
@@ -159,7 +168,7 @@ def map_function(
             state.change(column, j, step)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return _finished(code, types)
+    return finished(code, types)
 
 
 def step_function(
@@ -170,7 +179,7 @@ def step_function(
     numbers: Callable[..., Sequence[Any]],
     stage: Stage | MemoryStage,
     width: int = 1,
-    memory: bool = False,
+    memory: Callable[..., Memory] | None = None,
 ) -> Callable[..., None]:
     """Compile single steps from rows, each of its own length.
 
@@ -192,9 +201,9 @@ def step_function(
     types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("steps", types)
     table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments[:9]
-    state = _state(code, n_values, n_out, width, code.arguments[9:])
+    state = _state(code, n_values, n_out, width, memory, code.arguments[9:])
     alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
-    with code.over(_groups(code, n_rows, width)) as group:
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         (at,), (length,) = alone.loaded(x, begin, n_rows), alone.loaded(h, begin, n_rows)
         state.open(rows, begin, n_rows, n_out, own)
@@ -212,7 +221,7 @@ def step_function(
             state.change(lambda j, x, step, entries=entries: stage(x, entries.__getitem__, j, step), j, j)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return _finished(code, types)
+    return finished(code, types)
 
 
 MEMORY = [INT, INT, POINTER, POINTER]
@@ -229,16 +238,18 @@ class Room:
         Addresses: of the numbers of the state, and of room for others.
     size : Value
         How many numbers it has.
+    places : Value
+        The address of the array of addresses.
     width : int
     """
 
     def __init__(self, code: Code, width: int, state: Value, work: Value, size: Value, data: Value) -> None:
-        self.code, self.width, self.state, self.work, self.size, self._data = code, width, state, work, size, data
+        self.code, self.width, self.state, self.work, self.size, self.places = code, width, state, work, size, data
         self.type = Type("double", width)
 
     def data(self, i: int) -> Value:
         """The address of array i of those that a stage reads."""
-        return self.code.load(self._data, i, POINTER)
+        return self.code.load(self.places, i, POINTER)
 
     def load(self, i: Any, place: Value | None = None) -> Value:
         """The number i of the state, or of others from a place on."""
@@ -265,6 +276,10 @@ class _Registers:
         self._state: list[Variable] = []
         self._end: list[Variable] = []
         self._before: list[Value] = []
+
+    def block(self, every: int) -> Value:
+        """Steps between two looks."""
+        return self.code.constant(every, INT)
 
     def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
         """Read a state, of which the first numbers are given and the others are 0."""
@@ -307,8 +322,11 @@ class _Registers:
         self._lanes.store([x.value for x in self._state], running, begin, n_rows, one, zero)
 
 
-class _Memory:
-    """The same in memory: the state, its end, and the state before a block of steps."""
+class Memory:
+    """The same in memory: the state, its end, and the state before a block of steps.
+
+    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`.
+    """
 
     def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
         self.code, self.width, self._remembers = code, width, before
@@ -317,6 +335,9 @@ class _Memory:
         self._running, self._end, self._before = (
             Room(code, width, x, rooms[3], self.n_values, data) for x in rooms[:3]
         )
+
+    def block(self, every: int) -> Value:
+        return self.code.constant(every, INT)
 
     def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
         n = self.n_values if given is None else self.n_out
@@ -370,12 +391,21 @@ class _Memory:
 
 
 def _state(
-    code: Code, n_values: int, n_out: int, width: int, memory: Sequence[Value], before: bool = False
-) -> _Registers | _Memory:
-    return _Memory(code, width, memory, before) if memory else _Registers(code, n_values, n_out, width)
+    code: Code,
+    n_values: int,
+    n_out: int,
+    width: int,
+    memory: Callable[..., Memory] | None,
+    arguments: Sequence[Value],
+    before: bool = False,
+) -> _Registers | Memory:
+    if memory is None:
+        return _Registers(code, n_values, n_out, width)
+    return memory(code, width, arguments, before)
 
 
-def _groups(code: Code, n_rows: Value, width: int) -> Value:
+def groups(code: Code, n_rows: Value, width: int) -> Value:
+    """How often `width` rows are begun side by side."""
     if width == 1:
         return n_rows
     return code.op("sdiv", INT, n_rows + (width - 1), code.constant(width, INT))
@@ -466,6 +496,7 @@ def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) 
 _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
 
 
-def _finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+def finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+    """End the code of a function, and compile it."""
     code.give()
     return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *[_C[t.scalar] for t in types]))

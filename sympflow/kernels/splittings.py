@@ -23,14 +23,15 @@ from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
-from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["SplittingCode"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "shared"]
 
 MOST_TABLES = 64  # that are kept
+LONG = 64  # operations of a stage, beyond which products of sums may better be left
 EARLY = -4  # when momenta are known before the positions, in cycles
 
 
@@ -57,6 +58,12 @@ class Splitting:
     friction: int | None = None
 
     @property
+    def key(self) -> tuple[Any, ...]:
+        """Same for systems that share their code: those that differ in the values of parameters alone."""
+        of_system = self.symbols.H, self.symbols.parameters, self.symbols.q, self.symbols.p
+        return *of_system, self.level, self.monomials, self.compensated, self.friction
+
+    @property
     def kick_numbers(self) -> tuple[str, ...]:
         return kicks_of(self.level, len(self.monomials))[0].numbers
 
@@ -68,19 +75,25 @@ class Splitting:
         of_friction = [f"{name}_{i}" for name in ("mean", "decay") for i in range(damped)]
         return ["a", *self.kick_numbers, *of_friction, *(s.name for s in self.symbols.parameters)]
 
+    @property
+    def terms(self) -> list[int]:
+        """Terms of the kicks of each kind of stage: one, two, …; a polynomial has all of its own."""
+        return [1, 2, 3][: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0)]
+
     def kinds(self) -> list[Arranged]:
-        """The stages with kicks of one number, of two, …; a polynomial has all of its numbers."""
-        if self.level == POLYNOMIAL:
-            return [self._arranged(1)]
-        return [self._arranged(terms) for terms in range(1, 2 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0))]
+        """The stages, those with the fewest terms first."""
+        return [self._arranged(terms) for terms in self.terms]
 
     def _arranged(self, terms: int) -> Arranged:
-        """The stage as a program, the shape with the shortest chain and the fewest operations of two."""
-        shapes = [_Shape(self, terms, expand).arranged() for expand in ((True, False) if terms > 1 else (True,))]
-        return min(shapes, key=lambda shape: shape[0])[1]
+        """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
+        cost, shape = Shape(self, terms, True).arranged()
+        if terms > 1 and len(shape.body) > LONG:
+            other_cost, other = Shape(self, terms, False).arranged()
+            return shape if cost <= other_cost else other
+        return shape
 
 
-class _Shape:
+class Shape:
     """One way to write a stage: products of sums multiplied out, or left."""
 
     def __init__(self, splitting: Splitting, terms: int, expand: bool) -> None:
@@ -101,19 +114,22 @@ class _Shape:
     def arranged(self) -> tuple[int, Arranged]:
         """The cost of the stage, and its programs."""
         made, d = self.made, self.d
-        changes = self._changes()
         errors: list[Any] = []
         if self.splitting.compensated:
-            momenta, errors_p = self._compensated(self.p, [made.written(x) for x in changes], self.errors[d:])
+            changes = [made.written(x) for x in self._changes()]
+            momenta, errors_p = self._compensated(self.p, changes, self.errors[d:])
             moves = [made.written(x) for x in self._velocity(momenta, self.number["a"])]
             positions, errors_q = self._compensated(self.q, moves, self.errors[:d])
             errors = [*errors_q, *errors_p]
         else:
-            momenta = [made.written(p + x) for p, x in zip(self.p, changes, strict=True)]
-            positions, momenta = self._drifted(momenta)
+            positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
         arranged = made.finish(outputs)
         return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
+
+    def _kicked(self) -> list[Any]:
+        """The momenta after a kick, numbers of the body."""
+        return [self.made.written(p + x) for p, x in zip(self.p, self._changes(), strict=True)]
 
     def _changes(self) -> list[Any]:
         """The change of p by a kick."""
@@ -225,6 +241,20 @@ def _slope_of_monomial(powers: Sequence[int], i: int, q: Sequence[Any]) -> Any:
     return value
 
 
+MOST_CODES = 64  # that are kept, of systems with other structures
+_CODES: dict[Any, Any] = {}
+
+
+def shared(key: Any, make: Callable[[], Any]) -> Any:
+    """Return the code of a key, made once while it is kept: systems are often made again."""
+    found = _CODES.get(key)
+    if found is None:
+        while len(_CODES) >= MOST_CODES:
+            _CODES.pop(next(iter(_CODES)), None)
+        found = _CODES[key] = make()
+    return found
+
+
 class SplittingCode(Rollouts):
     """The compiled functions of splitting schemes on one symbolic system.
 
@@ -280,9 +310,8 @@ class SplittingCode(Rollouts):
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
             return self._executed(last, values, numbers)
 
-        return step_function(
-            self.n_values, self.n_out, powers, self._own if own else 0, self._kinds[last].table, stage, width
-        )
+        own_numbers, table = self._own if own else 0, self._kinds[last].table
+        return step_function(self.n_values, self.n_out, powers, own_numbers, table, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
 

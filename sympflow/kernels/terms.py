@@ -19,8 +19,7 @@ from sympflow.kernels.codegen import statements
 
 __all__ = [
     "bend_source",
-    "energy_source",
-    "gradient_and_hessian_source",
+    "families",
     "gradient_source",
     "is_large",
     "product_source",
@@ -179,19 +178,6 @@ def _constant(f: sp.Basic) -> _Tree | None:
 # derivatives as loops ---------------------------------------------------------------------------------------------
 
 
-def energy_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
-    """``name(q)``: the value of f.
-
-    Raises
-    ------
-    ValueError
-        As `sympflow.kernels.codegen.statements`.
-    """
-    constant = f.as_independent(*variables, as_Add=True)[0]
-    before, after = f"total = {float(constant)!r}", "return total"
-    return _source(f, variables, name, "q", before, lambda family: {"total": family.f}, after)
-
-
 def gradient_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
     """``name(q, out)``: ∇f into out; with letters in f ``name(q, out, numbers)``, of which the last are theirs."""
 
@@ -217,20 +203,6 @@ def bend_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: 
         return _each(_slopes(_along(_along(family.f, family.x), family.x) / 2, family.x))
 
     return _source(f, variables, name, "q, v, out", "out[:] = 0.0", bend, letters=letters)
-
-
-def gradient_and_hessian_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, time: str) -> str:
-    """``name(q, out, S, time)``: ∇f into out and ∇²f into S, of f that may hold the symbol of that time."""
-
-    def both(family: Family) -> dict[str, sp.Expr]:
-        slopes = _slopes(family.f, family.x)
-        targets = _each(slopes)
-        for j, slope in enumerate(slopes):
-            for k, entry in enumerate(_slopes(slope, family.x)):
-                targets[f"S[i_{j}, i_{k}]"] = entry
-        return targets
-
-    return _source(f, variables, name, f"q, out, S, {time}", "out[:] = 0.0\n    S[:] = 0.0", both)
 
 
 def _slopes(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:

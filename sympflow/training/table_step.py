@@ -290,7 +290,7 @@ class Forces(Protocol):
 
 def _pair_forces(system: HamiltonianSystem, level: int) -> Forces:
     from sympflow.hamiltonian.bodies import PairsHamiltonian
-    from sympflow.kernels.pair_forces import PairForces
+    from sympflow.kernels.pairs import PairForces
 
     assert isinstance(system.local, PairsHamiltonian)
     return PairForces(system.local, level)

@@ -9,11 +9,12 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from sympflow.flow.files import KEY, SUM, load, text_checksum
+from sympflow.flow.files import load
 from sympflow.flow.io import save
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.records import KEY, SUM, text_checksum
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import checksum
