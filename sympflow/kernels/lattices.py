@@ -12,17 +12,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+import threading
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from sympflow.compiler.arrange import ALWAYS, Arrangement
-from sympflow.compiler.control import BOOL, INT, POINTER, Code, Sweep, Type, Value
+from sympflow.compiler.control import INT, Code, Sweep, Type, Value
 from sympflow.compiler.functions import FUNCTIONS, times
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
+from sympflow.kernels.runs import Memory, Room
+from sympflow.kernels.teams import meet
 from sympflow.schemes import CURVATURE
 
 __all__ = ["Form", "LatticeStages"]
@@ -33,14 +36,21 @@ Key = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class Form:
-    """All that the code of a lattice depends on.
+    """All that the code of a lattice depends on: not its size, nor the values of parameters.
 
     Attributes
     ----------
-    lattice : LatticeHamiltonian
-        Its terms, and which parameters are arrays; not its size, nor values of parameters.
+    terms : dict
+        The terms T ("kinetic"), U ("site") and V by their distances, as pairs of an expression and its letters.
+    directions : tuple of Symbol
+        The letters of the two directions, v and w.
+    c : tuple of Symbol
+        The letters of the parameters.
+    arrays : frozenset of Symbol
+        Those that have a value at each site.
+    unit_masses : bool
     boundary : tuple of str
-        Of each axis, that of the lanes first.
+        Of each axis, that of the lanes last.
     level : int
         See `Scheme`.
     compensated : bool
@@ -50,25 +60,40 @@ class Form:
         Lanes.
     """
 
-    lattice: LatticeHamiltonian
+    terms: tuple[tuple[Any, tuple[Any, tuple[Any, ...]]], ...]
+    directions: tuple[Any, ...]
+    c: tuple[Any, ...]
+    arrays: frozenset[Any]
+    unit_masses: bool
     boundary: tuple[str, ...]
     level: int
     compensated: bool
     damped: bool
     width: int
 
+    @classmethod
+    def of(
+        cls, lattice: LatticeHamiltonian, order: Sequence[int], level: int, compensated: bool, damped: bool, width: int
+    ) -> Form:
+        """The form of a lattice whose axes are taken in an order."""
+        terms: dict[Any, Any] = {"kinetic": (lattice.T, lattice.p)}
+        if lattice.U != 0:
+            terms["site"] = lattice.U, lattice.x
+        terms |= {k: (lattice.bonds[k], lattice.r) for k in sorted(lattice.bonds)}
+        values = zip(lattice.c, lattice.params.values(), strict=True)
+        arrays = frozenset(s for s, value in values if isinstance(value, np.ndarray))
+        given = tuple(terms.items()), (*lattice.v, *lattice.w), lattice.c, arrays, lattice.inverse_mass is None
+        boundary = tuple(lattice.boundary[axis] for axis in order)
+        return cls(*given, boundary, level, compensated, damped, width)
+
     @property
-    def _key(self) -> tuple[Any, ...]:
-        lattice = self.lattice
-        arrays = tuple(isinstance(value, np.ndarray) for value in lattice.params.values())
-        terms = lattice.U, lattice.T, tuple(sorted(lattice.bonds.items())), len(lattice.fields), arrays
-        return *terms, self.boundary, self.level, self.compensated, self.damped, self.width
+    def fields(self) -> int:
+        return len(self.directions) // 2
 
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Form) and self._key == other._key
+    @property
+    def distances(self) -> list[int]:
+        """Of the ends of bonds."""
+        return [k for k, _ in self.terms if isinstance(k, int)]
 
     @property
     def column(self) -> tuple[str, ...]:
@@ -78,7 +103,7 @@ class Form:
     @property
     def reach(self) -> int:
         """The longest distance of two ends of a bond."""
-        return max(self.lattice.bonds, default=0)
+        return max(self.distances, default=0)
 
     def before(self, passes: int) -> int:
         """How far before the first place, or plane, a stage of so many passes begins."""
@@ -93,7 +118,7 @@ class Law:
 
     Parameters
     ----------
-    lattice : LatticeHamiltonian
+    form : Form
     keys : sequence of Key
         Of numbers that it may read; those of a column have the kind "column".
     outputs : callable
@@ -105,11 +130,11 @@ class Law:
         The numbers that depend on parameters alone, written out.
     """
 
-    def __init__(self, lattice: LatticeHamiltonian, keys: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> None:
+    def __init__(self, form: Form, keys: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> None:
         states = [(f"{kind}{i}", ALWAYS if kind == "column" else 0) for kind, i in keys]
         shapes = []
         for squares in (False, True):
-            made = Arrangement(states, [s.name for s in lattice.c], squares=squares)
+            made = Arrangement(states, [s.name for s in form.c], squares=squares)
             found = outputs(made, dict(zip(keys, made.states, strict=True)), made.constants)
             shapes.append(made.finish(list(found.values())))
         self._keys, self.results = keys, list(found)
@@ -145,19 +170,21 @@ class Potential:
         ∇f; ∇²f, row by row; and ∇²f w + ½ ∇³f(v, v); of x, v, w and the parameters.
     """
 
-    def __init__(self, lattice: LatticeHamiltonian, f: Any, x: Sequence[Any]) -> None:
+    def __init__(self, form: Form, f: Any, x: Sequence[Any]) -> None:
         n = self.n = len(x)
-        letters = (*x, *lattice.v, *lattice.w, *lattice.c)
+        letters = (*x, *form.directions, *form.c)
         program = traced(
             lambda *numbers: [evaluator(dict(zip(letters, numbers, strict=True)))(f)], *(s.name for s in letters)
         )
         given, (y,) = program.inputs, program.outputs
         self.x, v, w = given[:n], given[n : 2 * n], given[2 * n : 3 * n]
-        slopes = gradient(y, self.x)
-        bends = [a for row in derivatives(slopes, self.x) for a in row]
-        twice = tangent(tangent(slopes, self.x, v), self.x, v)
-        bent = [a + 0.5 * b for a, b in zip(tangent(slopes, self.x, w), twice, strict=True)]
-        self.slopes, self.bends, self.bent = (Program(given, list(values)) for values in (slopes, bends, bent))
+        slopes, bends, bent = gradient(y, self.x), list[Any](), list[Any]()
+        if form.level:
+            bends = [a for row in derivatives(slopes, self.x) for a in row]
+        if form.level == CURVATURE:
+            twice = tangent(tangent(slopes, self.x, v), self.x, v)
+            bent = [a + 0.5 * b for a, b in zip(tangent(slopes, self.x, w), twice, strict=True)]
+        self.slopes, self.bends, self.bent = (Program(given, values) for values in (slopes, bends, bent))
 
     def kept(self, costly: bool) -> list[int]:
         """The second derivatives that are no constants, of those that are alike the first; or the costly ones alone."""
@@ -192,18 +219,17 @@ class Pass:
     """
 
     def __init__(self, form: Form, name: str, terms: dict[Any, Potential]) -> None:
-        self.form, self.name, self.lattice = form, name, form.lattice
-        self._terms, self._fields = terms, range(len(form.lattice.fields))
+        self.form, self.name, self._terms, self._fields = form, name, terms, range(form.fields)
         ranks = [("r", "q"), ("dv", "v"), ("dw", "w")][: {KICK: 1, OPEN: 1, TURN: 2, MIDDLE: 2, LAST: 3}[name]]
         self._vectors = [vector for _, vector in ranks]
         self.differences = dict(ranks)
         keeps_all = len(form.boundary) == 1
         self._kept = {k: f.kept(k == "site" or not keeps_all) for k, f in terms.items()}
-        self.bonds = {k: self._bond(k) for k in form.lattice.bonds}
+        self.bonds = {k: self._bond(k) for k in form.distances}
         self.site = self._site()
 
     def _law(self, kinds: Sequence[str], more: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> Law:
-        return Law(self.lattice, [*((kind, f) for kind in kinds for f in self._fields), *more], outputs)
+        return Law(self.form, [*((kind, f) for kind in kinds for f in self._fields), *more], outputs)
 
     def _gradient(self, term: Any, kind: str, made: Any, get: dict[Key, Any], c: Sequence[Any]) -> dict[Key, Any]:
         """What this pass takes of a term: ("flux", f), and ("kept", (term, k))."""
@@ -258,7 +284,7 @@ class Pass:
     @property
     def _slope(self) -> str:
         """∇V, which is the acceleration where masses are 1."""
-        return "slope" if self.lattice.inverse_mass is not None else "v"
+        return "v" if self.form.unit_masses else "slope"
 
     def _moved(self, made: Any, get: dict[Key, Any], c: Sequence[Any]) -> dict[Key, Any]:
         """The numbers of a site after the pass."""
@@ -321,35 +347,34 @@ class Pass:
 SIZES = ("planes", "rows", "places", "vector", "plane", "row", "low")
 """Numbers of a context: planes, rows of a plane, places of a row; how many numbers vectors, planes and rows take, and
 those of a vector before the first site."""
-SITES = ("sites", "site_of_plane", "site_of_row", "site_of_place")
-"""How many sites there are, and how far apart those of neighbouring planes, rows and places are in a row [q, p]."""
+SITES = ("sites", "first", "site_of_plane", "site_of_row", "site_of_place")
+"""How many sites there are, and where in a row [q, p] the first one is; how far apart those of neighbouring planes, rows
+and places are."""
 ADDRESSES = ("starts", "sizes", "full", "follows", "inside_0", "inside_1", "inside_2")
 """Arrays: of each slab its first site and how many are its own; slabs of which all places are their own, and those that
 follow one; and, along each axis, where sites are."""
 ADDRESSES += ("arrays", "values", "helpers")
 """Numbers of each site and of all, and room for what passes keep."""
-SHARED = ("left", "right", "left_size", "members", "meeting", "stop")
+SHARED = ("left", "right", "left_size", "member", "members", "meeting", "stop", "found")
 """Addresses of the states before and behind this piece, 0 where there are none, and the sites of the last slab before
-it; threads, where they meet, and what ends them."""
-CONTEXT = ("own", "numbers", "row_of_q_p", "row_of_all", "longest", *SIZES, *SITES, *ADDRESSES, *SHARED)
+it; the number of this thread and of all, where they meet, what ends them, and whether the piece of each is finite."""
+CONTEXT = ("own", "longest", *SIZES, *SITES, *ADDRESSES, *SHARED)
 
 
 class LatticeStages:
     """The code of stages that change a state in memory: vectors of each field of q, of p and, compensated, of errors."""
 
     def __init__(self, form: Form) -> None:
-        lattice = form.lattice
-        self.form, self.fields = form, len(lattice.fields)
-        terms = {"kinetic": Potential(lattice, lattice.T, lattice.p)}
-        if lattice.U != 0:
-            terms["site"] = Potential(lattice, lattice.U, lattice.x)
-        terms |= {k: Potential(lattice, V, lattice.r) for k, V in lattice.bonds.items()}
+        self.form, self.fields = form, form.fields
+        self.functions: dict[Any, Callable[..., None]] = {}
+        self.lock = threading.RLock()
+        terms = {key: Potential(form, f, x) for key, (f, x) in form.terms}
         names = dict.fromkeys(name for kind in KINDS[: 1 + form.level] for name in kind)
         self.passes = {name: Pass(form, name, terms) for name in names}
         self.sets = ("q", "p", "q_error", "p_error")[: 4 if form.compensated else 2]
         self.vectors = [(kind, f) for kind in self.sets for f in range(self.fields)]
         laws = [law for one in self.passes.values() for law in (one.site, *one.bonds.values())]
-        arrays = {s.name for s, v in zip(lattice.c, lattice.params.values(), strict=True) if isinstance(v, np.ndarray)}
+        arrays = {s.name for s in form.arrays}
         self._made = {name: (law, i) for law in laws for i, name in enumerate(law.numbers)}
         self.arrays, self.values = list[str](), list[str]()
         for name, (law, i) in self._made.items():
@@ -385,42 +410,72 @@ class LatticeStages:
             found = {name: law.table(*given)[i] for name, (law, i) in self._made.items()}
         return [float(found[name]) for name in self.values], [np.asarray(found[name]) for name in self.arrays]
 
-    def load(self, code: Code, context: Value, row: Value, state: Value, whole: bool) -> None:
-        """Make a state of a row [q, p], with errors behind it if it is the `whole` of one."""
-        self._each(_Scene(self, state, context), row, whole, True)
+    def stage(self, room: Room, numbers: Callable[[int], Value], kind: Value) -> None:
+        """Change a state by a kick of a kind, without force gradient up to 1, and a drift."""
+        given = [numbers(i) for i in range(len(self.form.column))]
+        room.code.outlined("stage", (room.state, room.places, kind, *given), self._stage)
 
-    def keep(self, code: Code, context: Value, state: Value, row: Value, whole: bool) -> None:
-        """Write a state to a row, each thread its own sites."""
-        self._each(_Scene(self, state, context), row, whole, False)
+    def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
+        code, scene = state.code, _Scene(self, state, context, numbers)
+        for k, names in enumerate(KINDS[: 1 + self.form.level]):
+            with code.given(code.apply("eq", (kind, k + 1)) if k else kind <= 1):
+                scene.refresh(len(names) * self.form.reach)
+                scene.sweep([self.passes[name] for name in names])
 
-    def _each(self, scene: _Scene, row: Value, whole: bool, loads: bool) -> None:
-        code, at, width = row.code, scene.numbers, self.form.width
-        starts, sizes = scene.address("starts"), scene.address("sizes")
-        for v, key in enumerate(self.vectors[: len(self.vectors) if whole else 2 * self.fields]):
-            x, first = scene.vectors[key], code.constant(v, INT) * at["sites"]
+
+class LatticeInMemory(Memory):
+    """A state as vectors of the sites in slabs; each thread has its own piece."""
+
+    at_once = 8
+
+    def __init__(self, stages: LatticeStages, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
+        super().__init__(code, width, arguments, before)
+        self._stages, self._context = stages, arguments[3]
+
+    def block(self, every: int) -> Value:
+        return self.code.load(self._context, CONTEXT.index("longest"), INT)
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        with self.code.over(self.code.op("sdiv", INT, self.n_values, self.code.constant(8, INT))) as i:
+            self.code.store(self.code.constant(0.0, Type("double", 8)), self._running.state, i * 8)
+        n = len(self._stages.vectors) if given is None else 2 * self._stages.fields
+        self._each(self._running, rows, begin, n, True)
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self._each(self._end, out, begin * stride + at, 2 * self._stages.fields, False)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        self._each(self._running, running, begin, len(self._stages.vectors), False)
+
+    def finite(self) -> Value:
+        """True where the pieces of all threads are finite."""
+        scene, code = _Scene(self._stages, self._end.state, self._context), self.code
+        good = code.variable(super().finite())
+        with code.given(scene.number("members") > 1):
+            found = scene.address("found")
+            code.store(code.convert("zext", good.value, "i64"), found, scene.number("member"))
+            scene.meet()
+            with code.over(scene.number("members")) as k:
+                good.value = good.value & code.apply("eq", (code.load(found, k, INT), 1))
+            scene.meet()
+        return good.value
+
+    def _each(self, room: Room, rows: Value, row: Value, n: int, loads: bool) -> None:
+        """Take vectors of a state from a row, or write them there."""
+        scene, code, width = _Scene(self._stages, room.state, self._context), self.code, self._stages.form.width
+        at, starts, sizes = scene.numbers, scene.address("starts"), scene.address("sizes")
+        rows = code.at(rows, row * (at["sites"] * n))
+        for v, key in enumerate(self._stages.vectors[:n]):
+            x, first = scene.vectors[key], at["first"] + at["sites"] * v
             with code.over(at["planes"]) as i, code.over(at["rows"]) as r, code.over(width) as lane:
                 start = first + i * at["site_of_plane"] + r * at["site_of_row"]
                 site, place = code.load(starts, lane, INT) + start, i * at["plane"] + r * at["row"] + lane
                 with code.over(at["places"] if loads else code.load(sizes, lane, INT)) as j:
                     in_row, in_state = site + j * at["site_of_place"], place + j * width
                     if loads:
-                        code.store(code.load(row, in_row), x, in_state)
+                        code.store(code.load(rows, in_row), x, in_state)
                     else:
-                        code.store(code.load(x, in_state), row, in_row)
-
-    def stage(self, values: list[Value], numbers: Callable[[int], Value], kind: Value, step: Value) -> list[Value]:
-        """See `sympflow.kernels.runs.Stage`; the values are the addresses of the state and the context."""
-        given = [numbers(i) for i in range(len(self.form.column))]
-        kind.code.outlined("stage", (*values, kind, *given), self._stage)
-        return values
-
-    def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
-        code = state.code
-        scene = _Scene(self, state, context, numbers)
-        for k, names in enumerate(KINDS[: 1 + self.form.level]):
-            with code.given(code.apply("eq", (kind, k))):
-                scene.refresh(len(names) * self.form.reach)
-                scene.sweep([self.passes[name] for name in names])
+                        code.store(code.load(x, in_state), rows, in_row)
 
 
 class _Scene:
@@ -441,7 +496,7 @@ class _Scene:
         self.n_axes, self.reach, self.width = len(self.form.boundary), self.form.reach, self.form.width
         self.type, self.bits = Type("double", self.width), Type("i64", self.width)
         code, width = self.code, self.width
-        self.numbers = {name: self._number(name) for name in (*SIZES, *SITES)}
+        self.numbers = {name: self.number(name) for name in (*SIZES, *SITES)}
         vector, low = self.numbers["vector"], self.numbers["low"]
         self.vectors = {key: code.at(state, vector * i + low) for i, key in enumerate(stages.vectors)}
         if not column:
@@ -455,15 +510,15 @@ class _Scene:
         self._full, self._follows = (
             code.apply("lt", (code.load(self.address(name), 0, self.bits), 0)) for name in ("full", "follows")
         )
-        distance = code.convert("ptrtoint", state, "i64") - self._number("own")
-        self._sides = {name: self._number(name) for name in ("left", "right")}
+        distance = code.convert("ptrtoint", state, "i64") - self.number("own")
+        self._sides = {name: self.number(name) for name in ("left", "right")}
         self._beside = {name: code.address(x + distance) for name, x in self._sides.items()}
 
-    def _number(self, name: str) -> Value:
+    def number(self, name: str) -> Value:
         return self.code.load(self._context, CONTEXT.index(name), INT)
 
     def address(self, name: str) -> Value:
-        return self.code.address(self._number(name))
+        return self.code.address(self.number(name))
 
     # ghosts ---------------------------------------------------------------------------------------------------------
 
@@ -472,7 +527,7 @@ class _Scene:
         if not depth:
             return
         code, at = self.code, self.numbers
-        self._meet()
+        self.meet()
         for f in range(self.stages.fields):
             x = self.vectors["q", f]
             if self.n_axes == 1:
@@ -481,13 +536,13 @@ class _Scene:
                 continue
             length, x = at["plane"] * depth, self.vectors["q", f]
             with code.given(~code.apply("eq", (self._sides["left"], 0))):
-                last = self._of_piece("left", f, (self._number("left_size") - depth) * at["plane"])
+                last = self._of_piece("left", f, (self.number("left_size") - depth) * at["plane"])
                 self._copy(last, code.at(x, -length), length)
             with code.given(~code.apply("eq", (self._sides["right"], 0))):
                 self._copy(self._of_piece("right", f, 0), code.at(x, at["planes"] * at["plane"]), length)
             with code.over(at["planes"] + 2 * depth) as i:
                 self.around(code.at(x, (i - depth) * at["plane"]))
-        self._meet()
+        self.meet()
 
     def around(self, x: Value) -> None:
         """What stands around a plane."""
@@ -534,7 +589,7 @@ class _Scene:
         code, places, W, x = self.code, self.numbers["places"], self.width, self.vectors["q", f]
         own_size = code.load(self.address("sizes"), W - 1, INT)
         for side, first, other, lane, at in (
-            ("left", self._number("left_size") - 1, -1, W - 1, code.constant(-1, INT)),
+            ("left", self.number("left_size") - 1, -1, W - 1, code.constant(-1, INT)),
             ("right", places - own_size, 1, 0, places),
         ):
             with code.given(~code.apply("eq", (self._sides[side], 0))):
@@ -546,8 +601,9 @@ class _Scene:
     def _of_piece(self, side: str, f: int, distance: Any) -> Value:
         return self.code.at(self._beside[side], self.numbers["vector"] * f + self.numbers["low"] + distance)
 
-    def _meet(self) -> None:
-        pass
+    def meet(self) -> None:
+        """Wait for the other threads."""
+        meet(*(self.number(name) for name in ("meeting", "members", "stop")))
 
     # places in memory -----------------------------------------------------------------------------------------------
 
@@ -839,33 +895,28 @@ class Slabs:
                 x[: found.size] = found.ravel()
             masks = [-x[mine].astype(np.int64) for x in (full, follows)]
             offsets = [depth, R][: len(outer)] + [ends[0] * W]
-            numbers = [n_planes, shape[1] if len(order) > 2 else 1, places, vector, plane, row, low, lattice.sites]
-            numbers += [*distances]
+            numbers = [n_planes, shape[1] if len(order) > 2 else 1, places, vector, plane, row, low, lattice.sites, first * distances[0], *distances]
             size = n_planes if outer else int(sizes[mine, -1])
-            self._pieces.append(_Piece(first, numbers, [starts[mine] * strides[-1], sizes[mine], *masks], inside, offsets, own, size))
-        self._distance = distances[0]
+            self._pieces.append(_Piece(numbers, [starts[mine] * strides[-1], sizes[mine], *masks], inside, offsets, own, size))
 
-    def contexts(
-        self, rooms: Sequence[int], helpers: Sequence[int], first: Sequence[int], shared: Sequence[int]
-    ) -> list[np.ndarray]:
+    def contexts(self, rooms: Sequence[int], helpers: Sequence[int], longest: int, shared: Sequence[int]) -> np.ndarray:
         """The numbers of `CONTEXT` of each piece: of the addresses of their states and helpers, and others."""
         found = []
         for k, (piece, room) in enumerate(zip(self._pieces, rooms, strict=True)):
             before, behind = k > 0 or self._closed, k + 1 < len(rooms) or self._closed
             places = [x.ctypes.data + 8 * offset for x, offset in zip(piece.inside, piece.offsets, strict=True)]
             places += [0] * (3 - len(places))
-            numbers = [room, self.size, *first, *piece.numbers, *(x.ctypes.data for x in piece.arrays), *places]
+            numbers = [room, longest, *piece.numbers, *(x.ctypes.data for x in piece.arrays), *places]
             numbers += [piece.sites.ctypes.data, self._values.ctypes.data, helpers[k]]
             numbers += [rooms[k - 1] if before else 0, rooms[(k + 1) % len(rooms)] if behind else 0]
-            found.append(np.array([*numbers, self._pieces[k - 1].size, *shared], dtype=np.int64))
-        return found
+            found.append([*numbers, self._pieces[k - 1].size, k, len(rooms), *shared])
+        return np.array(found, dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """One piece: its first plane; and what stands in its context."""
+    """What stands in the context of a piece."""
 
-    first: int
     numbers: list[int]
     arrays: list[np.ndarray]
     inside: list[np.ndarray]

@@ -657,58 +657,24 @@ class PairCode(Rollouts):
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         self._stages.stage(room.places, room.state, kind, [numbers(i) for i in range(self.size)])
 
-    def prepared(self, table: np.ndarray) -> Columns:
-        """The columns of a table, and which sums their kicks have."""
-        kinds = np.zeros(table.shape[1], dtype=np.int64)
-        for k in range(1, 1 + self._stages.helpers):
-            kinds[table[k] != 0] = k
-        return np.ascontiguousarray(table.T), kinds
-
-    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
-        """Call a compiled run or map; one state is shared by several threads where that pays."""
+    def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
         local, stages = self._local, self._stages
-        n, dim = local.n_bodies, local.dim
-        if name == "run":
-            n_rows, n_columns = arguments[5], arguments[2] * (arguments[7] - arguments[6])
-        else:
-            n_rows, n_columns = arguments[6], arguments[2]
-        stop = np.zeros(1, dtype=np.int64)
-        if name == "run" and arguments[-1] is not NEVER:
-            stop = arguments[-1]
-        elif name == "run":
-            arguments = *arguments[:-1], stop
-        size, chunks = self._sites.shape[1], CHUNKS if local.work >= WORTH_CHUNKS else 1
-        team = Team(threads_for(chunks, n_columns * local.work, None) if n_rows == 1 else 1)
-        sums, meeting = aligned(2 * chunks * dim * size), np.zeros(16, dtype=np.int64)
-        sets, sorts = 4 if stages.compensated else 2, stages.cells is not None
-        function = self.function(name, width)
+        n, dim, size, chunks = local.n_bodies, local.dim, self._sites.shape[1], self.pieces
+        sums, sets, sorts = aligned(2 * chunks * dim * size), len(self._sets), stages.cells is not None
         shared = {"sites": self._sites, "numbers": self._numbers, "sums": sums, "meeting": meeting, "stop": stop}
-        sizes = {"bodies": n, "size": size, "chunks": chunks, "members": team.threads, "turn": 0}
-        sizes |= {"most_cells": most_along(n, dim), "block": max(1, min(BLOCK, MOMENT // local.work))}
-        given = [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
+        sizes = {"bodies": n, "size": size, "chunks": chunks, "members": threads, "turn": 0}
+        sizes |= {"most_cells": most_along(n, dim), "block": block}
 
-        def member(k: int) -> None:
-            room, work = aligned(3 * sets * dim * size), zeros(stages.helpers * dim * size)
+        def member(k: int) -> Member:
             ready = zeros((2 * dim + stages.columns) * size * sorts)
             order, cells = np.arange(n), np.zeros(most_cells(n, dim) * sorts, dtype=np.int64)
-            arrays = shared | {"work": work, "sorted": ready, "order": order, "cells": cells}
+            arrays = shared | {"sorted": ready, "order": order, "cells": cells}
+            arrays["work"] = zeros(stages.helpers * dim * size)
             numbers = sizes | {"member": k} | {name: address(x) for name, x in arrays.items()}
             context = np.array([numbers[name] for name in FIELDS], dtype=np.int64)
-            function(*given, sets * dim * size, 2 * dim * n, address(room), address(context))
+            return Member(aligned(3 * sets * dim * size), context, arrays)
 
-        team(member, stop)
-
-    def step_rows(
-        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
-    ) -> None:
-        """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
-        numbers = np.zeros((*table.shape[:2], len(h)))
-        for k in range(table.shape[2] - 1, -1, -1):
-            numbers = numbers * x + table[:, :, k, None]
-        powers = np.array([1, 1, 3, 5])[: len(table)]
-        tables = (numbers * h ** powers[:, None, None]).transpose(2, 0, 1)
-        for i, each in enumerate(tables):
-            self.mapped(each, y[i : i + 1], out[i : i + 1])
+        return member
 
 
 # forces at many states ------------------------------------------------------------------------------------------------
