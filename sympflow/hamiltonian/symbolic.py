@@ -857,7 +857,8 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     TypeError
         If the library has no function for something in the expressions.
     """
-    code = [_by_products(f) if library == "numpy" else f for f in map(_of_machine_numbers, expressions)]
+    written = _by_products if library == "numpy" else _by_tensor_functions
+    code = [written(_of_machine_numbers(f)) for f in expressions]
     sums = [_in_pieces(f) for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
@@ -896,6 +897,32 @@ def _by_products(f: sp.Expr) -> sp.Expr:
     return f.replace(is_large, product)
 
 
+class tensor_erfc(sp.Function):
+    """erfc, which SymPy does not write for torch."""
+
+    def _torchcode(self, printer: Any) -> str:
+        return f"tensor_erfc({printer._print(self.args[0])})"
+
+
+_OF_TENSORS: dict[Any, Callable[[Any], Any]] = {
+    sp.sec: lambda x: 1 / sp.cos(x),
+    sp.csc: lambda x: 1 / sp.sin(x),
+    sp.cot: lambda x: 1 / sp.tan(x),
+    sp.sech: lambda x: 1 / sp.cosh(x),
+    sp.csch: lambda x: 1 / sp.sinh(x),
+    sp.coth: lambda x: 1 / sp.tanh(x),
+    sp.acot: lambda x: sp.atan(1 / x, evaluate=False),
+    sp.erfc: tensor_erfc,
+}
+"""Functions that SymPy does not write for torch, by those that it does."""
+
+
+def _by_tensor_functions(f: sp.Expr) -> sp.Expr:
+    for function, written in _OF_TENSORS.items():
+        f = f.replace(function, written)
+    return f
+
+
 def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
     half = x if n < 4 else _integer_power(x, n // 2)
     return half * half * x if n % 2 else half * half
@@ -919,11 +946,11 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     """Modules of the functions in the generated code; SciPy is brought in for special functions only."""
     from sympy.printing.numpy import NumPyPrinter
 
-    known = NumPyPrinter().known_functions
+    known = {name for name, code in NumPyPrinter().known_functions.items() if code.startswith("numpy")}
+    if library == "torch":
+        known |= {"erf", "tensor_erfc"}
     names = {type(f).__name__ for expression in code for f in expression.atoms(sp.Function)} - {"integer_power"}
-    special = sorted(
-        n for n in names - known.keys() if n not in ("Max", "Min", "Abs", "Heaviside", "sign", "Piecewise")
-    )
+    special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise"})
     if library == "numpy":
         own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
         return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]
@@ -944,4 +971,12 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     def heaviside(x: Any, value: float) -> Any:
         return torch.heaviside(x, torch.as_tensor(value, dtype=x.dtype, device=x.device))
 
-    return [{"heaviside": heaviside, "max": pairwise(torch.maximum), "min": pairwise(torch.minimum)}, "torch"]
+    return [
+        {
+            "tensor_erfc": torch.special.erfc,
+            "heaviside": heaviside,
+            "max": pairwise(torch.maximum),
+            "min": pairwise(torch.minimum),
+        },
+        "torch",
+    ]

@@ -109,7 +109,7 @@ class OneStep(Rollouts):
             return super().made(name, width)
         # All numbers follow the states in their rows, which have the count behind them.
         n, size = self.n_out + self.counted, self.size
-        return step_function(n, n, [0] * size, size, lambda *numbers: numbers, self.stage, width, self.place)
+        return step_function(n, n, [0] * size, size, lambda _, *numbers: numbers, self.stage, width, self.place)
 
     def steps(self, y: np.ndarray, numbers: np.ndarray) -> Steps:
         """One step from every row of `y` (N, 2d) by its own numbers (N, size)."""

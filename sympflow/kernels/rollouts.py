@@ -17,6 +17,7 @@ __all__ = ["Columns", "Rollouts", "aligned"]
 
 NONE = np.empty(0)
 LINE = 8  # numbers in a line of memory
+START = np.zeros(1, dtype=np.int64)
 AT_ONCE = 4096  # trajectories with tables of their own
 
 Columns = tuple[np.ndarray, np.ndarray]
@@ -49,6 +50,8 @@ class Rollouts:
         How they are there: `sympflow.kernels.runs.Memory`, or such a class.
     data : sequence of ndarray
         Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
+    timed : bool
+        True if stages depend on the step.
     every : int, optional
         Steps after which `look` changes the running state.
     block : int
@@ -65,6 +68,7 @@ class Rollouts:
     data: Sequence[np.ndarray] = ()
     memory: Callable[..., Memory] = Memory
     every: int | None = None
+    timed = False
     block = BLOCK
     counted = False
     closing = True
@@ -114,7 +118,7 @@ class Rollouts:
         """Compile the function of a name: "run", "run own" or "map"."""
         memory = self.place
         if name == "map":
-            return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory)
+            return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
         own = name == "run own"
         return run_function(
@@ -260,7 +264,7 @@ class Rollouts:
             start = np.empty_like(y0)
             self.mapped(before, y0, start)
         self.rollout_batch(run, start, n_steps, save, out, n_finite, stop, first, running, False)
-        self.mapped(after, out.reshape(-1, self.n_out), out.reshape(-1, self.n_out))
+        self.mapped(after, out.reshape(-1, self.n_out), out.reshape(-1, self.n_out), save)
         out[:, : np.searchsorted(save, 0, side="right")] = y0[:, None]
         good = np.isfinite(out).all(-1)
         for i in np.flatnonzero(~good.all(-1)):
@@ -274,10 +278,13 @@ class Rollouts:
         """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
         raise NotImplementedError
 
-    def mapped(self, table: Any, y: np.ndarray, out: np.ndarray) -> None:
-        """All columns of a table, applied to rows `y` (N, 2d); `out` may be `y`."""
+    def mapped(self, table: Any, y: np.ndarray, out: np.ndarray, steps: np.ndarray = START) -> None:
+        """All columns of a table, applied to rows `y` (N, 2d) after steps (n,), one row after the other and again.
+
+        `out` may be `y`.
+        """
         if not len(y):
             return
         entries, kinds = self.prepared(table)
         width = 1 if len(y) == 1 else self.lanes
-        self.call("map", width, entries, kinds, len(kinds), kinds, 1, y, len(y), out)
+        self.call("map", width, entries, kinds, len(kinds), steps, len(steps), y, len(y), out)

@@ -21,8 +21,8 @@ __all__ = ["Lanes", "Memory", "Numbers", "Room", "finished", "groups", "map_func
 
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
-Numbers = Callable[[int], Any]
-"""The number of an index, of one column."""
+Numbers = Callable[..., Any]
+"""``numbers(i, lone=False)``: number i of one column, in all lanes; `lone`, as a scalar if the lanes share it."""
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 """``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
 `step` tells after how many whole steps the stage is executed."""
@@ -147,14 +147,20 @@ def map_function(
     stage: Stage | MemoryStage,
     width: int = 1,
     memory: Callable[..., Memory] | None = None,
+    timed: bool = False,
 ) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table.
+
+    Parameters
+    ----------
+    timed : bool
+        True if stages are given the steps of each lane, else those of the first one for all.
 
     Returns
     -------
     callable
         Of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out), of states in memory then `MEMORY`: row i is
-        mapped after ``steps[i % n_steps]`` whole steps, in lanes the same for all of them; `out` may be `rows`.
+        mapped after ``steps[i % n_steps]`` whole steps; `out` may be `rows`.
     """
     types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("map", types)
@@ -164,12 +170,21 @@ def map_function(
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         state.open(rows, begin, n_rows, n_out)
-        step = code.load(steps, code.op("srem", INT, begin, n_steps), INT)
+        step = _steps_of_lanes(code, steps, n_steps, begin, width if timed else 1)
         with code.over(n_columns) as j:
             state.change(column, j, step)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
     return finished(code, types)
+
+
+def _steps_of_lanes(code: Code, steps: Value, n_steps: Value, begin: Value, width: int) -> Value:
+    if width == 1:
+        return code.load(steps, code.op("srem", INT, begin, n_steps), INT)
+    found = code.memory(1, Type("i64", width))
+    with code.over(code.constant(width, INT)) as lane:
+        code.store(code.load(steps, code.op("srem", INT, begin + lane, n_steps), INT), found, lane)
+    return code.load(found, 0, Type("i64", width))
 
 
 def step_function(
@@ -191,7 +206,7 @@ def step_function(
     own : int
         Numbers that follow each state in its row and replace the last ones given.
     numbers : callable
-        From the given numbers to those that a stage reads.
+        From the time at which a step begins and the given numbers to those that a stage reads.
 
     Returns
     -------
@@ -201,12 +216,12 @@ def step_function(
     """
     types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("steps", types)
-    table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments[:9]
+    table, n_columns, n_powers, x, h, t, rows, n_rows, out = code.arguments[:9]
     state = _state(code, n_values, n_out, width, memory, code.arguments[9:])
     alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
-        (at,), (length,) = alone.loaded(x, begin, n_rows), alone.loaded(h, begin, n_rows)
+        at, length, time = (alone.loaded(given, begin, n_rows)[0] for given in (x, h, t))
         state.open(rows, begin, n_rows, n_out, own)
         values = [] if behind is None else behind.loaded(rows, begin, n_rows, state.n_out + own, state.n_out)
         with code.over(n_columns) as j:
@@ -218,7 +233,7 @@ def step_function(
                     total.value = total.value * at + code.splat(code.load(start, n_powers - 1 - k), width)
                 given.append(total.value)
             grown = [value * length**power if power else value for value, power in zip(given, powers, strict=True)]
-            entries = numbers(*grown[: len(grown) - own], *values)
+            entries = numbers(time, *grown[: len(grown) - own], *values)
             state.change(lambda j, x, step, entries=entries: stage(x, entries.__getitem__, j, step), j, j)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
@@ -487,10 +502,10 @@ def _column(
     def at(j: Value, values: Any, step: Value) -> Any:
         start = code.at(table, j * (size * lanes))
 
-        def number(i: int) -> Value:
+        def number(i: int, lone: bool = False) -> Value:
             if lanes > 1:
                 return code.load(start, i * lanes, Type("double", lanes))
-            return code.splat(code.load(start, i), width)
+            return code.splat(code.load(start, i), 1 if lone else width)
 
         return stage(values, number, code.load(kinds, j, INT), step)
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.loop_functions import LoopFunctions
     from sympflow.kernels.rollouts import Rollouts
     from sympflow.kernels.splittings import Splitting
+    from sympflow.kernels.stage_times import Driving
 
     Functions = LoopFunctions | Rollouts
 
@@ -81,6 +82,7 @@ class SplittingLoops:
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.closes = self.traced = False
         self._symbols: Any = system.symbols
+        self._driving: Driving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Functions]
         self._codes: dict[tuple[int, bool, Monomials], Functions] = {}
@@ -98,12 +100,13 @@ class SplittingLoops:
 
                 self._compile = partial(family_loops, system, damped_drift(system, True))
             elif self.driven:
-                from sympflow.kernels.loop_functions import driven_loops
                 from sympflow.kernels.stage_times import driven_form
 
-                driving = driven_form(system.symbols.parametric)
-                self.values = driving.form.values
-                self._compile = partial(driven_loops, driving, damped_drift(system, False))
+                self._driving = driven_form(system.symbols.parametric)
+                self._driving.check()
+                damped_drift(system, False)
+                self.values, self.traced = self._driving.form.values, True
+                self.abreast = LANES
             else:
                 V = system.symbols.V
                 check_recorded(V)
@@ -234,7 +237,9 @@ class SplittingLoops:
         key = level, compensated, monomials
         if key not in self._codes:
             ndim = None if self.friction is None else self.friction.damping.ndim
-            make = self._written or partial(Splitting, self._symbols.parametric)
+            driving = self._driving
+            symbols = self._symbols.parametric if driving is None else driving.form
+            make = self._written or partial(Splitting, symbols, driving=driving)
             splitting = make(level, monomials, compensated, ndim)
             self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import Value
+from sympflow.compiler.control import Type, Value
 from sympflow.compiler.functions import times
 from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
@@ -27,11 +27,13 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.kernels.stage_times import Driving
 
 __all__ = ["Shape", "Splitting", "SplittingCode", "shared"]
 
 MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
+CLOCK = 3  # numbers of the time in a column
 EARLY = -4  # when momenta are known before the positions, in cycles
 
 
@@ -49,6 +51,8 @@ class Splitting:
         True if states have the errors of compensated sums.
     friction : int, optional
         Dimensions of Γ.
+    driving : Driving, optional
+        Of `symbols` with letters for what depends on the time.
     """
 
     symbols: SymbolicHamiltonian
@@ -56,12 +60,14 @@ class Splitting:
     monomials: Monomials = ()
     compensated: bool = False
     friction: int | None = None
+    driving: Driving | None = None
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Same for systems that share their code: those that differ in the values of parameters alone."""
         of_system = self.symbols.H, self.symbols.parameters, self.symbols.q, self.symbols.p
-        return *of_system, self.level, self.monomials, self.compensated, self.friction
+        driving = None if self.driving is None else self.driving.key
+        return *of_system, self.level, self.monomials, self.compensated, self.friction, driving
 
     @property
     def kick_numbers(self) -> tuple[str, ...]:
@@ -268,7 +274,8 @@ class SplittingCode(Rollouts):
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         symbols = splitting.symbols
         super().__init__(2 * symbols.ndof * (1 + splitting.compensated), 2 * symbols.ndof)
-        self._own = len(symbols.parameters)
+        self.timed = splitting.driving is not None
+        self._own = len(symbols.values if self.timed else symbols.parameters)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SplittingCode, (self._splitting,)
@@ -280,23 +287,49 @@ class SplittingCode(Rollouts):
     @cached_property
     def size(self) -> int:
         """Numbers of a column that the code reads."""
+        if self.timed:
+            letters = len(self._splitting.symbols.parameters) - self._own
+            return len(self._splitting.numbers) - letters + CLOCK
         return max(len(kind.table.outputs) for kind in self._kinds)
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """A kick and a drift, of the kind that a column has."""
         if len(self._kinds) == 1:
-            return self._executed(0, values, numbers)
+            return self._executed(0, values, self._column(0, values[0].type, numbers, step))
         code = values[0].code
         results = [code.variable(x) for x in values]
         for k in range(len(self._kinds)):
             with code.given(code.apply("eq", (kind, k))):
-                for result, x in zip(results, self._executed(k, values, numbers), strict=True):
+                column = self._column(k, values[0].type, numbers, step)
+                for result, x in zip(results, self._executed(k, values, column), strict=True):
                     result.value = x
         return [x.value for x in results]
 
-    def _executed(self, k: int, values: list[Value], numbers: Numbers) -> list[Value]:
-        table, body = self._kinds[k]
-        return body(*values, *[numbers(i) for i in range(len(table.outputs))])
+    def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
+        return self._kinds[k].body(*values, *column)
+
+    def _column(self, k: int, type: Type, numbers: Numbers, step: Value) -> list[Value]:
+        """The numbers that a stage of a kind reads."""
+        table = self._kinds[k].table
+        if not self.timed:
+            return [numbers(i) for i in range(len(table.outputs))]
+        code, given = step.code, [numbers(i, lone=True) for i in range(self.size)]
+        before, first, length = given[self._clock]
+        time = first + (code.convert("sitofp", step, "double") * length + before)
+        return [code.operand(x, type) for x in table(*self._lettered(time, given))]
+
+    @cached_property
+    def _clock(self) -> slice:
+        """The places of the numbers of the time in a column: when the kick is, when step 0 begins, how long one is."""
+        end = self.size - self._own
+        return slice(end - CLOCK, end)
+
+    def _lettered(self, time: Value, given: Sequence[Value]) -> list[Any]:
+        """The numbers of a column of a driven system, of those that are given, with its letters at a time."""
+        driving, clock = self._splitting.driving, self._clock
+        assert driving is not None
+        fixed = given[clock.stop :]
+        return [*given[: clock.start], *fixed, *driving.values_at(time, given[0], fixed)]
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "step" and "step own" too."""
@@ -304,19 +337,27 @@ class SplittingCode(Rollouts):
         if what != "step":
             return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
-        powers = [1, *kick.powers, *(0 for _ in range(self._own))]
-        last = len(self._kinds) - 1
+        powers = [1, *kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self._own]
+        last, table = len(self._kinds) - 1, self._kinds[-1].table
+
+        def column(time: Value, *given: Value) -> list[Any]:
+            if not self.timed:
+                return table(*given)
+            at = time + given[self._clock][0]
+            return [time.code.operand(x, time.type) for x in table(*self._lettered(at, given))]
 
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-            return self._executed(last, values, numbers)
+            return self._executed(last, values, [numbers(i) for i in range(len(table.outputs))])
 
-        own_numbers, table = self._own if own else 0, self._kinds[last].table
-        return step_function(self.n_values, self.n_out, powers, own_numbers, table, stage, width, self.place)
+        own_numbers = self._own if own else 0
+        return step_function(self.n_values, self.n_out, powers, own_numbers, column, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
 
     def prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The numbers (m, size) that the code reads, of a table (n, m) of given ones, and the kinds (m,) of columns."""
+        if self.timed:
+            return np.ascontiguousarray(table.T), self._kinds_of(table)
         key = table.tobytes()
         found = self._tables.get(key)
         if found is None:
@@ -334,6 +375,8 @@ class SplittingCode(Rollouts):
 
     def _entries(self, table: Any, kinds: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
         """The numbers (m, size, *shape) of rows, each (m,) or (m, *shape)."""
+        if self.timed:
+            return np.stack([np.broadcast_to(row, (len(kinds), *shape)) for row in table], axis=1)
         entries = np.zeros((len(kinds), self.size, *shape))
         for k, kind in enumerate(self._kinds):
             with np.errstate(all="ignore"):

@@ -88,11 +88,12 @@ class StageTable:
         return rows
 
     def timed_rows(self, values: tuple[float, ...], h: float, t0: float) -> np.ndarray:
-        """`rows`, then the times of the kicks, that of step 0 and the step of the time, of a driven system."""
+        """`rows`, before the values the times of the kicks, that of step 0 and the step of the time."""
         of_kicks = np.cumsum(self.drifts, axis=0) - self.drifts if self.times is None else self.times
         clock = np.zeros((2, *of_kicks.shape))
         (clock if clock.ndim == 2 else clock[..., 0])[:] = np.array([t0, self.direction * h])[:, None]
-        return np.concatenate([self.rows(values), of_kicks[None], clock])
+        rows, n = self.rows(values), len(self.packed)
+        return np.concatenate([rows[:n], of_kicks[None], clock, rows[n:]])
 
     @cached_property
     def _with_values(self) -> dict[tuple[float, ...], np.ndarray]:

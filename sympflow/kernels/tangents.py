@@ -260,13 +260,11 @@ class TangentCode(SplittingCode):
             return super().stage(values, numbers, kind, step)
         for k in range(len(self._kinds)):
             with values.code.given(values.code.apply("eq", (kind, k))):
-                self._executed(k, values, numbers)
+                self._executed(k, values, self._column(k, values.type, numbers, step))
         return None
 
-    def _executed(self, k: int, values: Any, numbers: Numbers) -> Any:
-        d = self._d
-        table, body = self._kinds[k]
-        column = [numbers(i) for i in range(len(table.outputs))]
+    def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
+        d, body = self._d, self._kinds[k].body
         if not isinstance(values, Room):
             n = 2 * d * (1 + self.vectors)
             return [*body(*values[:n], *column), *values[n:]]

@@ -86,6 +86,33 @@ def test_special_functions_have_their_values_and_are_undefined_elsewhere():
     assert np.isnan(W[1])
 
 
+OF_ARRAYS = {
+    **dict.fromkeys(["erf(q)", "erfc(q)", "sec(q/3)", "csc(q + 2)", "cot(q + 2)", "acot(q)*q"], True),
+    **dict.fromkeys(["sech(q)", "csch(q + 2)", "coth(q + 2)", "sinc(q)"], True),
+    "Piecewise((q**2, Piecewise((q, q > 0), (-q, True)) > 1), (2*Abs(q) - 1, True))": True,
+    "Max(Piecewise((q, Heaviside(q) > 0.3), (-q, True)), 1)*q**2": True,
+    **dict.fromkeys(["gamma(q + 2)", "loggamma(q + 2)", "besselj(1, q)", "besselk(0, q + 2)"], False),
+    **dict.fromkeys(["elliptic_k(q/4)", "elliptic_e(q, 0.3)", "airyai(q)", "LambertW(q + 1)"], False),
+}
+"""V, and True if torch has it; else tensors are refused."""
+
+
+@pytest.mark.parametrize("V", OF_ARRAYS)
+def test_functions_of_arrays_have_their_values(V):
+    system, q = made(f"p**2/2 + {V}"), np.array([0.7, 1.3, -0.3])
+    y = np.stack([q, 0 * q], axis=-1)
+    exact = sp.lambdify(system.symbols.q[0], system.symbols.V, "mpmath")
+    with mpmath.workdps(40):
+        right = [[float(mpmath.diff(exact, x, n)) for x in q.tolist()] for n in range(3)]
+    found = system.potential(y[:, :1]), -system.force(y[:, :1])[:, 0], system.hessian(y)[:, 0, 0]
+    np.testing.assert_allclose(found, right, rtol=1e-13, atol=1e-14)
+    if OF_ARRAYS[V]:
+        np.testing.assert_allclose(system.gradient(torch.tensor(y)), system.gradient(y), rtol=1e-13, atol=1e-14)
+    else:
+        with pytest.raises(TypeError, match=r"`expression` holds .* which torch has not: solve on NumPy states"):
+            system.hamiltonian(torch.tensor(y))
+
+
 @pytest.mark.parametrize(
     ("text", "more"),
     [
