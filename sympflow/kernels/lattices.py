@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import threading
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -21,14 +21,16 @@ import numpy as np
 from sympflow.compiler.arrange import ALWAYS, Arrangement
 from sympflow.compiler.control import INT, Code, Sweep, Type, Value
 from sympflow.compiler.functions import FUNCTIONS, times
+from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
-from sympflow.kernels.runs import Memory, Room
-from sympflow.kernels.teams import meet
-from sympflow.schemes import CURVATURE
+from sympflow.kernels.rollouts import aligned
+from sympflow.kernels.runs import Memory, Numbers, Room
+from sympflow.kernels.teams import Member, SharedRollouts, meet
+from sympflow.schemes import CURVATURE, POLYNOMIAL
 
-__all__ = ["Form", "LatticeStages"]
+__all__ = ["LatticeCode"]
 
 Key = tuple[Any, ...]
 """A number of a site: its kind, and which one of these."""
@@ -927,3 +929,89 @@ class _Piece:
 
 def _strides(shape: Sequence[int]) -> list[int]:
     return [int(np.prod(shape[k + 1 :], dtype=np.int64)) for k in range(len(shape))]
+
+
+class LatticeCode(SharedRollouts):
+    """The compiled functions of splitting schemes on one lattice, of which only its form is part of the code.
+
+    Parameters
+    ----------
+    lattice : LatticeHamiltonian
+    level : int
+        See `Scheme`.
+    compensated : bool
+    damped : bool
+        True if there is friction −γp, whose numbers are the last two rows of a table.
+    """
+
+    def __init__(self, lattice: LatticeHamiltonian, level: int, compensated: bool, damped: bool) -> None:
+        if level == POLYNOMIAL:
+            raise ValueError(
+                "`scheme` has polynomials, which are of systems by their coordinates one by one: use backend='array'."
+            )
+        super().__init__(2 * lattice.ndof * (1 + compensated), 2 * lattice.ndof)
+        self._given = lattice, level, compensated, damped
+        self._order, width = arrangement(lattice)
+        self._stages = _stages(Form.of(lattice, self._order, level, compensated, damped, width))
+        self._functions, self._lock = self._stages.functions, self._stages.lock
+        self.memory = partial(LatticeInMemory, self._stages)
+        self.work, self.terms = lattice.ndof, 1 + level
+        reach = max(1, self._stages.form.reach * (1 + level))
+        planes = lattice.shape[self._order[0]] // (width if len(lattice.shape) == 1 else 1)
+        self.pieces = max(1, min(lattice.ndof // WORTH_A_PIECE, planes // (8 * reach)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return LatticeCode, self._given
+
+    @cached_property
+    def size(self) -> int:
+        return len(self._stages.form.column)
+
+    def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
+        self._stages.stage(room, numbers, kind)
+
+    @cached_property
+    def _slabs(self) -> dict[int, Slabs]:
+        return {}
+
+    def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
+        slabs = self._slabs.get(threads)
+        if slabs is None:
+            slabs = self._slabs[threads] = Slabs(self._given[0], self._stages, self._order, threads)
+        rooms = [aligned(3 * slabs.size) for _ in range(threads)]
+        helpers = [np.zeros(slabs.helpers) for _ in range(threads)]
+        found = np.zeros(threads, dtype=np.int64)
+        shared = [address(x) for x in (meeting, stop, found)]
+        contexts = slabs.contexts([*map(address, rooms)], [*map(address, helpers)], block, shared)
+        return lambda k: Member(rooms[k], contexts[k], (slabs, helpers, found))
+
+
+WORTH_A_PIECE = 16_384
+"""Degrees of freedom from which another thread pays: threads wait for each other twice a stage."""
+
+
+@lru_cache(maxsize=64)
+def _stages(form: Form) -> LatticeStages:
+    return LatticeStages(form)
+
+
+def arrangement(lattice: LatticeHamiltonian) -> tuple[list[int], int]:
+    """The axes of a lattice, that which is cut into slabs last, and how many slabs: with the least done in vain."""
+    reach, one_axis = max(1, max(lattice.bonds, default=0)), len(lattice.shape) == 1
+    best: tuple[float, list[int], int] | None = None
+    for axis in reversed(range(len(lattice.shape))):
+        n = lattice.shape[axis]
+        for width in (8, 4, 2, 1):
+            places = -(-n // width)
+            if n // width < (4 if one_axis else 2) * reach and width > 1:
+                continue
+            others = [a for a in range(len(lattice.shape)) if a != axis]
+            cost = width * (places + 2 * reach) / n * (8 / width) * (1.25 if places > LONG and others else 1.0)
+            if best is None or cost < best[0]:
+                best = cost, [*others, axis], width
+    assert best is not None
+    return best[1:]
+
+
+LONG = 256
+"""Places of a row from which the rows around a site leave the fastest cache."""

@@ -24,11 +24,10 @@ from sympflow.compiler.machine import address, host
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
-from sympflow.kernels.rollouts import Columns, Rollouts, aligned
+from sympflow.kernels.rollouts import aligned
 from sympflow.kernels.runs import Memory, Numbers, Room, finished
 from sympflow.kernels.splittings import Shape, Splitting
-from sympflow.kernels.teams import Team, meet
-from sympflow.kernels.threads import NEVER, threads_for
+from sympflow.kernels.teams import Member, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
@@ -46,8 +45,6 @@ LANES = 1 << SHIFT
 CHUNKS, WORTH_CHUNKS = 8, 100_000
 """Chunks of a sum, which threads share, and about how many nanoseconds a sum takes from which there are more than one:
 threads wait for each other after each sum."""
-BLOCK, MOMENT = 1024, 200_000_000
-"""Most steps between two looks for an interrupt, and about how many nanoseconds they may take."""
 
 
 def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Arranged:
@@ -619,7 +616,7 @@ def _check_level(level: int) -> None:
         raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
 
 
-class PairCode(Rollouts):
+class PairCode(SharedRollouts):
     """The compiled functions of splitting schemes on bodies in pairs, of which only the potential is part of the code.
 
     Parameters
@@ -632,15 +629,15 @@ class PairCode(Rollouts):
         True if there is friction −γp, whose numbers are the last two rows of a table.
     """
 
-    lanes = 1
-    room = 0
-
     def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
         _check_level(level)
         self._given = local, level, compensated, damped
         self._local = local
         self._stages = PairStages(local, level, compensated, damped)
-        self.memory = partial(BodiesInMemory, local.dim, 4 if compensated else 2)
+        self._sets = 4 if compensated else 2
+        self.memory = partial(BodiesInMemory, local.dim, self._sets)
+        self.work, self.terms = local.work, self._stages.helpers
+        self.pieces = CHUNKS if local.work >= WORTH_CHUNKS else 1
         self._numbers = self._stages.numbers()
         n = local.n_bodies
         self._sites = zeros((1 + len(local.columns)) * (-(-n // LANES) * LANES)).reshape(1 + len(local.columns), -1)
@@ -660,7 +657,7 @@ class PairCode(Rollouts):
     def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
         local, stages = self._local, self._stages
         n, dim, size, chunks = local.n_bodies, local.dim, self._sites.shape[1], self.pieces
-        sums, sets, sorts = aligned(2 * chunks * dim * size), len(self._sets), stages.cells is not None
+        sums, sets, sorts = aligned(2 * chunks * dim * size), self._sets, stages.cells is not None
         shared = {"sites": self._sites, "numbers": self._numbers, "sums": sums, "meeting": meeting, "stop": stop}
         sizes = {"bodies": n, "size": size, "chunks": chunks, "members": threads, "turn": 0}
         sizes |= {"most_cells": most_along(n, dim), "block": block}

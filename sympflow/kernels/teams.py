@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import INT, Type, Value
+from sympflow.compiler.machine import address
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import BLOCK
-from sympflow.kernels.threads import NEVER, address, threads_for
+from sympflow.kernels.threads import NEVER, threads_for
 
 __all__ = ["Member", "SharedRollouts", "Team", "meet"]
 
