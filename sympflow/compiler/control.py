@@ -492,23 +492,21 @@ class Code:
 
     @contextmanager
     def sweep(self, first: Value, last: Value, read: Callable[[Any, Value], Value]) -> Iterator[Sweep]:
-        """Execute what is written inside for k = first … last − 1, with values of other turns: see `Sweep`."""
+        """Execute what is written inside for k = first … last − 1, at least once, with values of other turns."""
         sweep = Sweep(self, first, read)
         outside, self._lines = self._lines, []
-        head, inside, after, before = self._label(), self._label(), self._label(), self._block
-        self._begin(inside, head)
+        head, after, before = self._label(), self._label(), self._block
+        self._block, self._before[head] = head, before
         yield sweep
         following = sweep.k + 1
-        self._branch(head)
+        again = following < last
         end, body, self._lines = self._block, self._lines, outside
         phis, begun, made = sweep.finished(before, end, following)
         self._lines += begun
         self._branch(head)
         self._begin(head, before)
-        self._lines += phis
-        self._lines.append(f"  br i1 {(sweep.k < last).name}, label %{inside}, label %{after}")
-        self._lines += [body[0], *made, *body[1:]]
-        self._begin(after, head)
+        self._lines += [*phis, *made, *body, f"  br i1 {again.name}, label %{head}, label %{after}"]
+        self._begin(after, end)
 
     @contextmanager
     def elsewhere(self, lines: list[str]) -> Iterator[None]:

@@ -60,6 +60,8 @@ class Form:
         True if there is friction −γp, whose numbers are the last two of a column.
     width : int
         Lanes.
+    even : bool
+        True if all slabs have as many sites.
     """
 
     terms: tuple[tuple[Any, tuple[Any, tuple[Any, ...]]], ...]
@@ -72,10 +74,18 @@ class Form:
     compensated: bool
     damped: bool
     width: int
+    even: bool
 
     @classmethod
     def of(
-        cls, lattice: LatticeHamiltonian, order: Sequence[int], level: int, compensated: bool, damped: bool, width: int
+        cls,
+        lattice: LatticeHamiltonian,
+        order: Sequence[int],
+        level: int,
+        compensated: bool,
+        damped: bool,
+        width: int,
+        even: bool,
     ) -> Form:
         """The form of a lattice whose axes are taken in an order."""
         terms: dict[Any, Any] = {"kinetic": (lattice.T, lattice.p)}
@@ -86,7 +96,7 @@ class Form:
         arrays = frozenset(s for s, value in values if isinstance(value, np.ndarray))
         given = tuple(terms.items()), (*lattice.v, *lattice.w), lattice.c, arrays, lattice.inverse_mass is None
         boundary = tuple(lattice.boundary[axis] for axis in order)
-        return cls(*given, boundary, level, compensated, damped, width)
+        return cls(*given, boundary, level, compensated, damped, width, even)
 
     @property
     def fields(self) -> int:
@@ -130,6 +140,8 @@ class Law:
     ----------
     numbers : list of str
         The numbers that depend on parameters alone, written out.
+    operations : int
+        About how many instructions it takes.
     """
 
     def __init__(self, form: Form, keys: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> None:
@@ -141,6 +153,7 @@ class Law:
             shapes.append(made.finish(list(found.values())))
         self._keys, self.results = keys, list(found)
         self.table, self._body = min(shapes, key=lambda shape: len(shape.body))
+        self.operations = sum(FUNCTIONS[x.name].cost // 3 for x in self._body.operations)
         used = {x.order for x in reached(self._body.outputs)}
         self._reads = [x.order in used for x in self._body.inputs]
         self.numbers = [_formula(x) for x in self.table.outputs]
@@ -377,6 +390,7 @@ class LatticeStages:
         self.vectors = [(kind, f) for kind in self.sets for f in range(self.fields)]
         laws = [law for one in self.passes.values() for law in (one.site, *one.bonds.values())]
         arrays = {s.name for s in form.arrays}
+        self._operations = len(form.boundary) * sum(law.operations for law in laws)
         self._made = {name: (law, i) for law in laws for i, name in enumerate(law.numbers)}
         self.arrays, self.values = list[str](), list[str]()
         for name, (law, i) in self._made.items():
@@ -415,7 +429,10 @@ class LatticeStages:
     def stage(self, room: Room, numbers: Callable[[int], Value], kind: Value) -> None:
         """Change a state by a kick of a kind, without force gradient up to 1, and a drift."""
         given = [numbers(i) for i in range(len(self.form.column))]
-        room.code.outlined("stage", (room.state, room.places, kind, *given), self._stage)
+        if self._operations < INLINE:
+            self._stage(room.state, room.places, kind, *given)
+        else:
+            room.code.outlined("stage", (room.state, room.places, kind, *given), self._stage)
 
     def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
         code, scene = state.code, _Scene(self, state, context, numbers)
@@ -480,6 +497,10 @@ class LatticeInMemory(Memory):
                         code.store(code.load(x, in_state), rows, in_row)
 
 
+INLINE = 100
+"""Instructions up to which the code of a stage stands in the loop over stages, and not in a function of its own."""
+
+
 class _Scene:
     """The code of one stage: the numbers and arrays that it reads, and loops over sites.
 
@@ -509,12 +530,7 @@ class _Scene:
             ("column", name): code.splat(x, width) for name, x in zip(self.form.column, column, strict=True)
         } | {("number", name): code.splat(code.load(values, i), width) for i, name in enumerate(stages.values)}
         self.helpers = self.address("helpers")
-        self._full, self._follows = (
-            code.apply("lt", (code.load(self.address(name), 0, self.bits), 0)) for name in ("full", "follows")
-        )
-        distance = code.convert("ptrtoint", state, "i64") - self.number("own")
-        self._sides = {name: self.number(name) for name in ("left", "right")}
-        self._beside = {name: code.address(x + distance) for name, x in self._sides.items()}
+        self._distance = code.convert("ptrtoint", state, "i64") - self.number("own")
 
     def number(self, name: str) -> Value:
         return self.code.load(self._context, CONTEXT.index(name), INT)
@@ -534,14 +550,14 @@ class _Scene:
             x = self.vectors["q", f]
             if self.n_axes == 1:
                 self._ghosts(x, depth)
-                self._ghosts_of_pieces(f, depth)
+                with code.given(self.number("members") > 1):
+                    self._ghosts_of_pieces(f, depth)
                 continue
-            length, x = at["plane"] * depth, self.vectors["q", f]
-            with code.given(~code.apply("eq", (self._sides["left"], 0))):
-                last = self._of_piece("left", f, (self.number("left_size") - depth) * at["plane"])
-                self._copy(last, code.at(x, -length), length)
-            with code.given(~code.apply("eq", (self._sides["right"], 0))):
-                self._copy(self._of_piece("right", f, 0), code.at(x, at["planes"] * at["plane"]), length)
+            length = at["plane"] * depth
+            with self._piece("left", f) as beside:
+                self._copy(code.at(beside, (self.number("left_size") - depth) * at["plane"]), code.at(x, -length), length)
+            with self._piece("right", f) as beside:
+                self._copy(beside, code.at(x, at["planes"] * at["plane"]), length)
             with code.over(at["planes"] + 2 * depth) as i:
                 self.around(code.at(x, (i - depth) * at["plane"]))
         self.meet()
@@ -566,14 +582,16 @@ class _Scene:
     def _ghosts(self, x: Value, depth: int) -> None:
         """Places before and behind the slabs of a row, taken from the lanes beside."""
         code, places, W = self.code, self.numbers["places"], self.width
+        full, follows = (partial(self._chosen, name) for name in ("full", "follows"))
 
         def ends(k: Value) -> None:
             for chosen, yes, no, order, at in (
-                (self._full, places - 1 - k, places - 2 - k, [W - 1, *range(W - 1)], code.constant(-1, INT) - k),
-                (self._follows, k, k + 1, [*range(1, W), 0], places + k),
+                (full, places - 1 - k, places - 2 - k, [W - 1, *range(W - 1)], code.constant(-1, INT) - k),
+                (follows, k, k + 1, [*range(1, W), 0], places + k),
             ):
-                a, b = (code.load(x, i * W, self.type) for i in (yes, no))
-                ghost = code.select(chosen, a, b)
+                ghost = code.load(x, yes * W, self.type)
+                if not self.form.even:
+                    ghost = code.select(chosen(), ghost, code.load(x, no * W, self.type))
                 ghost = code.shuffle(ghost, ghost, order)
                 if self.form.boundary[-1] == "fixed":
                     ghost = self.within(ghost, code.load(self.inside(self.n_axes - 1), at * W, self.bits))
@@ -586,6 +604,9 @@ class _Scene:
             with code.over(depth) as k:
                 ends(k)
 
+    def _chosen(self, name: str) -> Value:
+        return self.code.apply("lt", (self.code.load(self.address(name), 0, self.bits), 0))
+
     def _ghosts_of_pieces(self, f: int, depth: int) -> None:
         """The same of the first slab and the last one, taken from other pieces."""
         code, places, W, x = self.code, self.numbers["places"], self.width, self.vectors["q", f]
@@ -594,18 +615,21 @@ class _Scene:
             ("left", self.number("left_size") - 1, -1, W - 1, code.constant(-1, INT)),
             ("right", places - own_size, 1, 0, places),
         ):
-            with code.given(~code.apply("eq", (self._sides[side], 0))):
-                beside = self._of_piece(side, f, 0)
-                with code.over(depth) as k:
-                    number = code.load(beside, (first + k * other) * W + lane)
-                    code.store(number, x, (at + k * other) * W + (W - 1 - lane))
+            with self._piece(side, f) as beside, code.over(depth) as k:
+                number = code.load(beside, (first + k * other) * W + lane)
+                code.store(number, x, (at + k * other) * W + (W - 1 - lane))
 
-    def _of_piece(self, side: str, f: int, distance: Any) -> Value:
-        return self.code.at(self._beside[side], self.numbers["vector"] * f + self.numbers["low"] + distance)
+    @contextmanager
+    def _piece(self, side: str, f: int) -> Iterator[Value]:
+        """If there is a piece beside, with the first site of field f of q there."""
+        code, room = self.code, self.number(side)
+        with code.given(~code.apply("eq", (room, 0))):
+            yield code.at(code.address(room + self._distance), self.numbers["vector"] * f + self.numbers["low"])
 
     def meet(self) -> None:
         """Wait for the other threads."""
-        meet(*(self.number(name) for name in ("meeting", "members", "stop")))
+        with self.code.given(self.number("members") > 1):
+            meet(*(self.number(name) for name in ("meeting", "members", "stop")))
 
     # places in memory -----------------------------------------------------------------------------------------------
 
@@ -952,13 +976,15 @@ class LatticeCode(SharedRollouts):
         super().__init__(2 * lattice.ndof * (1 + compensated), 2 * lattice.ndof)
         self._given = lattice, level, compensated, damped
         self._order, width = arrangement(lattice)
-        self._stages = _stages(Form.of(lattice, self._order, level, compensated, damped, width))
+        n, one_axis = lattice.shape[self._order[-1]], len(lattice.shape) == 1
+        depth = max(1, max(lattice.bonds, default=0) * (1 + level))
+        planes = n // width if one_axis else lattice.shape[self._order[0]]
+        self.pieces = max(1, min(lattice.ndof // WORTH_A_PIECE, planes // (8 * depth)))
+        even = n % width == 0 and (self.pieces == 1 or not one_axis)
+        self._stages = _stages(Form.of(lattice, self._order, level, compensated, damped, width, even))
         self._functions, self._lock = self._stages.functions, self._stages.lock
         self.memory = partial(LatticeInMemory, self._stages)
         self.work, self.terms = lattice.ndof, 1 + level
-        reach = max(1, self._stages.form.reach * (1 + level))
-        planes = lattice.shape[self._order[0]] // (width if len(lattice.shape) == 1 else 1)
-        self.pieces = max(1, min(lattice.ndof // WORTH_A_PIECE, planes // (8 * reach)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return LatticeCode, self._given
