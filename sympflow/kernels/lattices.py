@@ -25,7 +25,7 @@ from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
-from sympflow.kernels.rollouts import aligned
+from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room
 from sympflow.kernels.teams import Member, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, POLYNOMIAL
@@ -911,15 +911,15 @@ class Slabs:
             if outer:
                 sites[0] = sites[0] + first
             sites.append(starts[mine] + np.arange(-ends[0], places + ends[1])[:, None])
-            inside = [-(p | (0 <= i) & (i < n)).astype(np.int64) for i, n, p in zip(sites, shape, periodic, strict=True)]
+            inside = [_mask(p | (0 <= i) & (i < n)) for i, n, p in zip(sites, shape, periodic, strict=True)]
             index = [i % n if p else i.clip(0, n - 1) for i, n, p in zip(sites, shape, periodic, strict=True)]
-            own = np.zeros((len(arrays), vector))
+            own = zeros(len(arrays) * vector).reshape(len(arrays), vector)
             for x, array in zip(own, arrays, strict=True):
                 found = np.broadcast_to(array, lattice.shape).transpose(order)
                 for axis, i in enumerate(index):
                     found = found.take(i, axis)
                 x[: found.size] = found.ravel()
-            masks = [-x[mine].astype(np.int64) for x in (full, follows)]
+            masks = [_mask(x[mine]) for x in (full, follows)]
             offsets = [depth, R][: len(outer)] + [ends[0] * W]
             numbers = [n_planes, shape[1] if len(order) > 2 else 1, places, vector, plane, row, low, lattice.sites, first * distances[0], *distances]
             size = n_planes if outer else int(sizes[mine, -1])
@@ -949,6 +949,13 @@ class _Piece:
     offsets: list[int]
     sites: np.ndarray
     size: int
+
+
+def _mask(x: np.ndarray) -> np.ndarray:
+    """Numbers all bits of which are as these."""
+    bits = zeros(x.size).view(np.int64)
+    bits[:] = -x.ravel().astype(np.int64)
+    return bits
 
 
 def _strides(shape: Sequence[int]) -> list[int]:
@@ -1005,7 +1012,7 @@ class LatticeCode(SharedRollouts):
         if slabs is None:
             slabs = self._slabs[threads] = Slabs(self._given[0], self._stages, self._order, threads)
         rooms = [aligned(3 * slabs.size) for _ in range(threads)]
-        helpers = [np.zeros(slabs.helpers) for _ in range(threads)]
+        helpers = [zeros(slabs.helpers) for _ in range(threads)]
         found = np.zeros(threads, dtype=np.int64)
         shared = [address(x) for x in (meeting, stop, found)]
         contexts = slabs.contexts([*map(address, rooms)], [*map(address, helpers)], block, shared)

@@ -24,7 +24,7 @@ from sympflow.compiler.machine import address, host
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
-from sympflow.kernels.rollouts import aligned
+from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room, finished
 from sympflow.kernels.splittings import Shape, Splitting
 from sympflow.kernels.teams import Member, SharedRollouts, meet
@@ -321,13 +321,6 @@ class FewShape(Shape):
         if local.cutoff is None:
             return slope
         return made.operation("where", made.operation("lt", s, made.written(self.number["end"])), slope, 0.0)
-
-
-def zeros(n: int) -> np.ndarray:
-    """Numbers 0 that begin with a line of memory."""
-    x = aligned(n)
-    x[:] = 0.0
-    return x
 
 
 # more bodies than a few: states in memory ---------------------------------------------------------------------------

@@ -30,6 +30,13 @@ def aligned(n: int) -> np.ndarray:
     return memory[-(memory.ctypes.data // 8) % LINE :][:n]
 
 
+def zeros(n: int) -> np.ndarray:
+    """The same, of 0."""
+    x = aligned(n)
+    x[:] = 0.0
+    return x
+
+
 class Rollouts:
     """The compiled functions of one stage. A method says what its stage is, and how its tables become columns.
 
