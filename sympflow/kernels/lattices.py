@@ -674,23 +674,27 @@ class _Scene:
                 for one, lag in zip(passes, lags, strict=True):
                     _Place(self, one, sweep, lag).execute()
             return
-        with code.over(at["planes"] - first) as k:
-            for one, lag in zip(passes, lags, strict=True):
-                plane = k + (first + lag)
-                with code.given(code.constant(-lag - R, INT) <= plane):
-                    if self.n_axes > 2:
-                        with code.over(at["rows"] + R) as r:
-                            self._row(one, plane, lag, r - R)
-                    else:
-                        self._row(one, plane, lag, code.constant(0, INT))
+        steps = [-self.form.before(m - k) for k in range(m)]
+        for k, step in enumerate(steps):  # those that are behind begin later
+            own = list(zip(passes[: k + 1], lags, strict=False))
+            last = steps[k + 1] if k + 1 < m else at["planes"]
+            with code.over(last - step) as i:
+                plane = i + step
+                if self.n_axes > 2:
+                    with code.over(at["rows"] + R) as r:
+                        self._row(own, plane, r - R)
+                else:
+                    self._row(own, plane, code.constant(0, INT))
+                for one, lag in own:
                     for key in one.site.results:
                         if key[0] in ("v", "w"):
-                            self.around(self.kept(key, self.stages.slots, plane))
+                            self.around(self.kept(key, self.stages.slots, plane + lag))
 
-    def _row(self, one: Pass, plane: Value, lag: int, row: Value) -> None:
-        place = _RowPlace(self, one, plane, lag, row)
-        with self.code.sweep(self.code.constant(-self.reach, INT), self.numbers["places"], place.read) as place.sweep:
-            place.execute()
+    def _row(self, passes: Sequence[tuple[Pass, int]], plane: Value, row: Value) -> None:
+        own = _Row(self, plane, row)
+        with self.code.sweep(self.code.constant(-self.reach, INT), self.numbers["places"], own.read) as own.sweep:
+            for one, lag in passes:
+                _RowPlace(own, one, lag).execute()
 
     def _at_place(self, key: Key, i: Value) -> Value:
         """Read a number of a lattice of one axis."""
@@ -707,7 +711,8 @@ class _Place:
     """A site of a lattice of one axis, at which a pass is executed: at the place `lag` places further on."""
 
     def __init__(self, scene: _Scene, one: Pass, sweep: Sweep, lag: int) -> None:
-        self.scene, self.one, self.code, self.sweep, self._lag = scene, one, scene.code, sweep, lag
+        self.scene, self.one, self.code, self.sweep, self.lag = scene, one, scene.code, sweep, lag
+        self.first = self.code.constant(0, INT)
 
     def execute(self) -> None:
         """Write the calculations of the bonds that begin at a site, and of the site."""
@@ -721,13 +726,19 @@ class _Place:
                         ahead = self._acting(axis, k, self.code.operand(x, self.scene.type))
                         change = self.behind(axis, k, key[1], ahead) - ahead
                         total[key[1]] = total[key[1]] + change if key[1] in total else change
-        with self.stored():
-            for key, x in self.one.site(partial(self._of_site, total)):
-                x = self.code.operand(x, self.scene.type)
-                if key in self.scene.stages.vectors:
-                    self.move(key, x)
-                else:
-                    self.keep(key, x)
+        if self.one.name in (OPEN, MIDDLE):
+            self._site(total)
+            return
+        with self.code.given(self.first <= self.sweep.k):
+            self._site(total)
+
+    def _site(self, total: dict[int, Value]) -> None:
+        for key, x in self.one.site(partial(self._of_site, total)):
+            x = self.code.operand(x, self.scene.type)
+            if key in self.scene.stages.vectors:
+                self.move(key, x)
+            else:
+                self.keep(key, x)
 
     def _of_bond(self, axis: int, k: int, key: Key) -> Any:
         kind, i = key
@@ -750,116 +761,109 @@ class _Place:
 
     def at_wall(self, key: Key, x: Value) -> Value:
         """Velocities, 0 beyond walls."""
-        if key[0] not in ("v", "w") or self.scene.form.boundary[0] != "fixed":
-            return x
-        return self.scene.within(x, self.inside(0, 0))
+        for axis in range(max(1, self.scene.n_axes - 1)) if key[0] in ("v", "w") else ():
+            if self.scene.form.boundary[axis] == "fixed":
+                x = self.scene.within(x, self.inside(axis, 0))
+        return x
 
     def get(self, key: Any, axis: int = 0, k: int = 0) -> Value:
         """A number of this site, or of the one so far along an axis."""
-        return self.sweep.get(key, self._lag + k, self.scene.type)
+        return self.sweep.get(key, self.lag + k, self.scene.type)
 
     def inside(self, axis: int, k: int) -> Value:
         """Where that is a site."""
-        return self.sweep.get(INSIDE, self._lag + k, self.scene.bits)
+        return self.sweep.get(INSIDE, self.lag + k, self.scene.bits)
 
     def behind(self, axis: int, k: int, f: int, x: Value) -> Value:
         """Keep what a bond does for the site at its end, and return what the one that ends here does."""
         key = "flux", self.one.name, k, f
-        self.sweep.put(key, self._lag, x)
-        return self.sweep.get(key, self._lag - k, x.type)
-
-    @contextmanager
-    def stored(self) -> Iterator[None]:
-        """Leave out what would be stored at places before the first one."""
-        if self.one.name in (OPEN, MIDDLE):
-            yield
-            return
-        with self.code.given(self.code.constant(0, INT) <= self.sweep.k):
-            yield
+        self.sweep.put(key, self.lag, x)
+        return self.sweep.get(key, self.lag - k, x.type)
 
     def move(self, key: Key, x: Value) -> None:
         self.code.store(x, self.scene.vectors[key], self.sweep.k * self.scene.width)
 
     def keep(self, key: Any, x: Value) -> None:
-        self.sweep.put(key, self._lag, self.at_wall(key, x))
+        self.sweep.put(key, self.lag, self.at_wall(key, x))
 
 
-class _RowPlace(_Place):
-    """A site of a lattice of several axes, in a row of a plane."""
+class _Row:
+    """A row of a lattice of several axes, and rows beside it, at which passes are executed together."""
 
     sweep: Sweep
 
-    def __init__(self, scene: _Scene, one: Pass, plane: Value, lag: int, row: Value) -> None:
-        self.scene, self.one, self.code, self._plane, self._row = scene, one, scene.code, plane, row
+    def __init__(self, scene: _Scene, plane: Value, row: Value) -> None:
+        self.scene, self.code, self.plane, self.row = scene, scene.code, plane, row
+        self.fresh: dict[Any, Value] = {}
         self._known: dict[Any, Value] = {}
-        zero = self.code.constant(0, INT)
-        there = (zero <= row) & (zero <= plane + lag)
-        self._first = self.code.select(there, zero, scene.numbers["places"])
+        zero, places = self.code.constant(0, INT), scene.numbers["places"]
+        self.first = self.code.select((zero <= row) & (zero <= plane), zero, places)
 
-    def _before(self, key: Any, make: Callable[[], Value]) -> Value:
+    def before(self, key: Any, make: Callable[[], Value]) -> Value:
         """A value that is the same at all places of the row."""
         if key not in self._known:
             with self.sweep.before():
                 self._known[key] = make()
         return self._known[key]
 
-    def _start(self, key: Any, axis: int = 0, k: int = 0) -> Value:
-        def start() -> Value:
-            plane, row = (self._plane + k, self._row) if axis == 0 else (self._plane, self._row + k)
-            return self.scene.place_of(key, plane, row)
-
-        return self._before((key, axis, k), start)
+    def start(self, key: Any, plane: int = 0, row: int = 0) -> Value:
+        """The address of a number at the first place of a row so far from this one."""
+        return self.before((key, plane, row), lambda: self.scene.place_of(key, self.plane + plane, self.row + row))
 
     def read(self, key: Any, j: Value) -> Value:
         code, scene = self.code, self.scene
         if key == INSIDE:
             return code.load(scene.inside(scene.n_axes - 1), j * scene.width, scene.bits)
-        return code.load(self._start(*key), j * scene.width, scene.type)
+        return code.load(self.start(*key), j * scene.width, scene.type)
+
+
+class _RowPlace(_Place):
+    """A site of a row that is `lag` planes further on."""
+
+    def __init__(self, own: _Row, one: Pass, lag: int) -> None:
+        super().__init__(own.scene, one, own.sweep, lag)
+        self._own, self.first, self._last = own, own.first, own.scene.n_axes - 1
 
     def get(self, key: Any, axis: int = 0, k: int = 0) -> Value:
-        if axis == self.scene.n_axes - 1 or k == 0:
-            return self.sweep.get((key,), k, self.scene.type)
-        return self.sweep.get((key, axis, k), 0, self.scene.type)
+        if axis == self._last and k:
+            return self.sweep.get((key, self.lag), k, self.scene.type)
+        place = (key, self.lag + k) if axis == 0 else (key, self.lag, k) if k else (key, self.lag)
+        fresh = self._own.fresh.get(place)
+        return self.sweep.get(place, 0, self.scene.type) if fresh is None else fresh
 
     def inside(self, axis: int, k: int) -> Value:
-        code, scene = self.code, self.scene
-        if axis == scene.n_axes - 1:
+        code, scene, own = self.code, self.scene, self._own
+        if axis == self._last:
             return self.sweep.get(INSIDE, k, scene.bits)
 
         def mask() -> Value:
-            place = (self._plane, self._row)[axis] + k
+            place = own.plane + (self.lag + k) if axis == 0 else own.row + k
             return code.splat(code.load(scene.inside(axis), place, INT), scene.width)
 
-        return self._before((INSIDE, axis, k), mask)
+        return own.before((INSIDE, axis, k, self.lag), mask)
 
     def behind(self, axis: int, k: int, f: int, x: Value) -> Value:
-        if axis == self.scene.n_axes - 1:
-            key = "flux", k, f
-            self.sweep.put(key, 0, x)
-            return self.sweep.get(key, -k, x.type)
-        name = self.one.name, axis, k, f
-        if axis == 0:
-            start = self._before(name, lambda: self._in_plane(self.scene.kept(name, k, self._plane)))
-        else:
-            start = self._before(name, lambda: self.scene.kept_row(name, k, self._row))
-        place = self.sweep.k * self.scene.width
+        scene, own, name = self.scene, self._own, (self.one.name, axis, k, f)
+        if axis == self._last:
+            self.sweep.put(name, 0, x)
+            return self.sweep.get(name, -k, x.type)
+
+        def kept() -> Value:
+            if axis:
+                return scene.kept_row(name, k, own.row)
+            return self.code.at(scene.kept(name, k, own.plane + self.lag), own.row * scene.numbers["row"])
+
+        start, place = own.before(name, kept), self.sweep.k * scene.width
         behind = self.code.load(start, place, x.type)
         self.code.store(x, start, place)
         return behind
 
-    def _in_plane(self, x: Value) -> Value:
-        return self.code.at(x, self._row * self.scene.numbers["row"])
-
-    @contextmanager
-    def stored(self) -> Iterator[None]:
-        with self.code.given(self._first <= self.sweep.k):
-            yield
-
     def move(self, key: Key, x: Value) -> None:
-        self.code.store(x, self._start(key), self.sweep.k * self.scene.width)
+        self.code.store(x, self._own.start(key, self.lag), self.sweep.k * self.scene.width)
 
     def keep(self, key: Any, x: Value) -> None:
-        self.code.store(self.at_wall(key, x), self._start(key), self.sweep.k * self.scene.width)
+        x = self._own.fresh[key, self.lag] = self.at_wall(key, x)
+        self.code.store(x, self._own.start(key, self.lag), self.sweep.k * self.scene.width)
 
 
 # the places of a lattice --------------------------------------------------------------------------------------------
