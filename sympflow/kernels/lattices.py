@@ -350,8 +350,8 @@ class Pass:
         if not self.form.compensated:
             return [made.written(a + b) for a, b in zip(x, changes, strict=True)], []
         sums, left, op = [], [], made.operation
-        for f, (value, change) in enumerate(zip(map(made.node, x), map(made.written, changes), strict=True)):
-            corrected = op("sub", change, made.node(get[f"{vector}_error", f]))
+        for f, (value, change) in enumerate(zip(map(made.node, x), changes, strict=True)):
+            corrected = made.written(change - get[f"{vector}_error", f])
             sums.append(op("add", value, corrected))
             left.append(op("sub", op("sub", sums[-1], value), corrected))
         return sums, left
@@ -633,8 +633,16 @@ class _Scene:
 
     # places in memory -----------------------------------------------------------------------------------------------
 
-    def inside(self, axis: int) -> Value:
-        return self.address(f"inside_{axis}")
+    def inside(self, axis: int, k: int = 0) -> Value:
+        """The address at the first site of what tells where sites are along an axis, or where bonds begin."""
+        start = self.address(f"inside_{axis}")
+        if k == 0:
+            return start
+        numbers = self.numbers["row"]
+        if axis < self.n_axes - 1:
+            ghosts = (self.form.level + 1 if axis == 0 else 1) * self.reach
+            numbers = self.numbers["planes" if axis == 0 else "rows"] + 2 * ghosts
+        return self.code.at(start, numbers * (1 + self.form.distances.index(k)), "i64")
 
     def within(self, x: Value, mask: Value) -> Value:
         """A number where there are sites, else 0."""
@@ -698,12 +706,12 @@ class _Scene:
 
     def _at_place(self, key: Key, i: Value) -> Value:
         """Read a number of a lattice of one axis."""
-        if key == INSIDE:
-            return self.code.load(self.inside(0), i * self.width, self.bits)
+        if key[0] == INSIDE:
+            return self.code.load(self.inside(0, key[1]), i * self.width, self.bits)
         return self.code.load(self.vectors[key], i * self.width, self.type)
 
 
-INSIDE = ("inside",)
+INSIDE = "inside"
 FEW = 4
 
 
@@ -757,7 +765,7 @@ class _Place:
         """What a bond does, 0 where a free end leaves it out."""
         if self.scene.form.boundary[axis] != "free":
             return x
-        return self.scene.within(x, self.inside(axis, 0) & self.inside(axis, k))
+        return self.scene.within(x, self.inside(axis, k))
 
     def at_wall(self, key: Key, x: Value) -> Value:
         """Velocities, 0 beyond walls."""
@@ -771,8 +779,8 @@ class _Place:
         return self.sweep.get(key, self.lag + k, self.scene.type)
 
     def inside(self, axis: int, k: int) -> Value:
-        """Where that is a site."""
-        return self.sweep.get(INSIDE, self.lag + k, self.scene.bits)
+        """True where there is a site, or the bond of length k that begins there."""
+        return self.sweep.get((INSIDE, k), self.lag, self.scene.bits)
 
     def behind(self, axis: int, k: int, f: int, x: Value) -> Value:
         """Keep what a bond does for the site at its end, and return what the one that ends here does."""
@@ -812,8 +820,8 @@ class _Row:
 
     def read(self, key: Any, j: Value) -> Value:
         code, scene = self.code, self.scene
-        if key == INSIDE:
-            return code.load(scene.inside(scene.n_axes - 1), j * scene.width, scene.bits)
+        if key[0] == INSIDE:
+            return code.load(scene.inside(scene.n_axes - 1, key[1]), j * scene.width, scene.bits)
         return code.load(self.start(*key), j * scene.width, scene.type)
 
 
@@ -834,11 +842,11 @@ class _RowPlace(_Place):
     def inside(self, axis: int, k: int) -> Value:
         code, scene, own = self.code, self.scene, self._own
         if axis == self._last:
-            return self.sweep.get(INSIDE, k, scene.bits)
+            return self.sweep.get((INSIDE, k), 0, scene.bits)
 
         def mask() -> Value:
-            place = own.plane + (self.lag + k) if axis == 0 else own.row + k
-            return code.splat(code.load(scene.inside(axis), place, INT), scene.width)
+            place = own.plane + self.lag if axis == 0 else own.row
+            return code.splat(code.load(scene.inside(axis, k), place, INT), scene.width)
 
         return own.before((INSIDE, axis, k, self.lag), mask)
 
@@ -915,7 +923,11 @@ class Slabs:
             if outer:
                 sites[0] = sites[0] + first
             sites.append(starts[mine] + np.arange(-ends[0], places + ends[1])[:, None])
-            inside = [_mask(p | (0 <= i) & (i < n)) for i, n, p in zip(sites, shape, periodic, strict=True)]
+            lengths = 0, *form.distances
+            inside = [
+                _mask(np.stack([p | (0 <= i) & (i + k < n) for k in lengths]))
+                for i, n, p in zip(sites, shape, periodic, strict=True)
+            ]
             index = [i % n if p else i.clip(0, n - 1) for i, n, p in zip(sites, shape, periodic, strict=True)]
             own = zeros(len(arrays) * vector).reshape(len(arrays), vector)
             for x, array in zip(own, arrays, strict=True):
