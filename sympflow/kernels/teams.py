@@ -25,7 +25,7 @@ __all__ = ["Member", "SharedRollouts", "Team", "meet"]
 
 ARRIVED, TURN = 0, 8
 """Places in `meeting` (16,), in lines of the cache of their own: threads that are here, and times that all were."""
-SPINS, YIELDS = 20_000, 200  # looks before a thread lets others run, and before it sleeps
+SPINS, YIELDS = 1_000, 2_000  # looks before a thread lets others run, and before it sleeps
 PAUSE = 20  # µs
 MOMENT = 200_000_000  # about how many nanoseconds pass between two looks for an interrupt
 _I32 = Type("i32")
