@@ -35,9 +35,9 @@ from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
+    smaller_tolerance,
     warn_of_leap,
     warn_of_loss,
-    warn_of_tolerance,
 )
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.impulses import run_between_impulses
@@ -301,7 +301,7 @@ def _answered(integrator: Integrator, problem: Problem, action: str, rows: Param
 
 def _solved(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None = None) -> Solution:
     """The solution of a validated problem; `rows` are the parameters of its trajectories, where they have some."""
-    system, y_start = problem.system, problem.y0
+    given, system, y_start = problem, problem.system, problem.y0
     n_times = 0 if problem.t_eval is None else len(problem.t_eval)
     between = system.between_impulses
     integrator = integrator.resolved(between, y_start, abs(problem.t1 - problem.t0), n_times)
@@ -335,6 +335,11 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
+    if integrator.absolute_tolerance and stopped is None and readable(outcome.y) and np.all(outcome.status >= 0):
+        atol = smaller_tolerance(outcome, system, integrator.absolute_tolerance)
+        if atol is not None:
+            afresh = replace(given, events=given.events and given.events.afresh())
+            return _solved(replace(integrator, atol=atol), afresh, action, rows)  # type: ignore[type-var]
     passed = False
     if (system.poles is not None or problem.letters is not None) and problem.diagnosed and problem.store is None:
         if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
@@ -346,8 +351,6 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         note_singularities(outcome, integrator, problem, passed)
     if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
-    if integrator.absolute_tolerance and not failed and problem.store is None and readable(outcome.y):
-        warn_of_tolerance(outcome, system, integrator.absolute_tolerance, stacklevel=4)
     if system.functions_given and readable(outcome.y):
         system.check_functions_along(outcome.y)
     if integrator.trained:

@@ -14,7 +14,20 @@ from typing import Any, NamedTuple
 
 from sympflow.compiler.numbers import Number
 
-__all__ = ["BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Sweep", "Type", "Value", "Variable"]
+__all__ = [
+    "BOOL",
+    "DOUBLE",
+    "INT",
+    "LOWERED",
+    "POINTER",
+    "Code",
+    "Module",
+    "Rows",
+    "Sweep",
+    "Type",
+    "Value",
+    "Variable",
+]
 
 
 class Type(NamedTuple):
@@ -107,6 +120,32 @@ class Variable:
     @value.setter
     def value(self, x: Value) -> None:
         self._code.store(x, self._place)
+
+
+class Rows:
+    """Memory as numbers of one type, one after the other."""
+
+    __slots__ = ("code", "place", "type")
+
+    def __init__(self, place: Value, type: Type) -> None:
+        self.code, self.place, self.type = place.code, place, type
+
+    def __getitem__(self, i: Any) -> Value:
+        return self.code.load(self.place, i * self.type.width, self.type)
+
+    def __setitem__(self, i: Any, x: Any) -> None:
+        self.code.store(self.code.operand(x, self.type), self.place, i * self.type.width)
+
+    def add(self, i: Any, *products: tuple[Value, Value]) -> None:
+        """Add products to number i."""
+        total = self[i]
+        for x, y in products:
+            total = self.code.fma(x, y, total)
+        self[i] = total
+
+    def part(self, i: Any) -> Rows:
+        """The numbers from i on."""
+        return Rows(self.code.at(self.place, i * self.type.width, self.type.scalar), self.type)
 
 
 class Module:
@@ -237,6 +276,11 @@ class Code:
         return self._new(result, f"call {result or 'void'} @{name}({given})")
 
     def call_address(self, address: Value, args: Sequence[Value], result: Type | None = None) -> Value:
+        """Write a call of a function at an address."""
+        given = ", ".join(f"{a.type} {a.name}" for a in args)
+        return self._new(result, f"call {result or 'void'} {address.name}({given})")
+
+    def call_at(self, address: Value, args: Sequence[Value], result: Type | None = None) -> Value:
         """Write a call of a function at an address."""
         given = ", ".join(f"{a.type} {a.name}" for a in args)
         return self._new(result, f"call {result or 'void'} {address.name}({given})")

@@ -18,7 +18,9 @@ from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.registry import build, check_applies
 
 TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
-"""Steps of a trial run, or else so many of `system.dt`, at most the last number; or the run itself."""
+"""Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
+AT_ROUNDING = 1e-8
+"""Errors that may be rounding: below it, steps that are shorter and no better end the search."""
 TRIALS = 12
 MOST_STATES = 16  # of a batch in trials
 SAFETY = 0.5  # of the tolerance, at which a step is aimed
@@ -178,7 +180,7 @@ def choose_step(
 def check_tolerance(tol: Any, tol_of: Any) -> None:
     """Refuse what is no tolerance."""
     if not 0 < as_float(tol) < 1:
-        raise ValueError(f"`tol` must be a relative error between 0 and 1; got {tol!r}: take 1e-6, for instance.")
+        raise ValueError(f"`tol` must be a positive number below 1, a relative error; got {tol!r}: take 1e-6.")
     if tol_of not in ("energy", "state"):
         raise ValueError(f"`tol_of` must be 'energy' or 'state'; got {tol_of!r}.")
 
@@ -203,6 +205,8 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     good, bad, least = 0.0, math.inf, math.inf
     for _ in range(TRIALS):
         e = error(h)
+        if e > tol and h < bad and least <= e <= AT_ROUNDING:
+            break
         least = min(least, e)
         if e <= MOST * tol:
             good = max(good, h)
@@ -244,16 +248,20 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[fl
     scale = np.where(np.isnan(scale), 1.0, scale)
     factors, size = weights(system), smallest_size(system, y0)
 
+    compiled = False
+
     def run(h: float, end: float, n: int) -> tuple[np.ndarray, np.ndarray]:
         t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
         with np.errstate(all="ignore"):
             outcome = replace(integrator, dt=h).run(replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False))
+        nonlocal compiled
+        compiled = outcome.stats.get("backend") == "compiled"
         full = np.full((n + 1, *y0.shape), np.nan)
         full[: len(outcome.y)] = outcome.y
         return t, full
 
     def error(h: float) -> float:
-        n = max(TRIAL_STEPS, min(math.ceil(TRIAL_LENGTH * system.dt / h), MOST_TRIAL_STEPS))
+        n = max(TRIAL_STEPS, min(math.ceil(TRIAL_LENGTH * system.dt / h), MOST_TRIAL_STEPS) if compiled else 0)
         n = max(1, min(n, math.ceil(length / h)))
         end, n = min(n * h, length), -(-n // -(-n // TRIAL_STEPS))
         t, y = run(h, end, n)

@@ -242,7 +242,7 @@ class Splitting(OwnStepper):
             return None
         if compiled_loops(lambda: self.inner.composed(transformed).kernel(False), start, backend) is None:
             return None
-        from sympflow.kernels.timed_loops import reach_times
+        from sympflow.kernels.elapsed_times import reach_times
 
         return reach_times(transformed, self.scheme, h, start, times, stride, expected)
 

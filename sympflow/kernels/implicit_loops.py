@@ -33,7 +33,8 @@ _KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneSte
 
 
 def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
-    if system.symbols is None:
+    written = system.written
+    if written is None:
         raise ValueError(
             "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
             "or use backend='array'."
@@ -43,7 +44,7 @@ def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> O
         raise ValueError("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
     if friction is not None and friction.damping.ndim == 2:
         raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
-    symbols = system.symbols if is_large(system.symbols) else system.symbols.parametric
+    symbols = written if is_large(written) else written.parametric
     lettered = Lettered(symbols, [symbols.H])
     code = newton_code(lettered, tableau, compensated, friction is not None)
     single = newton_code(lettered, tableau, False, False) if compensated else code

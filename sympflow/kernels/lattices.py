@@ -9,10 +9,10 @@ made some places ahead of the kicks. What is made of a site is the same in all l
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-import threading
 from functools import cached_property, lru_cache, partial
 from typing import Any
 
@@ -24,15 +24,17 @@ from sympflow.compiler.functions import FUNCTIONS, times
 from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
+from sympflow.hamiltonian.local import LocalHamiltonian
+from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room
 from sympflow.kernels.teams import Member, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, POLYNOMIAL
 
-__all__ = ["LatticeCode"]
+__all__ = ["LatticeCode", "lattice_code"]
 
-Key = tuple[Any, ...]
+Key = Any
 """A number of a site: its kind, and which one of these."""
 
 
@@ -365,11 +367,9 @@ those of a vector before the first site."""
 SITES = ("sites", "first", "site_of_plane", "site_of_row", "site_of_place")
 """How many sites there are, and where in a row [q, p] the first one is; how far apart those of neighbouring planes, rows
 and places are."""
-ADDRESSES = ("starts", "sizes", "full", "follows", "inside_0", "inside_1", "inside_2")
+ADDRESSES = ("starts", "sizes", "full", "follows", "inside_0", "inside_1", "inside_2", "arrays", "values", "helpers")
 """Arrays: of each slab its first site and how many are its own; slabs of which all places are their own, and those that
 follow one; and, along each axis, where sites are."""
-ADDRESSES += ("arrays", "values", "helpers")
-"""Numbers of each site and of all, and room for what passes keep."""
 SHARED = ("left", "right", "left_size", "member", "members", "meeting", "stop", "found")
 """Addresses of the states before and behind this piece, 0 where there are none, and the sites of the last slab before
 it; the number of this thread and of all, where they meet, what ends them, and whether the piece of each is finite."""
@@ -405,7 +405,9 @@ class LatticeStages:
         if len(axes) > 1:
             for one in self.passes.values():
                 kept = [key for key in one.site.results if key not in self.vectors]
-                kept += [(key, a) for law in one.bonds.values() for key in law.results if key[0] == "kept" for a in axes]
+                kept += [
+                    (key, a) for law in one.bonds.values() for key in law.results if key[0] == "kept" for a in axes
+                ]
                 for key in kept:
                     helpers[key], planes = planes, planes + self.slots
                 for k in one.bonds:
@@ -555,7 +557,9 @@ class _Scene:
                 continue
             length = at["plane"] * depth
             with self._piece("left", f) as beside:
-                self._copy(code.at(beside, (self.number("left_size") - depth) * at["plane"]), code.at(x, -length), length)
+                self._copy(
+                    code.at(beside, (self.number("left_size") - depth) * at["plane"]), code.at(x, -length), length
+                )
             with self._piece("right", f) as beside:
                 self._copy(beside, code.at(x, at["planes"] * at["plane"]), length)
             with code.over(at["planes"] + 2 * depth) as i:
@@ -598,8 +602,8 @@ class _Scene:
                 code.store(ghost, x, at * W)
 
         if depth <= FEW:
-            for k in range(depth):
-                ends(code.constant(k, INT))
+            for i in range(depth):
+                ends(code.constant(i, INT))
         else:
             with code.over(depth) as k:
                 ends(k)
@@ -712,7 +716,7 @@ class _Scene:
 
 
 INSIDE = "inside"
-FEW = 4
+FEW = 4  # ghosts that are written out
 
 
 class _Place:
@@ -919,13 +923,15 @@ class Slabs:
         for k in range(pieces):
             mine = k if one_axis else 0
             first, n_planes = int(bounds[k if outer else 0]), int(bounds[k + 1] - bounds[k]) if outer else 1
-            sites = [np.arange(-d, n + d) for d, n in zip((depth, R), (n_planes, *shape[1:-1]), strict=False)][: len(outer)]
+            sites = [np.arange(-d, n + d) for d, n in zip((depth, R), (n_planes, *shape[1:-1]), strict=False)][
+                : len(outer)
+            ]
             if outer:
                 sites[0] = sites[0] + first
             sites.append(starts[mine] + np.arange(-ends[0], places + ends[1])[:, None])
             lengths = 0, *form.distances
             inside = [
-                _mask(np.stack([p | (0 <= i) & (i + k < n) for k in lengths]))
+                _mask(np.stack([p | (i >= 0) & (i + k < n) for k in lengths]))
                 for i, n, p in zip(sites, shape, periodic, strict=True)
             ]
             index = [i % n if p else i.clip(0, n - 1) for i, n, p in zip(sites, shape, periodic, strict=True)]
@@ -937,9 +943,22 @@ class Slabs:
                 x[: found.size] = found.ravel()
             masks = [_mask(x[mine]) for x in (full, follows)]
             offsets = [depth, R][: len(outer)] + [ends[0] * W]
-            numbers = [n_planes, shape[1] if len(order) > 2 else 1, places, vector, plane, row, low, lattice.sites, first * distances[0], *distances]
+            numbers = [
+                n_planes,
+                shape[1] if len(order) > 2 else 1,
+                places,
+                vector,
+                plane,
+                row,
+                low,
+                lattice.sites,
+                first * distances[0],
+                *distances,
+            ]
             size = n_planes if outer else int(sizes[mine, -1])
-            self._pieces.append(_Piece(numbers, [starts[mine] * strides[-1], sizes[mine], *masks], inside, offsets, own, size))
+            self._pieces.append(
+                _Piece(numbers, [starts[mine] * strides[-1], sizes[mine], *masks], inside, offsets, own, size)
+            )
 
     def contexts(self, rooms: Sequence[int], helpers: Sequence[int], longest: int, shared: Sequence[int]) -> np.ndarray:
         """The numbers of `CONTEXT` of each piece: of the addresses of their states and helpers, and others."""
@@ -976,6 +995,14 @@ def _mask(x: np.ndarray) -> np.ndarray:
 
 def _strides(shape: Sequence[int]) -> list[int]:
     return [int(np.prod(shape[k + 1 :], dtype=np.int64)) for k in range(len(shape))]
+
+
+def lattice_code(
+    local: LocalHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
+) -> LatticeCode:
+    """The compiled functions of a lattice; `damped` if there is friction −γp."""
+    assert isinstance(local, LatticeHamiltonian)
+    return LatticeCode(local, level, compensated, damped)
 
 
 class LatticeCode(SharedRollouts):

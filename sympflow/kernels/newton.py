@@ -19,7 +19,7 @@ from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Type, Value
 from sympflow.compiler.functions import fma, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
-from sympflow.kernels.one_steps import Lettered, OneStep, recorded
+from sympflow.kernels.one_steps import Lettered, OneStep, add_terms, recorded
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.terms import families, is_large
@@ -352,20 +352,16 @@ class _InMemory(NewtonCode):
         n = self.n_out
         _fill(code, g, n)
         _fill(code, S, n * n)
-        for family, (coordinates, constants) in zip(self._families, zip(*[iter(data)] * 2, strict=True), strict=True):
+
+        def targets(places: list[Value]) -> list[tuple[Value, Value]]:
+            return [(g, m) for m in places] + [(S, row * n + column) for row in places for column in places]
+
+        for i, family in enumerate(self._families):
             program = recorded([family.f], (*family.x, *family.c, *self.lettered.given))
-            x, d = program.inputs[: len(family.x)], len(family.x)
+            x = program.inputs[: len(family.x)]
             slope = gradient(program.outputs[0], x)
             both = Program(program.inputs, [*slope, *(entry for s in slope for entry in gradient(s, x))])
-            with code.over(len(family.coordinates)) as term:
-                places = [code.load(coordinates, term * d + j, INT) for j in range(d)]
-                values = [code.load(Y, place) for place in places]
-                values += [code.load(constants, term * len(family.c) + j) for j in range(len(family.c))]
-                targets = [(g, place) for place in places]
-                targets += [(S, row * n + column) for row in places for column in places]
-                for (target, place), x in zip(targets, both(*values, *given), strict=True):
-                    if not _is_zero(x):
-                        code.store(code.load(target, place) + x, target, place)
+            add_terms(family, data[2 * i : 2 * i + 2], both, Y, given, targets)
 
     def _fill_sizes(self, code: Code, state: Value, K: Value, M: Value, sizes: Value) -> None:
         """The reciprocal size of each unknown: of its variable, or of the largest of its kind where that is 0."""

@@ -26,7 +26,7 @@ from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room, finished
-from sympflow.kernels.splittings import Shape, Splitting
+from sympflow.kernels.splittings import Shape, Splitting, WithinRange
 from sympflow.kernels.teams import Member, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
@@ -147,9 +147,6 @@ def dot(x: Sequence[Value], y: Sequence[Value]) -> Value:
 
 # a few bodies: their pairs written out ------------------------------------------------------------------------------
 
-MOST_WRITTEN = 6
-"""Bodies whose pairs are written out."""
-
 
 @dataclass(frozen=True)
 class FewSymbols:
@@ -198,6 +195,13 @@ class FewSymbols:
         return tuple(sp.Symbol(f"p{i + 1}") for i in range(self.ndof))
 
     @cached_property
+    def V(self) -> sp.Expr:
+        local, number = self.local, sp.Symbol
+        columns = [[number(f"column_{c}_{i}") for i in range(local.n_bodies)] for c in range(len(local.columns))]
+        box = [number(f"box_{k}") for k in range(0 if local.box is None else local.dim)]
+        return local.written_potential(self.q, number("softening"), columns, {c: number(c.name) for c in local.c}, box)
+
+    @cached_property
     def inverse_mass(self) -> sp.Matrix:
         return sp.diag(*(sp.Symbol(f"w_{i // self.local.dim}") for i in range(self.ndof)))
 
@@ -205,7 +209,7 @@ class FewSymbols:
 def few(local: LocalHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple[float, ...]]:
     """The splitting of a few bodies, None of more, and the values that it reads."""
     assert isinstance(local, PairsHamiltonian)
-    if local.n_bodies > MOST_WRITTEN:
+    if not local.is_few:
         return None, ()
     symbols = FewSymbols(local)
     return partial(FewSplitting, cast("SymbolicHamiltonian", symbols)), symbols.values
@@ -220,7 +224,7 @@ class FewSplitting(Splitting):
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
 
-    def kinds(self) -> list[Arranged]:
+    def kinds(self) -> Sequence[Arranged | WithinRange]:
         _check_level(self.level)
         return super().kinds()
 

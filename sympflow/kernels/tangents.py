@@ -245,7 +245,7 @@ class TangentCode(SplittingCode):
         products = d * d + (d if splitting.symbols.inverse_mass is not None else d * d)
         self.room = 0 if vectors * products > MOST_WRITTEN_OUT else None
         self.every = EVERY if grows else None
-        self.lanes = 16
+        self.lanes, self.chunked = 16, False
 
     def __reduce__(self) -> tuple[Any, ...]:
         return TangentCode, (self._splitting, self.vectors, self._grows)
@@ -449,9 +449,7 @@ def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, ve
     if key not in codes:
         codes[key] = _lacks(system)
         if not codes[key]:
-            assert system.symbols is not None
-            ndim = None if system.friction is None else system.friction.damping.ndim
-            splitting = Splitting(system.symbols.parametric, level, monomials, friction=ndim)
+            splitting = splitting_loops(system).splitting(level, monomials)
             codes[key] = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
     found = codes[key]
     if isinstance(found, str):
@@ -466,7 +464,8 @@ def _lacks(system: HamiltonianSystem) -> str:
     if not system.autonomous:
         return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
     symbols = system.symbols
-    if symbols is None or is_large(symbols) or not splitting_loops(system).traced:
+    given = system.local is not None if symbols is None else not is_large(symbols)
+    if not given or not splitting_loops(system).traced:
         return (
             f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "
             "few terms: use backend='auto'."
