@@ -255,7 +255,7 @@ class Pass:
             return {("flux", f): made.number(0.0) for f in fields}
         vectors = ("r", "dv", "dw") if term != "site" else ("q", "v", "w")
         x, v, w = ([get.get((vector, f), 0.0) for f in fields] for vector in vectors)
-        found, kept = {}, self._kept[term]
+        kept = self._kept[term]
         if self.name in (KICK, OPEN):
             slopes = potential.slopes(*x, *v, *w, *c)
         elif self.name == LAST:
@@ -268,7 +268,7 @@ class Pass:
                 for k, f in enumerate(bends)
             ]
             slopes = potential.product(made, bends, v)
-        found = {("flux", f): made.number(y) for f, y in enumerate(slopes)}
+        found: dict[Key, Any] = {("flux", f): made.number(y) for f, y in enumerate(slopes)}
         if self.name == OPEN and self.form.level:
             bends = Program(potential.bends.inputs, [potential.bends.outputs[k] for k in kept])(*x, *v, *w, *c)
             found |= {("kept", (term, k)): made.number(y) for k, y in zip(kept, bends, strict=True)}
@@ -365,8 +365,8 @@ SIZES = ("planes", "rows", "places", "vector", "plane", "row", "low")
 """Numbers of a context: planes, rows of a plane, places of a row; how many numbers vectors, planes and rows take, and
 those of a vector before the first site."""
 SITES = ("sites", "first", "site_of_plane", "site_of_row", "site_of_place")
-"""How many sites there are, and where in a row [q, p] the first one is; how far apart those of neighbouring planes, rows
-and places are."""
+"""How many sites there are, where in a row [q, p] the first one is, and how far apart those of neighbouring planes,
+rows and places are."""
 ADDRESSES = ("starts", "sizes", "full", "follows", "inside_0", "inside_1", "inside_2", "arrays", "values", "helpers")
 """Arrays: of each slab its first site and how many are its own; slabs of which all places are their own, and those that
 follow one; and, along each axis, where sites are."""
@@ -377,7 +377,7 @@ CONTEXT = ("own", "longest", *SIZES, *SITES, *ADDRESSES, *SHARED)
 
 
 class LatticeStages:
-    """The code of stages that change a state in memory: vectors of each field of q, of p and, compensated, of errors."""
+    """The code of stages that change a state in memory: vectors of each field of q, p and, compensated, of errors."""
 
     def __init__(self, form: Form) -> None:
         self.form, self.fields = form, form.fields
@@ -523,14 +523,14 @@ class _Scene:
         code, width = self.code, self.width
         self.numbers = {name: self.number(name) for name in (*SIZES, *SITES)}
         vector, low = self.numbers["vector"], self.numbers["low"]
-        self.vectors = {key: code.at(state, vector * i + low) for i, key in enumerate(stages.vectors)}
+        self.vectors: dict[Key, Value] = {key: code.at(state, vector * i + low) for i, key in enumerate(stages.vectors)}
         if not column:
             return
         arrays, values = self.address("arrays"), self.address("values")
-        self.vectors |= {("array", name): code.at(arrays, vector * i + low) for i, name in enumerate(stages.arrays)}
-        self.values = {
-            ("column", name): code.splat(x, width) for name, x in zip(self.form.column, column, strict=True)
-        } | {("number", name): code.splat(code.load(values, i), width) for i, name in enumerate(stages.values)}
+        self.vectors |= {("array", x): code.at(arrays, vector * i + low) for i, x in enumerate(stages.arrays)}
+        of_column = {("column", name): x for name, x in zip(self.form.column, column, strict=True)}
+        of_all = {("number", name): code.load(values, i) for i, name in enumerate(stages.values)}
+        self.values = {key: code.splat(x, width) for key, x in (of_column | of_all).items()}
         self.helpers = self.address("helpers")
         self._distance = code.convert("ptrtoint", state, "i64") - self.number("own")
 
@@ -678,7 +678,7 @@ class _Scene:
     # passes ---------------------------------------------------------------------------------------------------------
 
     def sweep(self, passes: Sequence[Pass]) -> None:
-        """Execute passes one after the other at each plane, each of them so far behind the one before that it can be."""
+        """Execute passes one after the other at each plane, each so far behind the one before that it can be."""
         code, R, m, at = self.code, self.reach, len(passes), self.numbers
         first, lags = -self.form.before(m), [(m - 1 - k) * R for k in range(m)]
         if self.n_axes == 1:
@@ -745,8 +745,8 @@ class _Place:
             self._site(total)
 
     def _site(self, total: dict[int, Value]) -> None:
-        for key, x in self.one.site(partial(self._of_site, total)):
-            x = self.code.operand(x, self.scene.type)
+        for key, value in self.one.site(partial(self._of_site, total)):
+            x = self.code.operand(value, self.scene.type)
             if key in self.scene.stages.vectors:
                 self.move(key, x)
             else:
@@ -942,7 +942,7 @@ class Slabs:
                     found = found.take(i, axis)
                 x[: found.size] = found.ravel()
             masks = [_mask(x[mine]) for x in (full, follows)]
-            offsets = [depth, R][: len(outer)] + [ends[0] * W]
+            offsets = [*[depth, R][: len(outer)], ends[0] * W]
             numbers = [
                 n_planes,
                 shape[1] if len(order) > 2 else 1,
@@ -1029,7 +1029,7 @@ class LatticeCode(SharedRollouts):
         n, one_axis = lattice.shape[self._order[-1]], len(lattice.shape) == 1
         depth = max(1, max(lattice.bonds, default=0) * (1 + level))
         planes = n // width if one_axis else lattice.shape[self._order[0]]
-        self.pieces = max(1, min(lattice.ndof // WORTH_A_PIECE, planes // (8 * depth)))
+        self.pieces = max(1, min(lattice.ndof // WORTH_A_PIECE, planes // (2 * depth)))
         even = n % width == 0 and (self.pieces == 1 or not one_axis)
         self._stages = _stages(Form.of(lattice, self._order, level, compensated, damped, width, even))
         self._functions, self._lock = self._stages.functions, self._stages.lock
