@@ -16,7 +16,6 @@ __all__ = [
     "sampled_name",
     "statements",
     "tuple_algebra",
-    "vectorised",
 ]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
@@ -24,11 +23,6 @@ _MAX_POWER = 16  # integer powers up to this are written as products
 
 class fast_exp(sp.Function):  # as the compiled function of the text `elementary`
     """exp as arithmetic, in loops that are to become vector instructions."""
-
-
-def vectorised(expressions: Sequence[sp.Expr]) -> list[sp.Expr]:
-    """Expressions for loops over sites, whose exponentials are arithmetic too."""
-    return [f.replace(sp.exp, fast_exp) for f in expressions]
 
 
 class _KernelPrinter(PythonCodePrinter):
