@@ -266,8 +266,11 @@ class Arrangement:
         return min(plans, key=lambda plan: plan.cost if few else plan.cost[::-1])
 
     def _factors(self, terms: Terms, few: bool) -> list[Monomial]:
-        """Products of letters to take out."""
+        """Products of letters to take out; where no two terms share any, those of the term that is known last."""
         counts: dict[Monomial, int] = {}
+        used = [x for m in terms for x, _ in m]
+        if few and len(set(used)) == len(used):
+            terms = {max(terms, key=lambda m: max((self._known[x] for x, _ in m), default=ALWAYS)): None}
         for m in terms:
             for i, (x, e) in enumerate(m):
                 for power in range(1, min(e, 2) + 1):
