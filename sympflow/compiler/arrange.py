@@ -20,6 +20,7 @@ __all__ = ["Arranged", "Arrangement"]
 
 MOST_TERMS = 64  # of a product that is multiplied out
 MOST_TRIED = 10  # terms of a polynomial for which all ways to nest it are compared
+FEW_TERMS = 5  # of a polynomial from which any product of letters may be taken out
 
 Monomial = tuple[tuple[int, int], ...]
 """Letters, by their order in the recording, with their exponents; sorted."""
@@ -266,11 +267,9 @@ class Arrangement:
         return min(plans, key=lambda plan: plan.cost if few else plan.cost[::-1])
 
     def _factors(self, terms: Terms, few: bool) -> list[Monomial]:
-        """Products of letters to take out; where no two terms share any, those of the term that is known last."""
+        """Products of letters to take out: those that terms share, and those of the term that is known last."""
         counts: dict[Monomial, int] = {}
-        used = [x for m in terms for x, _ in m]
-        if few and len(set(used)) == len(used):
-            terms = {max(terms, key=lambda m: max((self._known[x] for x, _ in m), default=ALWAYS)): None}
+        last = max(terms, key=lambda m: max((self._known[x] for x, _ in m), default=ALWAYS))
         for m in terms:
             for i, (x, e) in enumerate(m):
                 for power in range(1, min(e, 2) + 1):
@@ -279,7 +278,8 @@ class Arrangement:
                     for y, _ in m[i + 1 :]:
                         counts[(x, 1), (y, 1)] = counts.get(((x, 1), (y, 1)), 0) + 1
         if few:
-            return list(counts)
+            every = len(terms) <= FEW_TERMS
+            return [m for m, count in counts.items() if every or count > 1 or _divides(m, last)]
         return sorted((m for m in counts if m[0][1] == 1), key=lambda m: -counts[m])[:1]
 
     def _nested(self, terms: Terms, factor: Monomial) -> Iterator[Plan]:
