@@ -32,13 +32,14 @@ def test_a_verlet_solve_loads_sympy_only(backend):
     assert loaded_after(code) == {"sympy"}
 
 
-def test_runs_of_primed_flows_load_no_numba():
-    code = "import sympflow\nsympflow.solve(sympflow.systems.henon_heiles(), t_span=(0, 10))"
+@pytest.mark.parametrize("scene", ["henon_heiles", "harmonic_oscillator"])
+def test_runs_of_primed_flows_and_networks_load_no_numba(scene):
+    code = f"import sympflow\nsympflow.solve(sympflow.systems.{scene}(), 'sympflow', (0, 10))"
     assert "numba" not in loaded_after(code)
 
 
-@pytest.mark.parametrize("scene", ["henon_heiles", "pendulum", "fput_beta", "driven_pendulum"])
-def test_a_primed_flow_that_ships_loads_no_torch(scene):
+@pytest.mark.parametrize("scene", ["henon_heiles", "pendulum", "fput_beta", "driven_pendulum", "harmonic_oscillator"])
+def test_a_flow_that_ships_loads_no_torch(scene):
     code = (
         "import sympflow\n"
         f"sol = sympflow.solve(sympflow.systems.{scene}(), 'sympflow', (0, 10))\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.numbers import Number
 
-__all__ = ["Program", "Traced", "derivatives", "gradient", "tangent", "traced"]
+__all__ = ["Program", "Traced", "derivatives", "fused", "gradient", "tangent", "traced"]
 
 
 class Traced(Number):
@@ -209,6 +210,33 @@ def _written(x: Traced) -> str:
     args = [repr(a) for a in x.args]
     infix = FUNCTIONS[x.name].infix
     return f"{args[0]} {infix} {args[1]}" if infix else f"{x.name}({', '.join(args)})"
+
+
+def fused(program: Program) -> Program:
+    """Return the program with products that are used once joined to the sums that use them, in the same recording."""
+    used = Counter(a.order for x in program.operations for a in x.args if isinstance(a, Traced))
+    used.update(x.order for x in program.outputs if isinstance(x, Traced))
+    of: dict[int, Any] = {x.order: x for x in program.inputs}
+
+    def new(x: Any) -> Any:
+        return of[x.order] if isinstance(x, Traced) else x
+
+    def is_product(x: Any) -> bool:
+        return isinstance(x, Traced) and x.name in ("mul", "times") and used[x.order] == 1
+
+    for x in program.operations:
+        a, b, *_ = (*x.args, None)
+        if x.name == "add" and (is_product(a) or is_product(b)):
+            product, rest = (a, b) if is_product(a) else (b, a)
+            of[x.order] = apply("fma", *map(new, product.args), new(rest))
+        elif x.name == "sub" and is_product(a):
+            of[x.order] = apply("fma", *map(new, a.args), -new(b))
+        elif x.name == "sub" and is_product(b):
+            first, second = map(new, b.args)
+            of[x.order] = apply("fma", -first, second, new(a))
+        else:
+            of[x.order] = apply(x.name, *map(new, x.args))
+    return Program(program.inputs, [new(x) for x in program.outputs])
 
 
 def traced(function: Callable[..., Sequence[Any]], *names: str) -> Program:

@@ -27,7 +27,8 @@ Columns = tuple[np.ndarray, np.ndarray]
 def aligned(n: int) -> np.ndarray:
     """Numbers in memory, of any values, that begin with a line of it."""
     memory = np.empty(n + LINE)
-    return memory[-(memory.ctypes.data // 8) % LINE :][:n]
+    begin = -(address(memory) // 8) % LINE
+    return memory[begin : begin + n]
 
 
 class Rollouts:
@@ -50,6 +51,8 @@ class Rollouts:
         How they are there: `sympflow.kernels.runs.Memory`, or such a class.
     data : sequence of ndarray
         Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
+    chunked : bool
+        True if many trajectories of a batch are in memory, and pass through registers in each stage.
     timed : bool
         True if stages depend on the step.
     every : int, optional
@@ -69,6 +72,7 @@ class Rollouts:
     memory: Callable[..., Memory] = Memory
     every: int | None = None
     timed = False
+    chunked = False
     block = BLOCK
     counted = False
     closing = True
@@ -81,6 +85,10 @@ class Rollouts:
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
         raise NotImplementedError
+
+    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
+        """One column of many states: see `sympflow.kernels.runs.Over`."""
+        each(lambda values: self.stage(values, numbers, kind, step))
 
     def look(self, values: Any) -> Any:
         """The running state changed, where there is `every`: see `sympflow.kernels.runs.run_function`."""
@@ -120,9 +128,9 @@ class Rollouts:
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
-        own = name == "run own"
+        own, over = name == "run own", self.over if self.chunked else None
         return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over
         )
 
     def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:

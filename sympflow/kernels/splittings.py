@@ -70,6 +70,13 @@ class Splitting:
         return *of_system, self.level, self.monomials, self.compensated, self.friction, driving
 
     @property
+    def polynomial(self) -> bool:
+        """True if stages are sums and products alone."""
+        symbols = self.symbols
+        V, T = symbols.V, symbols.T
+        return bool(V is not None and T is not None and V.is_polynomial(*symbols.q) and T.is_polynomial(*symbols.p))
+
+    @property
     def kick_numbers(self) -> tuple[str, ...]:
         return kicks_of(self.level, len(self.monomials))[0].numbers
 
@@ -275,6 +282,8 @@ class SplittingCode(Rollouts):
         symbols = splitting.symbols
         super().__init__(2 * symbols.ndof * (1 + splitting.compensated), 2 * symbols.ndof)
         self.timed = splitting.driving is not None
+        self.chunked = self.timed or not splitting.polynomial
+        self.lanes = 8 if self.chunked else 16  # chunks need not wait for each other, registers side by side do
         self._own = len(symbols.values if self.timed else symbols.parameters)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -304,6 +313,13 @@ class SplittingCode(Rollouts):
                 for result, x in zip(results, self._executed(k, values, column), strict=True):
                     result.value = x
         return [x.value for x in results]
+
+    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
+        code, type = step.code, numbers(0).type
+        for k in range(len(self._kinds)):
+            with code.given(code.apply("eq", (kind, k))):
+                column = self._column(k, type, numbers, step)
+                each(lambda values, k=k, column=column: self._executed(k, values, column))
 
     def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
         return self._kinds[k].body(*values, *column)
