@@ -14,7 +14,6 @@ Points are the lanes of registers, all else is loops over memory.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,10 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
+from sympflow.compiler.control import INT, POINTER, Code, Module, Rows, Type, Value
 from sympflow.compiler.functions import fma
-from sympflow.compiler.machine import compiled, host
+from sympflow.compiler.machine import host
 from sympflow.kernels.activations import bent
+from sympflow.kernels.rollouts import filled
+from sympflow.kernels.runs import finished
 from sympflow.kernels.threads import run_rows
 
 __all__ = ["NetworkTangents", "TrainedNetwork"]
@@ -117,7 +118,7 @@ class NetworkTangents:
         J = self._kept[key]
         start = np.empty((m, m, shape[2]) if by_start is not None else 0)
         by = np.zeros(m) if by_velocity is None else np.ascontiguousarray(by_velocity)
-        factors = [_at_least(by_state.transpose(1, 2, 0)), by, self._units, self._places, J, start]
+        factors = [filled(by_state.transpose(1, 2, 0), LANES), by, self._units, self._places, J, start]
         flags = len(self._places), int(by_start is not None)
         self._run("jacobian", velocity, 10 * self.ndof, parameters, t, x, constants, factors, *flags)
         if by_start is not None:
@@ -140,7 +141,7 @@ class NetworkTangents:
         n_layers, n = len(self._is_kick), len(parameters)
         weights = np.zeros((n_layers, self._sizes.size))
         weights[:, self._places] = (parameters * self._units).reshape(n_layers, -1)
-        points = [weights, self._is_kick, *map(_at_least, (t, x.T, constants)), *rest]
+        points = [weights, self._is_kick, *(filled(a, LANES) for a in (t, x.T, constants)), *rest]
         addresses = [a.ctypes.data for a in points]
         function = _compiled(name, self._sizes, self._activation, velocity)
 
@@ -150,12 +151,6 @@ class NetworkTangents:
             function(*addresses, work.ctypes.data, n_layers, max(len(t), LANES), *blocks, *flags)
 
         run_rows(rows, len(t), factor * n, None)
-
-
-def _at_least(x: np.ndarray) -> np.ndarray:
-    """The columns of an array, the last one again where there are fewer than lanes."""
-    short = LANES - x.shape[-1]
-    return np.ascontiguousarray(np.concatenate([x, np.repeat(x[..., -1:], short, axis=-1)], -1) if short > 0 else x)
 
 
 class _Sizes(NamedTuple):
@@ -209,28 +204,6 @@ class _Sizes(NamedTuple):
         return np.concatenate(rows)
 
 
-class _Rows:
-    """Rows of memory, each a register of lanes."""
-
-    def __init__(self, code: Code, place: Value) -> None:
-        self.code, self.place = code, place
-
-    def __getitem__(self, i: Any) -> Value:
-        return self.code.load(self.place, i * LANES, REGISTER)
-
-    def __setitem__(self, i: Any, x: Any) -> None:
-        self.code.store(self.code.operand(x, REGISTER), self.place, i * LANES)
-
-    def add(self, i: Any, *products: tuple[Value, Value]) -> None:
-        total = self[i]
-        for x, y in products:
-            total = fma(x, y, total)
-        self[i] = total
-
-    def part(self, i: Any) -> _Rows:
-        return _Rows(self.code, self.code.at(self.place, i * LANES))
-
-
 class _Sweeps:
     """The code of one network: its values, and their derivatives along directions and by the weights.
 
@@ -250,7 +223,7 @@ class _Sweeps:
         self.K, self.k, self.w, self.b, self.W, _ = sizes.starts
         self.rows, at = {}, 0
         for name, size in sizes.parts.items():
-            self.rows[name] = _Rows(code, code.at(work, at * LANES))
+            self.rows[name] = Rows(code.at(work, at * LANES), REGISTER)
             at += size
 
     def weight(self, i: Any) -> Value:
@@ -265,7 +238,7 @@ class _Sweeps:
 
         return self.code.loop(count, start[: len(rows)], more)
 
-    def sweep(self, x: _Rows, dx: _Rows, t: Value, rate: Value) -> None:
+    def sweep(self, x: Rows, dx: Rows, t: Value, rate: Value) -> None:
         """z, σ', σ'', σ''', ż, ȧ, and back R = Wᵀr', r, Ṙ = Wᵀṙ', ṙ of all levels, at times t."""
         code, h, n, inputs, velocity = self.code, self.sizes.h, self.sizes.n, self.sizes.inputs, self.velocity
         z, s, u, v, dz, da, R, r, dR, dr = (
@@ -303,7 +276,7 @@ class _Sweeps:
                 total = self.product(h, lambda i: self.weight(column + i * h), [zero, zero], *given)
                 weighted(level * h + m, total[0], total[-1])
 
-    def add_moved(self, r: _Rows, sign: Value, target: _Rows) -> None:
+    def add_moved(self, r: Rows, sign: Value, target: Rows) -> None:
         """target += sign · Kᵀ r."""
         code, h, inputs = self.code, self.sizes.h, self.sizes.inputs
         with code.over(self.sizes.ndof) as j:
@@ -312,7 +285,7 @@ class _Sweeps:
             target.add(j, (sign, total[0]))
 
     def add_sensitivities(
-        self, x: _Rows, dx: _Rows, t: Value, rate: Value, sign: Value, j: Value, G: _Rows, dG: _Rows
+        self, x: Rows, dx: Rows, t: Value, rate: Value, sign: Value, j: Value, G: Rows, dG: Rows
     ) -> None:
         """Add sign times the derivatives of ∂_jV and d/dt ∂_jV by the weights to G and dG, by x to H and dH."""
         code, sizes, velocity, rows = self.code, self.sizes, self.velocity, self.rows
@@ -401,18 +374,18 @@ class _Points:
         self.theta, self.kicks, self.t, self.x, self.constants = code.arguments[:5]
         self.more, self.work = code.arguments[5 : 5 + more], code.arguments[5 + more]
         self.n_layers, self.n_points, self.first, self.last, *self.flags = code.arguments[6 + more :]
-        self.states = _Rows(code, code.at(self.work, sizes.work * LANES))
+        self.states = Rows(code.at(self.work, sizes.work * LANES), REGISTER)
         self._given = sizes, activation, velocity
 
     def sweeps(self, code: Code, theta: Value, work: Value) -> _Sweeps:
         return _Sweeps(code, *self._given, theta, work)
 
-    def swept(self, theta: Value, x: _Rows, dx: _Rows, t: Value, rate: Value) -> _Sweeps:
+    def swept(self, theta: Value, x: Rows, dx: Rows, t: Value, rate: Value) -> _Sweeps:
         """Call the sweep, which stands in the module once."""
 
         def body(theta: Value, x: Value, dx: Value, t: Value, rate: Value, work: Value) -> None:
             code = theta.code
-            self.sweeps(code, theta, work).sweep(_Rows(code, x), _Rows(code, dx), t, rate)
+            self.sweeps(code, theta, work).sweep(Rows(x, REGISTER), Rows(dx, REGISTER), t, rate)
 
         self.code.outlined("sweep", [theta, x.place, dx.place, t, rate, self.work], body)
         return self.sweeps(self.code, theta, self.work)
@@ -560,6 +533,4 @@ def _compiled(name: str, sizes: _Sizes, activation: str, velocity: bool) -> Call
     types = [*[POINTER] * (6 + more), *[INT] * (4 + flags)]
     code = Module(host().fused).function(name, types)
     getattr(_Points(code, sizes, activation, velocity, more), name)()
-    code.give()
-    c_types = [ctypes.c_void_p if t == POINTER else ctypes.c_int64 for t in types]
-    return compiled(str(code.module), name, ctypes.CFUNCTYPE(None, *c_types))
+    return finished(code, types)

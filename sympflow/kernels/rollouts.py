@@ -13,7 +13,7 @@ from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
 
-__all__ = ["Columns", "Rollouts", "aligned"]
+__all__ = ["Columns", "Rollouts", "aligned", "filled", "zeros"]
 
 NONE = np.empty(0)
 LINE = 8  # numbers in a line of memory
@@ -29,6 +29,23 @@ def aligned(n: int) -> np.ndarray:
     memory = np.empty(n + LINE)
     begin = -(address(memory) // 8) % LINE
     return memory[begin : begin + n]
+
+
+def zeros(n: int) -> np.ndarray:
+    """The same, of 0."""
+    x = aligned(n)
+    x[:] = 0.0
+    return x
+
+
+def filled(x: np.ndarray, lanes: int, times: int = 1) -> np.ndarray:
+    """Columns (…, J N), of each of J times the last one again where there are fewer than lanes."""
+    n = x.shape[-1] // times
+    if n >= lanes:
+        return np.ascontiguousarray(x)
+    each = x.reshape(*x.shape[:-1], times, n)
+    more = np.repeat(each[..., -1:], lanes - n, axis=-1)
+    return np.concatenate([each, more], axis=-1).reshape(*x.shape[:-1], times * lanes)
 
 
 class Rollouts:
@@ -114,12 +131,16 @@ class Rollouts:
 
     def function(self, name: str, width: int) -> Callable[..., None]:
         """The compiled function of a name, see `made`."""
-        found = self._functions.get((name, width))
+        return self.kept((name, width), lambda: self.made(name, width))
+
+    def kept(self, key: Any, make: Callable[[], Callable[..., None]]) -> Callable[..., None]:
+        """The result of `make`, made once for each key."""
+        found = self._functions.get(key)
         if found is None:
             with self._lock:
-                found = self._functions.get((name, width))
+                found = self._functions.get(key)
                 if found is None:
-                    found = self._functions[name, width] = self.made(name, width)
+                    found = self._functions[key] = make()
         return found
 
     def made(self, name: str, width: int) -> Callable[..., None]:

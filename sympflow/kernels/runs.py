@@ -9,14 +9,27 @@ closing column is applied. One function is the run of a single trajectory, and o
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Lanes", "Memory", "Numbers", "Room", "finished", "groups", "map_function", "run_function", "step_function"]
+__all__ = [
+    "ColumnStage",
+    "Lanes",
+    "Memory",
+    "Numbers",
+    "Room",
+    "finished",
+    "groups",
+    "map_function",
+    "run_function",
+    "step_function",
+    "there",
+]
 
 FAST_MEMORY = 16_384  # bytes of the states of a chunk after the other, and of their ends
 MOST_CHUNKS = 32
@@ -102,7 +115,7 @@ def run_function(
         begin = group * (width * chunks)
         length = (link + 2) * (size * width)
         place = code.at(table, group * length * chunks) if own else table
-        column = _Column(code, place, kinds, size, width if own else 1, width, stage, length if own else None)
+        column = ColumnStage(code, place, kinds, size, width if own else 1, width, stage, length if own else None)
         state.open(rows, begin, n_rows)
         n, saved, longest = code.variable(first), code.variable(zero), code.variable(state.block(every))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
@@ -181,7 +194,7 @@ def map_function(
     code = Module(host().fused).function("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
     state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
-    column = _Column(code, table, kinds, size, 1, width, stage)
+    column = ColumnStage(code, table, kinds, size, 1, width, stage)
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         state.open(rows, begin, n_rows, n_out)
@@ -389,7 +402,7 @@ class _Chunks:
             for i, x in enumerate(body([code.load(start, i * width, self.type) for i in range(n)], c)):
                 code.store(x, start, i * width)
 
-    def change(self, column: _Column, j: Value, step: Value, end: bool = False) -> None:
+    def change(self, column: ColumnStage, j: Value, step: Value, end: bool = False) -> None:
         place = self._end if end else self._state
         if self._over is None:
             self._each(place, lambda x, c: column(j, x, step, c))
@@ -428,7 +441,7 @@ class _Chunks:
     def mark(self, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
         """Write n for the trajectories that are alive, else −1."""
         code = self.code
-        with code.over(self._there(begin, n_rows)) as i:
+        with code.over(self.there(begin, n_rows)) as i:
             alive = code.apply("eq", (code.load(self._watch, i), 0.0))
             code.store(code.select(alive, n, code.constant(-1, INT)), finite, begin + i)
 
@@ -439,12 +452,12 @@ class _Chunks:
         one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
         self._write(self._state, self._n, running, begin, n_rows, one, zero)
 
-    def _there(self, begin: Value, n_rows: Value) -> Value:
+    def there(self, begin: Value, n_rows: Value) -> Value:
         return self.code.apply("min", (self._used * self.width, n_rows - begin))
 
     def _write(self, place: Value, n: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         code, width = self.code, self.width
-        with code.over(self._there(begin, n_rows)) as row:
+        with code.over(self.there(begin, n_rows)) as row:
             c = code.op("sdiv", INT, row, code.constant(width, INT))
             source = code.at(place, c * ((self._n - 1) * width) + row)
             start = code.at(out, ((begin + row) * stride + at) * n)
@@ -456,7 +469,14 @@ class Memory:
     """The same in memory: the state, its end, and the state before a block of steps.
 
     A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`.
+
+    Attributes
+    ----------
+    at_once : int
+        Numbers that are copied at a time: a state has a multiple of these.
     """
+
+    at_once = 1
 
     def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
         self.code, self.width, self._remembers = code, width, before
@@ -495,16 +515,24 @@ class Memory:
     def end(self) -> None:
         self._copy(self._running, self._end)
 
+    @contextmanager
+    def _blocks(self) -> Iterator[tuple[Value, Type]]:
+        """Places of blocks of numbers, which are copied at a time, and the type of each."""
+        size = self.at_once * self.width
+        with self.code.over(self.code.op("udiv", INT, self.n_values, self.code.constant(self.at_once, INT))) as i:
+            yield i * size, Type("double", size)
+
     def _copy(self, source: Room, target: Room) -> None:
-        with self.code.over(self.n_values) as i:
-            target.store(source.load(i), i)
+        with self._blocks() as (i, type):
+            self.code.store(self.code.load(source.state, i, type), target.state, i)
 
     def finite(self) -> Value:
-        zero = self.code.constant(0.0, self._end.type)
+        zero = self.code.constant(0.0, Type("double", self.at_once * self.width))
         total = self.code.variable(zero)
-        with self.code.over(self.n_values) as i:
-            total.value = self.code.fma(self._end.load(i), zero, total.value)
-        return self.code.apply("eq", (total.value, 0.0))
+        with self._blocks() as (i, type):
+            total.value = self.code.fma(self.code.load(self._end.state, i, type), zero, total.value)
+        good = self.code.apply("eq", (total.value, 0.0))
+        return good if self.at_once == 1 else ~self.code.any(~good)
 
     def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         self._write(self._end, self.n_out, out, begin, n_rows, stride, at)
@@ -514,7 +542,7 @@ class Memory:
         self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
 
     def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        with self.code.over(_there(self.code, self.width, begin, n_rows)) as lane:
+        with self.code.over(there(self.code, self.width, begin, n_rows)) as lane:
             start = self.code.at(out, ((begin + lane) * stride + at) * n)
             with self.code.over(n) as i:
                 self.code.store(self.code.load(room.state, i * self.width + lane), start, i)
@@ -541,7 +569,8 @@ def groups(code: Code, n_rows: Value, width: int) -> Value:
     return code.op("sdiv", INT, n_rows + (width - 1), code.constant(width, INT))
 
 
-def _there(code: Code, width: int, begin: Value, n_rows: Value) -> Value:
+def there(code: Code, width: int, begin: Value, n_rows: Value) -> Value:
+    """How many rows there are of `width` from `begin` on."""
     return code.apply("min", (code.constant(width, INT), n_rows - begin))
 
 
@@ -550,7 +579,7 @@ def _mark(code: Code, alive: Value, n: Value, finite: Value, begin: Value, n_row
     width = alive.type.width
     marks = code.memory(1, Type("i64", width))
     code.store(code.select(alive, code.splat(n, width), code.constant(-1, Type("i64", width))), marks)
-    with code.over(_there(code, width, begin, n_rows)) as lane:
+    with code.over(there(code, width, begin, n_rows)) as lane:
         code.store(code.load(marks, lane, INT), finite, begin + lane)
 
 
@@ -587,13 +616,13 @@ class Lanes:
             return
         for i, value in enumerate(x):
             code.store(value, self._buffer, i * self.width)
-        with code.over(_there(code, self.width, begin, n_rows)) as lane:
+        with code.over(there(code, self.width, begin, n_rows)) as lane:
             start = code.at(out, ((begin + lane) * stride + at) * n)
             for i in range(n):
                 code.store(code.load(self._buffer, lane + i * self.width), start, i)
 
 
-class _Column:
+class ColumnStage:
     """The stage of a column, the numbers of which are those of all lanes, or one for each in tables of a length."""
 
     def __init__(

@@ -20,6 +20,7 @@ from sympflow.compiler.functions import times
 from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
+from sympflow.kernels.approximations import OnInterval, Ranges, on_interval
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.stage_times import Driving
 
-__all__ = ["Shape", "Splitting", "SplittingCode", "shared"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange", "shared"]
 
 MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
@@ -53,6 +54,8 @@ class Splitting:
         Dimensions of Γ.
     driving : Driving, optional
         Of `symbols` with letters for what depends on the time.
+    ranges
+        Intervals of one position in which kicks are polynomials, equal but for rounding; its values are then in V.
     """
 
     symbols: SymbolicHamiltonian
@@ -61,13 +64,14 @@ class Splitting:
     compensated: bool = False
     friction: int | None = None
     driving: Driving | None = None
+    ranges: Ranges = ()
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Same for systems that share their code: those that differ in the values of parameters alone."""
         of_system = self.symbols.H, self.symbols.parameters, self.symbols.q, self.symbols.p
         driving = None if self.driving is None else self.driving.key
-        return *of_system, self.level, self.monomials, self.compensated, self.friction, driving
+        return *of_system, self.level, self.monomials, self.compensated, self.friction, driving, self.ranges
 
     @property
     def polynomial(self) -> bool:
@@ -93,9 +97,17 @@ class Splitting:
         """Terms of the kicks of each kind of stage: one, two, …; a polynomial has all of its own."""
         return [1, 2, 3][: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0)]
 
-    def kinds(self) -> list[Arranged]:
+    def kinds(self) -> Sequence[Arranged | WithinRange]:
         """The stages, those with the fewest terms first."""
-        return [self._arranged(terms) for terms in self.terms]
+        return [self._within_range(terms) if self.ranges else self._arranged(terms) for terms in self.terms]
+
+    def _within_range(self, terms: int) -> Arranged | WithinRange:
+        """The stage as a polynomial in its range, if there is one."""
+        near = on_interval(_of_kick(self.symbols, terms), self.symbols.q[0], *self.ranges[0])
+        if near is None:
+            return self._arranged(terms)
+        arranged = NearShape(self, terms, near).arranged()[1]
+        return WithinRange(arranged, self._arranged(terms), near.low, near.high)
 
     def _arranged(self, terms: int) -> Arranged:
         """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
@@ -160,8 +172,12 @@ class Shape:
             again, u = [_dot(row, self._by_mass(product)) for row in hessian], v
             bent = [_dot([_dot(row, u) for row in rows], u) for rows in third]
             changes = [x - times(more[1], y + 0.5 * z) for x, y, z in zip(changes, again, bent, strict=True)]
-        for e, powers in zip(more if self.splitting.monomials else (), self.splitting.monomials, strict=True):
-            changes = [x - e * _slope_of_monomial(powers, i, self.q) for i, x in enumerate(changes)]
+        return self._with_monomials(changes)
+
+    def _with_monomials(self, changes: list[Any]) -> list[Any]:
+        letters, monomials = self.splitting.kick_numbers[1:], self.splitting.monomials
+        for e, powers in zip(letters if monomials else (), monomials, strict=True):
+            changes = [x - self.number[e] * _slope_of_monomial(powers, i, self.q) for i, x in enumerate(changes)]
         return changes
 
     def _by_mass(self, v: Sequence[Any]) -> list[Any]:
@@ -222,6 +238,74 @@ class Shape:
             sums.append(total)
             left.append(op("sub", op("sub", total, value), corrected))
         return sums, left
+
+
+class NearShape(Shape):
+    """A stage of one position whose kick is a polynomial on an interval, with coefficients in the table."""
+
+    def __init__(self, splitting: Splitting, terms: int, near: OnInterval) -> None:
+        super().__init__(splitting, terms, True)
+        self._near = near
+
+    def _changes(self) -> list[Any]:
+        made, near = self.made, self._near
+        factors = [self.number[name] for name in self.splitting.kick_numbers[: self.terms]]
+        x = self.q[0] if near.center == 0 else made.letter(made.written(self.q[0] - near.center))
+        total = made.number(0.0)
+        for k, column in enumerate(near.coefficients.T.tolist()):
+            for sign, factor, c in zip((-1.0, 1.0, -1.0), factors, column, strict=False):
+                total = total + (sign * c) * factor * x**k
+        return self._with_monomials([total])
+
+
+class WithinRange:
+    """A stage in two ways: as a polynomial for positions in a range, exact for others; the same for all lanes.
+
+    Attributes
+    ----------
+    table : callable
+        From the constants of a run to the numbers that both read.
+    """
+
+    def __init__(self, near: Arranged, exact: Arranged, low: float, high: float) -> None:
+        self._near, self._exact, self._low, self._high = near, exact, low, high
+        self.table = _Both(near.table, exact.table)
+
+    def body(self, q: Value, *rest: Value) -> list[Value]:
+        """The state after the stage."""
+        n, code = len(self._near.body.inputs) - len(self._near.table.outputs) - 1, q.code
+        state, column = (q, *rest[:n]), rest[n:]
+        here = len(self._near.table.outputs)
+        inside = (self._low <= q) & (q <= self._high)
+        near = self._near.body(*state, *column[:here])
+
+        def exact() -> list[Value]:
+            values = self._exact.body(*state, *column[here:])
+            return [code.select(inside, x, y) for x, y in zip(near, values, strict=True)]
+
+        return code.when(code.any(~inside), exact, lambda: near, rare=True)
+
+
+class _Both:
+    """Two programs of the same inputs, with the outputs of both."""
+
+    def __init__(self, *programs: Program) -> None:
+        self._programs = programs
+        self.outputs = [x for program in programs for x in program.outputs]
+
+    def __call__(self, *values: Any) -> list[Any]:
+        return [x for program in self._programs for x in program(*values)]
+
+
+def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
+    """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
+    V, M = symbols.V, symbols.inverse_mass
+    assert V is not None
+    slope = V.diff(symbols.q[0])
+    if terms == 1 or M is None:
+        return [slope]
+    product = slope.diff(symbols.q[0]) * M[0, 0] * slope
+    return [slope, product, (slope * M[0, 0] * product / 2).diff(symbols.q[0])][:terms]
 
 
 def _slopes(symbols: SymbolicHamiltonian, terms: int) -> Program:
@@ -290,7 +374,7 @@ class SplittingCode(Rollouts):
         return SplittingCode, (self._splitting,)
 
     @cached_property
-    def _kinds(self) -> list[Arranged]:
+    def _kinds(self) -> Sequence[Arranged | WithinRange]:
         return self._splitting.kinds()
 
     @cached_property
@@ -346,6 +430,16 @@ class SplittingCode(Rollouts):
         assert driving is not None
         fixed = given[clock.stop :]
         return [*given[: clock.start], *fixed, *driving.values_at(time, given[0], fixed)]
+
+    @property
+    def given_numbers(self) -> int:
+        """How many numbers of a column are given, from which those are computed that the code reads."""
+        return len(self._splitting.numbers)
+
+    def executed(self, given: Sequence[Any], values: list[Value]) -> list[Value]:
+        """The values after a stage of the last kind, by the numbers that are given."""
+        last = self._kinds[-1]
+        return last.body(*values, *last.table(*given))
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "step" and "step own" too."""

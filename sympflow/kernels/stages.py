@@ -18,7 +18,6 @@ __all__ = [
     "DampedDrift",
     "Kick",
     "StageTable",
-    "TimeAlone",
     "TimedNumbers",
     "damped_drift",
     "kicks_of",
@@ -423,24 +422,6 @@ class LaneNumbers(Protocol):
     def later_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
         """``timed_numbers(table, j)``, and ``numbers_after(common, k)`` of these, the numbers of kick j of step k."""
         ...
-
-
-class TimeAlone:
-    """The numbers of kicks, and after them the time, of a system whose functions take that."""
-
-    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        numbers, values = numbers_of_kicks(kinds)
-        run, one = time_lines(n_rows)
-        return f"""@njit(**OPTIONS)
-def numbers_of(table, j, k=0):
-    {run}
-    return ({", ".join([*numbers, "time"])})
-
-
-@njit(**OPTIONS)
-def numbers_at(table, j, x, h, t):
-    {one}
-    return ({", ".join([*values, "time"])})"""
 
 
 def time_lines(row: int) -> tuple[str, str]:

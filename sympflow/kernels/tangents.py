@@ -245,7 +245,7 @@ class TangentCode(SplittingCode):
         products = d * d + (d if splitting.symbols.inverse_mass is not None else d * d)
         self.room = 0 if vectors * products > MOST_WRITTEN_OUT else None
         self.every = EVERY if grows else None
-        self.lanes = 16
+        self.lanes, self.chunked = 16, False
 
     def __reduce__(self) -> tuple[Any, ...]:
         return TangentCode, (self._splitting, self.vectors, self._grows)
