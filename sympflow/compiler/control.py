@@ -66,6 +66,9 @@ class Value(Number):
         self.code, self.type, self.name = code, type, name
 
     def apply(self, name: str, args: Sequence[Any]) -> Any:
+        for x in args:
+            if isinstance(x, Number) and not isinstance(x, Value):  # a kind that is made of values
+                return x.apply(name, args)
         return self.code.apply(name, args)
 
     @property
