@@ -700,4 +700,4 @@ class Sweep:
         return phis, self._begun, made
 
 
-_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1}
+_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1, "ptr": 8}
