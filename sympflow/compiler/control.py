@@ -66,6 +66,9 @@ class Value(Number):
         self.code, self.type, self.name = code, type, name
 
     def apply(self, name: str, args: Sequence[Any]) -> Any:
+        for x in args:
+            if isinstance(x, Number) and not isinstance(x, Value):  # a kind that is made of values
+                return x.apply(name, args)
         return self.code.apply(name, args)
 
     @property
@@ -697,4 +700,4 @@ class Sweep:
         return phis, self._begun, made
 
 
-_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1}
+_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1, "ptr": 8}
