@@ -14,7 +14,6 @@ Points are the lanes of registers, all else is loops over memory.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -25,9 +24,10 @@ import numpy as np
 
 from sympflow.compiler.control import INT, POINTER, Code, Module, Rows, Type, Value
 from sympflow.compiler.functions import fma
-from sympflow.compiler.machine import compiled, host
+from sympflow.compiler.machine import host
 from sympflow.kernels.activations import bent
 from sympflow.kernels.rollouts import filled
+from sympflow.kernels.runs import finished
 from sympflow.kernels.threads import run_rows
 
 __all__ = ["NetworkTangents", "TrainedNetwork"]
@@ -533,6 +533,4 @@ def _compiled(name: str, sizes: _Sizes, activation: str, velocity: bool) -> Call
     types = [*[POINTER] * (6 + more), *[INT] * (4 + flags)]
     code = Module(host().fused).function(name, types)
     getattr(_Points(code, sizes, activation, velocity, more), name)()
-    code.give()
-    c_types = [ctypes.c_void_p if t == POINTER else ctypes.c_int64 for t in types]
-    return compiled(str(code.module), name, ctypes.CFUNCTYPE(None, *c_types))
+    return finished(code, types)

@@ -52,8 +52,7 @@ class TableStep:
     monomials
         Of the polynomial.
     compiled : bool
-        Compile the step and its derivatives, where the system has symbols, or the forces of bodies in pairs: that takes
-        two seconds, and pays for a hundred evaluations.
+        Compile the step and its derivatives, where the system has symbols, or the forces of bodies in pairs.
 
     Attributes
     ----------
