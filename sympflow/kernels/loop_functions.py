@@ -12,7 +12,6 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.modules import (
     constants_source,
     load_algebra,
@@ -33,7 +32,6 @@ from sympflow.schemes import CURVATURE, POLYNOMIAL
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.approximations import Ranges
-    from sympflow.kernels.sized_loops import SizedLoops
     from sympflow.kernels.stage_times import Driving
 
 
@@ -149,24 +147,3 @@ def plain_kicks_source(symbols: SymbolicHamiltonian, level: int, monomials: Mono
         return [polynomial_kick_source(symbols, monomials)]
     sources = [gradient_kick_source(symbols)] if level else []
     return [*sources, curvature_kick_source(symbols)] if level == CURVATURE else sources
-
-
-def _lattice_loops(system: HamiltonianSystem, level: int, compensated: bool) -> SizedLoops:
-    """The loops of a lattice, of which only the structure, and not the size, is part of the code."""
-    from sympflow.hamiltonian.lattice import LatticeHamiltonian
-    from sympflow.kernels.lattice_loops import LatticeLoops
-
-    assert isinstance(system.local, LatticeHamiltonian)
-    return LatticeLoops(system.local, level, compensated, system.friction is not None)
-
-
-LOCAL: dict[str, Callable[..., SizedLoops]] = {"lattice": _lattice_loops}
-"""Makers of the loops of systems that are given by one piece."""
-
-
-def local_loops(system: HamiltonianSystem, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
-    """The loops of a system that is given by one piece."""
-    assert system.local is not None
-    loops = LOCAL[system.local.loops](system, level, compensated)
-    processed = loops.rollout_processed, loops.rollout_processed_batch
-    return LoopFunctions(loops.rollout, loops.rollout_batch, *processed, loops.step_rows)

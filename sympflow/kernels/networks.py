@@ -360,7 +360,13 @@ def _slopes(layer: NetworkLayer) -> tuple[Callable[[Any], Any] | None, int]:
 @cache
 def _by_numba(function: Any) -> Any:
     """A function (n, a, values, slopes) of addresses."""
-    from numba import carray, cfunc, njit, types
+    try:
+        from numba import carray, cfunc, njit, types
+    except ImportError as error:
+        raise ValueError(
+            "`compiled`, with which the activation of the flow was registered, has branches or calls functions, which "
+            "Numba compiles: install numba, or write it by operators."
+        ) from error
 
     compiled = function if hasattr(function, "py_func") else njit(error_model="numpy")(function)
     numbers = types.CPointer(types.float64)

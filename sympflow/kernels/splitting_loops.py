@@ -72,15 +72,13 @@ class SplittingLoops:
         By how much less it takes in a batch, whose lanes run side by side.
     driven : bool
         True if H depends on t.
-    closes : bool
-        True if runs in other coordinates hand closed outputs to χ, not those before the last stage of K.
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
-        self._has_ranges = self.closes = self.traced = self._large = False
+        self._has_ranges = self.traced = self._large = False
         self._symbols: Any = system.symbols
         self._form: Any = system.symbols
         self._driving: Driving | None = None
@@ -139,10 +137,9 @@ class SplittingLoops:
                 self._written, self.values = few(system.local)
                 self._compile = partial(pair_code, system.local, system.friction is not None)
             else:
-                from sympflow.kernels.loop_functions import local_loops
+                from sympflow.kernels.lattices import lattice_code
 
-                self.closes = True
-                self._compile = partial(local_loops, system)
+                self._compile = partial(lattice_code, system.local, system.friction is not None)
             self._has_force_gradient = system.quadratic_kinetic
             self.traced = self._written is not None
         else:
