@@ -56,7 +56,7 @@ def compared(system, method, y0, **more):
     return loops.stats["backend"], arrays.stats["backend"]
 
 
-@pytest.mark.parametrize("method", [pytest.param("srkn6b", marks=pytest.mark.slow), "chin4c"])
+@pytest.mark.parametrize("method", ["srkn6b", "chin4c"])
 def test_loops_make_the_steps_of_array_operations(method):
     system = chain()
     assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
@@ -71,9 +71,9 @@ def test_loops_make_the_steps_of_array_operations(method):
     ("boundary", "method"),
     [
         ("free", "chin4c"),
-        pytest.param("fixed", "chin4c", marks=pytest.mark.slow),
-        pytest.param("periodic", "chin4c", marks=pytest.mark.slow),
-        pytest.param("free", "verlet", marks=pytest.mark.slow),
+        ("fixed", "chin4c"),
+        ("periodic", "chin4c"),
+        ("free", "verlet"),
     ],
 )
 def test_chains_in_vector_registers(boundary, method):
@@ -94,7 +94,6 @@ def test_chains_in_vector_registers(boundary, method):
         assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("boundary", ["free", "periodic"])
 def test_two_fields_in_vector_registers(boundary):
     system = HamiltonianSystem.lattice(
@@ -111,10 +110,10 @@ def test_two_fields_in_vector_registers(boundary):
     ("boundary", "method"),
     [
         (("free", "fixed"), "chin4c"),
-        pytest.param(("fixed", "free"), "chin4c", marks=pytest.mark.slow),
-        pytest.param(("periodic", "periodic"), "chin4c", marks=pytest.mark.slow),
-        pytest.param(("fixed", "periodic"), "verlet", marks=pytest.mark.slow),
-        pytest.param(("periodic", "free"), "verlet", marks=pytest.mark.slow),
+        (("fixed", "free"), "chin4c"),
+        (("periodic", "periodic"), "chin4c"),
+        (("fixed", "periodic"), "verlet"),
+        (("periodic", "free"), "verlet"),
     ],
 )
 def test_sheets_in_vector_registers(boundary, method):
@@ -136,11 +135,9 @@ def test_sheets_in_vector_registers(boundary, method):
     ("definition", "shape"),
     [
         ({"onsite": "q", "bond": "r"}, (3, 8)),
-        pytest.param(
-            {"onsite": "q**2/2", "bond": "r", "boundary": ("free", "periodic")}, (3, 8), marks=pytest.mark.slow
-        ),
+        ({"onsite": "q**2/2", "bond": "r", "boundary": ("free", "periodic")}, (3, 8)),
         ({"onsite": "cos(q)", "bond": "r", "boundary": "free"}, 12),
-        pytest.param({"bond": {1: "r", 2: "r**2/2"}, "boundary": "free"}, 12, marks=pytest.mark.slow),
+        ({"bond": {1: "r", 2: "r**2/2"}, "boundary": "free"}, 12),
     ],
 )
 def test_bonds_of_constant_force(definition, shape):
@@ -149,7 +146,7 @@ def test_bonds_of_constant_force(definition, shape):
     assert compared(system, "chin4c", start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.parametrize("power", [pytest.param(14, marks=pytest.mark.slow), 15])
+@pytest.mark.parametrize("power", [14, 15])
 def test_powers_that_only_derivatives_have(power):
     system = HamiltonianSystem.lattice(bond=f"1/(2 + r)**{power} + r**2", shape=13, boundary="free")
     assert compared(system, "chin4c", start(system)) == LOOPS_AND_ARRAYS
@@ -163,7 +160,6 @@ def test_a_bond_that_is_not_there_may_be_infinite():
     assert compared(system, "verlet", y0) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damping", [None, 0.3])
 def test_two_fields_on_a_sheet_in_vector_registers(damping):
     system = HamiltonianSystem.lattice(
@@ -178,14 +174,12 @@ def test_two_fields_on_a_sheet_in_vector_registers(damping):
     assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("boundary", [("fixed", "free"), ("periodic", "periodic")])
 def test_lattices_of_two_axes(boundary):
     system = sheet(boundary)
     assert compared(system, "verlet", start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("boundary", "method"),
     [("periodic", "chin4c"), ("fixed", "verlet"), (("free", "periodic", "fixed"), "verlet")],
@@ -274,13 +268,11 @@ def test_events_and_dense_output_go_by_the_one_driver():
         assert abs(sol.sol(t)[0]) < 1e-10
 
 
-@pytest.mark.slow
 def test_friction_is_the_same_in_loops():
     system = ring(damping=0.2)
     assert compared(system, "srkn6b", start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shape", [48, (6, 9)])
 def test_compensated_sums_lower_the_rounding(shape):
     """There and back by a symmetric scheme: what is left is rounding, whatever the error of the method."""
