@@ -35,9 +35,9 @@ from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
+    smaller_tolerance,
     warn_of_leap,
     warn_of_loss,
-    warn_of_tolerance,
 )
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.impulses import run_between_impulses
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.storage.runs import RunStore
 
-BACKENDS = ("auto", "compiled", "array", "cuda")
+BACKENDS = ("auto", "compiled", "array")
 MAX_EVENT_SAMPLES = 100_000_000
 MOST_DIAGNOSED = 16  # sets of values of parameters
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
@@ -129,11 +129,9 @@ def solve(
         Longest time between two samples of the event functions; two zeros of one between two samples are missed. It
         never changes the run: longer steps are sampled within, by the dense output, as `max_step` does inside
         `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and every step for adaptive methods.
-    backend : "auto", "compiled", "array" or "cuda"
-        "auto" runs splitting methods on symbolic systems (and on Numba functions) and float64 NumPy states compiled,
-        everything else with array operations. "cuda" runs a batch on an NVIDIA GPU, a thread for each trajectory: for
-        schemes on the splitting "kinetic" of autonomous symbolic systems without friction; results agree with compiled
-        ones to rounding. It has been run in Numba's simulator only. What ran is in `stats["backend"]`.
+    backend : "auto", "compiled" or "array"
+        "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states, everything
+        else with array operations; tensors on a GPU too. What ran is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
@@ -280,11 +278,8 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
 def check_backend(backend: Any, integrator: Integrator) -> None:
     """Raise ValueError if it is none, or none of the method."""
     if not isinstance(backend, str) or backend not in BACKENDS:
-        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
-    if backend == "cuda" and not integrator.runs_on_cuda:
         raise ValueError(
-            f"`backend` 'cuda' is for splitting methods on the splitting 'kinetic' and the clock 'physical'; "
-            f"{integrator.label!r} is none: use backend='auto'."
+            f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}: for a GPU pass tensors on it."
         )
     if backend == "compiled" and not integrator.compiles:
         raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
@@ -301,7 +296,7 @@ def _answered(integrator: Integrator, problem: Problem, action: str, rows: Param
 
 def _solved(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None = None) -> Solution:
     """The solution of a validated problem; `rows` are the parameters of its trajectories, where they have some."""
-    system, y_start = problem.system, problem.y0
+    given, system, y_start = problem, problem.system, problem.y0
     n_times = 0 if problem.t_eval is None else len(problem.t_eval)
     between = system.between_impulses
     integrator = integrator.resolved(between, y_start, abs(problem.t1 - problem.t0), n_times)
@@ -335,6 +330,11 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
+    if integrator.absolute_tolerance and stopped is None and readable(outcome.y) and np.all(outcome.status >= 0):
+        atol = smaller_tolerance(outcome, system, integrator.absolute_tolerance)
+        if atol is not None:
+            afresh = replace(given, events=given.events and given.events.afresh())
+            return _solved(replace(integrator, atol=atol), afresh, action, rows)  # type: ignore[type-var]
     passed = False
     if (system.poles is not None or problem.letters is not None) and problem.diagnosed and problem.store is None:
         if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
@@ -346,8 +346,6 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         note_singularities(outcome, integrator, problem, passed)
     if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
-    if integrator.absolute_tolerance and not failed and problem.store is None and readable(outcome.y):
-        warn_of_tolerance(outcome, system, integrator.absolute_tolerance, stacklevel=4)
     if system.functions_given and readable(outcome.y):
         system.check_functions_along(outcome.y)
     if integrator.trained:

@@ -83,13 +83,10 @@ def compiled(text: str, name: str, signature: Any) -> Any:
 
 
 def address(array: Any) -> int:
-    """Return where the numbers of a NumPy array lie in memory; 0 of one without numbers."""
-    if not array.size:
-        return 0
-    try:
-        return ctypes.addressof(_BYTE(array))  # a fifth of the time of what follows
-    except (TypeError, ValueError):  # read-only, or not contiguous
-        return int(array.ctypes.data)
+    """Return where the numbers of a NumPy array lie in memory, of an empty one too, where code may look."""
+    if array.size and array.flags.writeable:
+        return ctypes.addressof(_BYTE(array.data))  # a third of the time of what follows
+    return int(array.ctypes.data)
 
 
 _BYTE = ctypes.c_char.from_buffer
@@ -172,4 +169,3 @@ def _held_across_forks() -> None:
 
 
 _held_across_forks()
-VOID, REAL, WHOLE, ADDRESS = None, ctypes.c_double, ctypes.c_int64, ctypes.c_void_p

@@ -1,8 +1,8 @@
-"""Primed flows without torch: the knowledge of one, and one from a file as the numbers that compiled runs read."""
+"""Flows that ship without torch: the numbers of a file that compiled runs read, of primed flows and of networks."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from sympflow.arrays import untransformed
-from sympflow.flow.known import KnownFlow
+from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.records import Description, Refused, numbers_checksum, read
 from sympflow.flow.tables import PrimedShape, Tables, free_numbers, substeps_of
 from sympflow.hamiltonian.domain import states_of
@@ -22,6 +22,8 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 if TYPE_CHECKING:
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.kernels.flow_loops import PrimedFlowKernel
+    from sympflow.kernels.networks import NetworkLayer
+    from sympflow.kernels.protocol import Kernel
 
 WORSE = 2.0
 """Times the energy error of a ring that a lattice with ends may have for the numbers of a flow to hold there."""
@@ -154,12 +156,7 @@ class FrozenFlow(PrimedKnown):
         ValueError
             If the file is damaged, or the system is not that of the flow.
         """
-        from safetensors.numpy import load
-
-        content, _, record, altered = read(path)
-        arrays: Mapping[str, np.ndarray] = load(content)
-        if altered or numbers_checksum(arrays) != record["checksum"]:
-            raise Refused("its numbers are not those that were saved")
+        record, arrays = _read(path)
         plan, ndof = record["architecture"]["primed"], record["architecture"]["ndof"]
         shape = PrimedShape.from_dict(plan, ndof)
         tables = _tables(shape, record["dt"], arrays)
@@ -180,10 +177,7 @@ class FrozenFlow(PrimedKnown):
     @cached_property
     def thawed(self) -> Any:
         """The flow itself, a module of torch."""
-        from sympflow.flow.files import load
-
-        with untransformed():  # what is kept must not be a tensor of a transform that ends
-            return load(self.path, system=self._system)
+        return _thawed(self.path, self._system)
 
     def step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
         return self.thawed.step_of_arrays(h, y, t)
@@ -194,6 +188,78 @@ class FrozenFlow(PrimedKnown):
     def carried(self, system: HamiltonianSystem) -> Self:
         tables = Tables(self._tables.substeps, len(self.shape.outer), self.dt, self.monomials)
         return type(self)(self.path, self.shape, tables, system, self.description_for(system))
+
+
+class FrozenNetwork(KnownFlow):
+    """A SympFlow of networks from a file of our own, for compiled runs; everything else is done by `thawed`."""
+
+    kind = "sympflow"
+    symplectic = True
+
+    def __init__(self, path: Path, dt: float, layers: Sequence[NetworkLayer], description: Description) -> None:
+        self.ndof, self.dt, self.path, self._layers = layers[0].K.shape[1], dt, path, layers
+        self.describe(description)
+
+    @classmethod
+    def of_file(cls, path: Path, system: HamiltonianSystem) -> Self | None:
+        """Read a flow that ships, of that system; None if it is none of networks.
+
+        Raises
+        ------
+        ValueError
+            If the file is damaged, or the system is not that of the flow.
+        """
+        from sympflow.kernels.networks import NetworkLayer
+
+        record, arrays = _read(path)
+        plans = record["architecture"].get("layers", [])
+        if not plans or any(plan["potential"]["type"] != "mlp" for plan in plans):
+            return None
+        layers = []
+        for i, plan in enumerate(plans):
+            start = f"layers.{i}.potential."
+            of = {name.removeprefix(start): a.astype(float) for name, a in arrays.items() if name.startswith(start)}
+            n = len(plan["potential"]["hidden"])
+            first = plan["kind"] == "kick", plan["potential"]["activation"]
+            K, k = of["weight_x"] / of["scale"], of["weight_t"] / of["tau"]
+            biases, weights = ([of[f"{name}.{j}"] for j in range(m)] for name, m in (("biases", n), ("weights", n - 1)))
+            layers.append(NetworkLayer(*first, K, k, biases, weights, of["gain"] * of["weight_out"]))
+        flow = cls(path, record["dt"], layers, Description.of_record(record, record["architecture"]["ndof"]))
+        flow.check_system(system)
+        return flow
+
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
+        if compensated:
+            raise ValueError(UNCOMPENSATED)
+        return self._kernel
+
+    @cached_property
+    def _kernel(self) -> Kernel:
+        from sympflow.kernels.networks import MLPFlowKernel
+
+        return MLPFlowKernel(self.ndof, self._layers)
+
+    @cached_property
+    def thawed(self) -> Any:
+        return _thawed(self.path)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, np.ndarray]]:
+    """The record and the arrays of a file."""
+    from safetensors.numpy import load
+
+    content, _, record, altered = read(path)
+    arrays: Mapping[str, np.ndarray] = load(content)
+    if altered or numbers_checksum(arrays) != record["checksum"]:
+        raise Refused("its numbers are not those that were saved")
+    return record, arrays
+
+
+def _thawed(path: Path, system: HamiltonianSystem | None = None) -> Any:
+    from sympflow.flow.files import load
+
+    with untransformed():  # what is kept must not be a tensor of a transform that ends
+        return load(path, system=system)
 
 
 def _tables(shape: PrimedShape, dt: float, arrays: Mapping[str, np.ndarray]) -> Tables:

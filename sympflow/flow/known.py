@@ -18,6 +18,11 @@ from sympflow.hamiltonian.local_states import LocalStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 
+UNCOMPENSATED = (
+    "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
+    "flow of SympFlow.primed."
+)
+
 
 @dataclass(frozen=True)
 class Origin:

@@ -231,8 +231,8 @@ def register_activation(
         An elementwise function σ of tensors, C² (a torch.nn.Module for instance), whose derivatives are found by
         forward-mode differentiation; or an `Activation`, which has them in closed form.
     compiled : callable, optional
-        A function of a number a that returns σ(a) and σ'(a), one of Numba or one that Numba compiles. With it flows
-        run compiled, else by array operations.
+        A function of a number a that returns σ(a) and σ'(a), by operators; one with branches or functions of a module
+        is compiled by Numba, or is one of Numba. With it flows run compiled, else by array operations.
 
     Raises
     ------

@@ -134,12 +134,14 @@ class ShippedFlow:
         return load(self.path, system=time_transformed(system, self.shift))
 
     def known(self, system: HamiltonianSystem) -> KnownFlow:
-        """The flow of a system for compiled runs: of a primed one in its own time the numbers, without torch."""
-        if self.stages is None or self.shift is not None:
+        """The flow of a system for compiled runs: of one of numbers or of networks these, without torch."""
+        if self.shift is not None or self.kind != "sympflow":
             return self.load(system)
-        from sympflow.flow.frozen import FrozenFlow
+        from sympflow.flow.frozen import FrozenFlow, FrozenNetwork
 
-        return FrozenFlow.of_file(self.path, system)
+        if self.stages is not None:
+            return FrozenFlow.of_file(self.path, system)
+        return FrozenNetwork.of_file(self.path, system) or self.load(system)
 
 
 class ShippedFlows(Sequence[ShippedFlow]):

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from sympflow.arguments import plain
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.known import UNCOMPENSATED
 from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
 from sympflow.flow.potentials import (
     MLPPotential,
@@ -33,11 +34,6 @@ from sympflow.schemes import Scheme
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from sympflow.kernels.network_tangents import NetworkTangents
     from sympflow.kernels.networks import MLPFlowKernel
-
-UNCOMPENSATED = (
-    "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
-    "flow of SympFlow.primed."
-)
 
 
 class SympFlow(FlowMap):

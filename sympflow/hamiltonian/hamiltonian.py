@@ -190,9 +190,16 @@ class Hamiltonian:
 
     def with_force(self, force: ExternalForce) -> Self:
         """Return the system with p' = −∂H/∂q − Γp + F(q, p), which its vector field, and no H, holds."""
-        forced = copy.copy(self)
+        forced = self._copied()
         forced.name, forced.external_force = f"{self.name}_forced", force
         return forced
+
+    def _copied(self) -> Self:
+        """A copy without what was found out of the original, which is to be another system."""
+        other = copy.copy(self)
+        for name in [name for name in vars(other) if isinstance(getattr(type(other), name, None), cached_property)]:
+            del vars(other)[name]
+        return other
 
     def as_doubled(self) -> Doubled:
         """Return the system itself if it is a doubled one.
@@ -294,9 +301,7 @@ class Hamiltonian:
         form = self._definition.between_impulses
         if form is self._definition:
             return self
-        between = copy.copy(self)
-        for name in ("fingerprint", "linear_part", "expression"):
-            vars(between).pop(name, None)
+        between = self._copied()
         Hamiltonian.__init__(between, self.name, form, self.inverse_mass, self.quadratic_kinetic)
         between.symbols, between.autonomous = form, not form.timed
         return between

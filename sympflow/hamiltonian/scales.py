@@ -68,6 +68,14 @@ def weights(system: Scene) -> np.ndarray:
     return np.concatenate([s, 1 / s])
 
 
+def distance(system: Scene, change: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Return ‖y − y'‖ of differences of states along an axis, each pᵢ divided by sᵢ²: in units of q."""
+    s = natural_scale(system)
+    shape = [1] * change.ndim
+    shape[axis] = -1
+    return np.linalg.norm(change * np.concatenate([np.ones_like(s), s**-2]).reshape(shape), axis=axis)
+
+
 def smallest_size(scene: Scene, y0: np.ndarray) -> float:
     """A size that neither all q nor all p of an orbit from the states y0 (..., 2d) are less than; never 0.
 

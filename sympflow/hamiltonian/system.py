@@ -903,6 +903,7 @@ def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]
         Equal to `system`, so that whatever is kept by system is found by the view too.
     """
     view = copy.copy(system)
+    vars(view).pop("between_impulses", None)  # the view itself, where there are none
     view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]
     view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
     return view

@@ -81,26 +81,25 @@ NEXT_TO = 1e-3
 """Of the larger of q and p, in comparable units: where the other one is smaller, a run is at rest or has none."""
 
 
-def warn_of_tolerance(outcome: Outcome, system: HamiltonianSystem, tolerance: float, stacklevel: int) -> None:
-    """Warn of a run of which all q, or all p, are below the absolute tolerance, which hides their errors."""
+HIDES = 0.01  # of the largest q, or p: errors of the default tolerance that are as large
+
+
+def smaller_tolerance(outcome: Outcome, system: HamiltonianSystem, tolerance: float) -> float | None:
+    """The absolute tolerance of a run of which all q, or all p, are so small that the default one hides their errors.
+
+    None if none are: they are of an order between, or at rest.
+    """
     y = to_numpy(outcome.y).reshape(-1, 2, system.ndof)
     with np.errstate(all="ignore"):
         sizes = np.abs(y).max(0, initial=0.0)
-        small = (sizes.max(-1) > 0) & (sizes.max(-1) <= tolerance)
+        small = (sizes.max(-1) > 0) & (HIDES * sizes.max(-1) <= tolerance)
     if not small.any():
-        return
+        return None
     scale = weights(system)
     scaled = (sizes * scale.reshape(2, -1)).max(-1)
     at_rest = system.y0 is not None and scaled.max() <= np.finfo(float).eps * np.abs(scale * system.y0).max()
     small &= (scaled > NEXT_TO * scaled.max()) & (not at_rest)
-    if small.any():
-        k = int(np.argmax(small))
-        warnings.warn(
-            f"`atol`, by default {tolerance:g}, is larger than every {'qp'[k]} of the run, at most "
-            f"{sizes[k].max():.3g}, whose errors it hides. Pass an `atol`, such as {sizes[k].max() * 1e-9:.0e}.",
-            RuntimeWarning,
-            stacklevel=stacklevel + 1,
-        )
+    return tolerance * float(sizes.max(-1)[small].min()) if small.any() else None
 
 
 def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stacklevel: int) -> None:

@@ -6,7 +6,6 @@ chunk after the other into the triangle above it.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
@@ -15,7 +14,8 @@ import numpy as np
 
 from sympflow.compiler.control import DOUBLE, INT, POINTER, Code, Module, Type, Value
 from sympflow.compiler.functions import apply, fma
-from sympflow.compiler.machine import address, compiled, host
+from sympflow.compiler.machine import address, host
+from sympflow.kernels.runs import finished
 
 __all__ = ["bent", "damped", "factored"]
 
@@ -43,7 +43,7 @@ def _triangles(columns: np.ndarray, r: np.ndarray, n_blocks: int) -> tuple[np.nd
     """The triangles (B, k + 1, k + 1) of equal blocks of rows of [J r], and the norms of the last one's columns."""
     k, m = columns.shape
     R, norms, memory = np.zeros((n_blocks, k + 1, k + 1)), np.empty(k), np.empty((k + 1, CHUNK))
-    _functions()["fold"](*map(address, (columns, r, R, norms, memory)), k, m, n_blocks)
+    _function("fold")(*map(address, (columns, r, R, norms, memory)), k, m, n_blocks)
     return R, norms
 
 
@@ -51,7 +51,7 @@ def damped(R: np.ndarray, D: np.ndarray, damping: float) -> tuple[np.ndarray, np
     """Return the triangle S of [R; √λ D], the s that minimizes ‖J s + r‖² + λ‖D s‖², and the decrease of ‖J s + r‖²."""
     n = len(D)
     S, columns, step = R.copy(), np.zeros((n + 1, n)), np.empty(n + 1)
-    _functions()["damp"](*map(address, (R, D, S, columns, step)), damping, n)
+    _function("damp")(*map(address, (R, D, S, columns, step)), damping, n)
     return S, step[:n], float(step[n])
 
 
@@ -70,7 +70,7 @@ def bent(
     (k, m), n = columns.shape, len(D)
     curvature, bend = probed - r, np.zeros(n)
     arrays = columns, blocks, curvature, step, S, D, bend
-    _functions()["bend"](*map(address, arrays), probe, curved, k, m, len(blocks), n)
+    _function("bend")(*map(address, arrays), probe, curved, k, m, len(blocks), n)
     return bend
 
 
@@ -240,16 +240,8 @@ _FUNCTIONS: dict[str, tuple[Callable[[Code], None], list[Type]]] = {
 
 
 @cache
-def _functions() -> dict[str, Callable[..., None]]:
-    """The functions, of one module."""
-    module = Module(host().fused)
-    for name, (write, types) in _FUNCTIONS.items():
-        code = module.function(name, types)
-        write(code)
-        code.give()
-    of = {POINTER: ctypes.c_void_p, INT: ctypes.c_int64, DOUBLE: ctypes.c_double}
-    text = str(module)
-    return {
-        name: compiled(text, name, ctypes.CFUNCTYPE(None, *(of[t] for t in types)))
-        for name, (_, types) in _FUNCTIONS.items()
-    }
+def _function(name: str) -> Callable[..., None]:
+    write, types = _FUNCTIONS[name]
+    code = Module(host().fused).function(name, types)
+    write(code)
+    return finished(code, types)

@@ -30,7 +30,6 @@ __all__ = [
     "elementary",
     "imports_source",
     "load_algebra",
-    "load_around",
     "load_module",
     "template",
 ]
@@ -94,14 +93,6 @@ def load_module(source: str, shared: Sequence[str] = ()) -> ModuleType:
     """
     with _loading:
         return _loaded(source, tuple(shared))
-
-
-def load_around(source: str, shared: Sequence[str] = (), **given: Any) -> ModuleType:
-    """`load_module` of a source around compiled functions of the user, which it knows as `given`; kept on no disk."""
-    module = ModuleType("sympflow_kernel_around")
-    vars(module).update(given)
-    exec(imports_source(shared) + source, vars(module))
-    return _callable_part(module)
 
 
 @cache

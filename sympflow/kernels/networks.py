@@ -91,7 +91,11 @@ class MLPFlowKernel(Kernel):
                 f"{', '.join(SLOPES)}, or one that was registered with `compiled`, to be compiled: use "
                 "backend='array'."
             )
+        self._given = ndof, layers
         self._rollouts = _NetworkRollouts(ndof, layers)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return MLPFlowKernel, self._given
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` times ψ̄_h from one state: see `Kernel`."""
@@ -360,7 +364,13 @@ def _slopes(layer: NetworkLayer) -> tuple[Callable[[Any], Any] | None, int]:
 @cache
 def _by_numba(function: Any) -> Any:
     """A function (n, a, values, slopes) of addresses."""
-    from numba import carray, cfunc, njit, types
+    try:
+        from numba import carray, cfunc, njit, types
+    except ImportError as error:
+        raise ValueError(
+            "`compiled`, with which the activation of the flow was registered, has branches or calls functions, which "
+            "Numba compiles: install numba, or write it by operators."
+        ) from error
 
     compiled = function if hasattr(function, "py_func") else njit(error_model="numpy")(function)
     numbers = types.CPointer(types.float64)

@@ -195,6 +195,6 @@ class Kernel(Protocol):
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """The states of rows of `y0` (N, 2d) at elapsed times, of steps that are equal in another time.
 
-        See `timed_loops.reach_times`. None where there is no such pass.
+        See `elapsed_times.reach_times`. None where there is no such pass.
         """
         return None

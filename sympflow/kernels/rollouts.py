@@ -14,7 +14,7 @@ from sympflow.compiler.machine import address
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
 from sympflow.kernels.threads import NEVER
 
-__all__ = ["Columns", "Rollouts", "aligned"]
+__all__ = ["Columns", "Rollouts", "aligned", "filled", "zeros"]
 
 NONE = np.empty(0)
 LINE = 8  # numbers in a line of memory
@@ -30,6 +30,23 @@ def aligned(n: int) -> np.ndarray:
     memory = np.empty(n + LINE)
     begin = -(address(memory) // 8) % LINE
     return memory[begin : begin + n]
+
+
+def zeros(n: int) -> np.ndarray:
+    """The same, of 0."""
+    x = aligned(n)
+    x[:] = 0.0
+    return x
+
+
+def filled(x: np.ndarray, lanes: int, times: int = 1) -> np.ndarray:
+    """Columns (…, J N), of each of J times the last one again where there are fewer than lanes."""
+    n = x.shape[-1] // times
+    if n >= lanes:
+        return np.ascontiguousarray(x)
+    each = x.reshape(*x.shape[:-1], times, n)
+    more = np.repeat(each[..., -1:], lanes - n, axis=-1)
+    return np.concatenate([each, more], axis=-1).reshape(*x.shape[:-1], times * lanes)
 
 
 class Rollouts:
@@ -52,6 +69,8 @@ class Rollouts:
         How they are there: `sympflow.kernels.runs.Memory`, or such a class.
     data : sequence of ndarray
         Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
+    chunked : bool
+        True if many trajectories of a batch are in memory, and pass through registers in each stage.
     timed : bool
         True if stages depend on the step.
     every : int, optional
@@ -71,6 +90,7 @@ class Rollouts:
     memory: Callable[..., Memory] = Memory
     every: int | None = None
     timed = False
+    chunked = False
     block = BLOCK
     counted = False
     closing = True
@@ -83,6 +103,10 @@ class Rollouts:
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
         raise NotImplementedError
+
+    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
+        """One column of many states: see `sympflow.kernels.runs.Over`."""
+        each(lambda values: self.stage(values, numbers, kind, step))
 
     def look(self, values: Any) -> Any:
         """The running state changed, where there is `every`: see `sympflow.kernels.runs.run_function`."""
@@ -108,12 +132,16 @@ class Rollouts:
 
     def function(self, name: str, width: int) -> Callable[..., None]:
         """The compiled function of a name, see `made`."""
-        found = self._functions.get((name, width))
+        return self.kept((name, width), lambda: self.made(name, width))
+
+    def kept(self, key: Any, make: Callable[[], Callable[..., None]]) -> Callable[..., None]:
+        """The result of `make`, made once for each key."""
+        found = self._functions.get(key)
         if found is None:
             with self._lock:
-                found = self._functions.get((name, width))
+                found = self._functions.get(key)
                 if found is None:
-                    found = self._functions[name, width] = self.made(name, width)
+                    found = self._functions[key] = make()
         return found
 
     def made(self, name: str, width: int) -> Callable[..., None]:
@@ -122,9 +150,9 @@ class Rollouts:
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
-        own = name == "run own"
+        own, over = name == "run own", self.over if self.chunked else None
         return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over
         )
 
     def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:

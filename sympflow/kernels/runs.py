@@ -9,15 +9,30 @@ closing column is applied. One function is the run of a single trajectory, and o
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
+from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Lanes", "Memory", "Numbers", "Room", "finished", "groups", "map_function", "run_function", "step_function"]
+__all__ = [
+    "ColumnStage",
+    "Lanes",
+    "Memory",
+    "Numbers",
+    "Room",
+    "finished",
+    "groups",
+    "map_function",
+    "run_function",
+    "step_function",
+    "there",
+]
 
+FAST_MEMORY = 16_384  # bytes of the states of a chunk after the other, and of their ends
+MOST_CHUNKS = 32
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
 Numbers = Callable[..., Any]
@@ -27,6 +42,9 @@ Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 `step` tells after how many whole steps the stage is executed."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
+Over = Callable[[Callable[..., None], Numbers, Value, Value], None]
+"""``over(each, numbers, kind, step)``: a stage of many states, ``each(body)`` executes ``body(values)`` for each of
+them; what is the same for all is computed before."""
 
 
 def run_function(
@@ -40,8 +58,9 @@ def run_function(
     look: Callable[[Any], Any] | None = None,
     every: int = BLOCK,
     closing: bool = True,
+    over: Over | None = None,
 ) -> Callable[..., None]:
-    """Compile the runs of trajectories, `width` of them side by side.
+    """Compile the runs of trajectories, `width` of them side by side, and of these as many as the fast memory holds.
 
     Parameters
     ----------
@@ -62,6 +81,8 @@ def run_function(
         Steps between two looks, for a state that is not finite too.
     closing : bool
         False if `closes` is always 0.
+    over : callable, optional
+        The stage of many states, where these are to be in memory: as pays where a stage is long.
 
     Returns
     -------
@@ -84,15 +105,21 @@ def run_function(
         code.arguments[:15]
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
-    state = _state(code, n_values, n_out, width, memory, code.arguments[15:], before=width == 1)
-    with code.over(groups(code, n_rows, width)) as group:
-        begin = group * width
-        place = code.at(table, group * (link + 2) * (size * width)) if own else table
-        column = _column(code, place, kinds, size, width if own else 1, width, stage)
+    state: _Registers | _Chunks | Memory
+    if width > 1 and memory is None and over is not None:
+        state = _Chunks(code, n_values, n_out, width, own, over)
+    else:
+        state = _state(code, n_values, n_out, width, memory, code.arguments[15:], before=width == 1)
+    chunks = state.chunks if isinstance(state, _Chunks) else 1
+    with code.over(groups(code, n_rows, width * chunks)) as group:
+        begin = group * (width * chunks)
+        length = (link + 2) * (size * width)
+        place = code.at(table, group * length * chunks) if own else table
+        column = ColumnStage(code, place, kinds, size, width if own else 1, width, stage, length if own else None)
         state.open(rows, begin, n_rows)
         n, saved, longest = code.variable(first), code.variable(zero), code.variable(state.block(every))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
-        alive = code.variable(code.constant(1, Type("i1", width)))
+        alive = code.variable(code.constant(1, Type("i1", 1 if isinstance(state, _Chunks) else width)))
         going = code.variable(first < n_steps)
         with code.during(lambda: going.value):
             k = code.apply("min", (longest.value, n_steps - n.value))
@@ -132,6 +159,8 @@ def run_function(
                     alive.value, going.value = code.constant(1, Type("i1")), code.constant(1, Type("i1"))
         if width == 1:
             code.store(n.value, finite, begin)
+        elif isinstance(state, _Chunks):
+            state.mark(n.value, finite, begin, n_rows)
         else:
             _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
@@ -165,7 +194,7 @@ def map_function(
     code = Module(host().fused).function("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
     state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
-    column = _column(code, table, kinds, size, 1, width, stage)
+    column = ColumnStage(code, table, kinds, size, 1, width, stage)
     with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
         state.open(rows, begin, n_rows, n_out)
@@ -337,11 +366,117 @@ class _Registers:
         self._lanes.store([x.value for x in self._state], running, begin, n_rows, one, zero)
 
 
+class _Chunks:
+    """The same of many trajectories: in memory, from which a stage takes one chunk after the other into registers.
+
+    A chunk need not wait for the one before, whose chain of operations goes on meanwhile.
+    """
+
+    def __init__(self, code: Code, n_values: int, n_out: int, width: int, own: bool, over: Over) -> None:
+        self.code, self.width, self.type, self._n, self._n_out = code, width, Type("double", width), n_values, n_out
+        self._over = None if own else over
+        self.chunks = min(max(FAST_MEMORY // (16 * n_values * width), 1), MOST_CHUNKS)
+        self._state, self._end = (code.memory(n_values * self.chunks, self.type) for _ in range(2))
+        self._watch = code.memory(self.chunks, self.type)
+        self._used = code.constant(0, INT)
+
+    def block(self, every: int) -> Value:
+        return self.code.constant(every, INT)
+
+    def open(self, rows: Value, begin: Value, n_rows: Value) -> None:
+        code, n = self.code, self._n
+        left = groups(code, n_rows - begin, self.width)
+        self._used = code.apply("min", (left, code.constant(self.chunks, INT)))
+        with code.over(self._used) as c:
+            code.store(code.constant(0.0, self.type), self._watch, c * self.width)
+            with code.over(code.constant(self.width, INT)) as lane:
+                row = code.apply("min", (begin + c * self.width + lane, n_rows - 1))
+                start, place = code.at(rows, row * n), code.at(self._state, c * (n * self.width) + lane)
+                with code.over(code.constant(n, INT)) as i:
+                    code.store(code.load(start, i), place, i * self.width)
+
+    def _each(self, place: Value, body: Callable[[list[Value], Value], Sequence[Value]]) -> None:
+        code, n, width = self.code, self._n, self.width
+        with code.over(self._used) as c:
+            start = code.at(place, c * (n * width))
+            for i, x in enumerate(body([code.load(start, i * width, self.type) for i in range(n)], c)):
+                code.store(x, start, i * width)
+
+    def change(self, column: ColumnStage, j: Value, step: Value, end: bool = False) -> None:
+        place = self._end if end else self._state
+        if self._over is None:
+            self._each(place, lambda x, c: column(j, x, step, c))
+        else:
+            each = lambda body: self._each(place, lambda x, _: body(x))  # noqa: E731
+            self._over(each, column.numbers(j), column.kind(j), step)
+
+    def look(self, look: Callable[[Any], Any]) -> None:
+        self._each(self._state, lambda x, _: look(x))
+
+    def remember(self) -> None:
+        """A single trajectory alone goes back."""
+
+    restore = remember
+
+    def end(self) -> None:
+        with self.code.over(self._used * self._n) as i:
+            x = self.code.load(self._state, i * self.width, self.type)
+            self.code.store(x, self._end, i * self.width)
+
+    def finite(self) -> Value:
+        """True if a trajectory was finite up to now."""
+        code, zero = self.code, self.code.constant(0.0, self.type)
+        alive = code.variable(code.constant(0, BOOL))
+        with code.over(self._used) as c:
+            total, start = (
+                code.load(self._watch, c * self.width, self.type),
+                code.at(self._end, c * (self._n * self.width)),
+            )
+            for i in range(self._n):
+                total = code.fma(code.load(start, i * self.width, self.type), zero, total)
+            code.store(total, self._watch, c * self.width)
+            alive.value = alive.value | code.any(code.apply("eq", (total, 0.0)))
+        return alive.value
+
+    def mark(self, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
+        """Write n for the trajectories that are alive, else −1."""
+        code = self.code
+        with code.over(self.there(begin, n_rows)) as i:
+            alive = code.apply("eq", (code.load(self._watch, i), 0.0))
+            code.store(code.select(alive, n, code.constant(-1, INT)), finite, begin + i)
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self._write(self._end, self._n_out, out, begin, n_rows, stride, at)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
+        self._write(self._state, self._n, running, begin, n_rows, one, zero)
+
+    def there(self, begin: Value, n_rows: Value) -> Value:
+        return self.code.apply("min", (self._used * self.width, n_rows - begin))
+
+    def _write(self, place: Value, n: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        code, width = self.code, self.width
+        with code.over(self.there(begin, n_rows)) as row:
+            c = code.op("sdiv", INT, row, code.constant(width, INT))
+            source = code.at(place, c * ((self._n - 1) * width) + row)
+            start = code.at(out, ((begin + row) * stride + at) * n)
+            with code.over(code.constant(n, INT)) as i:
+                code.store(code.load(source, i * width), start, i)
+
+
 class Memory:
     """The same in memory: the state, its end, and the state before a block of steps.
 
     A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`.
+
+    Attributes
+    ----------
+    at_once : int
+        Numbers that are copied at a time: a state has a multiple of these.
     """
+
+    at_once = 1
 
     def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
         self.code, self.width, self._remembers = code, width, before
@@ -380,16 +515,24 @@ class Memory:
     def end(self) -> None:
         self._copy(self._running, self._end)
 
+    @contextmanager
+    def _blocks(self) -> Iterator[tuple[Value, Type]]:
+        """Places of blocks of numbers, which are copied at a time, and the type of each."""
+        size = self.at_once * self.width
+        with self.code.over(self.code.op("udiv", INT, self.n_values, self.code.constant(self.at_once, INT))) as i:
+            yield i * size, Type("double", size)
+
     def _copy(self, source: Room, target: Room) -> None:
-        with self.code.over(self.n_values) as i:
-            target.store(source.load(i), i)
+        with self._blocks() as (i, type):
+            self.code.store(self.code.load(source.state, i, type), target.state, i)
 
     def finite(self) -> Value:
-        zero = self.code.constant(0.0, self._end.type)
+        zero = self.code.constant(0.0, Type("double", self.at_once * self.width))
         total = self.code.variable(zero)
-        with self.code.over(self.n_values) as i:
-            total.value = self.code.fma(self._end.load(i), zero, total.value)
-        return self.code.apply("eq", (total.value, 0.0))
+        with self._blocks() as (i, type):
+            total.value = self.code.fma(self.code.load(self._end.state, i, type), zero, total.value)
+        good = self.code.apply("eq", (total.value, 0.0))
+        return good if self.at_once == 1 else ~self.code.any(~good)
 
     def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         self._write(self._end, self.n_out, out, begin, n_rows, stride, at)
@@ -399,7 +542,7 @@ class Memory:
         self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
 
     def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        with self.code.over(_there(self.code, self.width, begin, n_rows)) as lane:
+        with self.code.over(there(self.code, self.width, begin, n_rows)) as lane:
             start = self.code.at(out, ((begin + lane) * stride + at) * n)
             with self.code.over(n) as i:
                 self.code.store(self.code.load(room.state, i * self.width + lane), start, i)
@@ -426,7 +569,8 @@ def groups(code: Code, n_rows: Value, width: int) -> Value:
     return code.op("sdiv", INT, n_rows + (width - 1), code.constant(width, INT))
 
 
-def _there(code: Code, width: int, begin: Value, n_rows: Value) -> Value:
+def there(code: Code, width: int, begin: Value, n_rows: Value) -> Value:
+    """How many rows there are of `width` from `begin` on."""
     return code.apply("min", (code.constant(width, INT), n_rows - begin))
 
 
@@ -435,7 +579,7 @@ def _mark(code: Code, alive: Value, n: Value, finite: Value, begin: Value, n_row
     width = alive.type.width
     marks = code.memory(1, Type("i64", width))
     code.store(code.select(alive, code.splat(n, width), code.constant(-1, Type("i64", width))), marks)
-    with code.over(_there(code, width, begin, n_rows)) as lane:
+    with code.over(there(code, width, begin, n_rows)) as lane:
         code.store(code.load(marks, lane, INT), finite, begin + lane)
 
 
@@ -472,28 +616,48 @@ class Lanes:
             return
         for i, value in enumerate(x):
             code.store(value, self._buffer, i * self.width)
-        with code.over(_there(code, self.width, begin, n_rows)) as lane:
+        with code.over(there(code, self.width, begin, n_rows)) as lane:
             start = code.at(out, ((begin + lane) * stride + at) * n)
             for i in range(n):
                 code.store(code.load(self._buffer, lane + i * self.width), start, i)
 
 
-def _column(
-    code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Stage | MemoryStage
-) -> Callable[[Value, Any, Value], Any]:
-    """The stage of a column, the numbers of which are those of all lanes, or one for each."""
+class ColumnStage:
+    """The stage of a column, the numbers of which are those of all lanes, or one for each in tables of a length."""
 
-    def at(j: Value, values: Any, step: Value) -> Any:
-        start = code.at(table, j * (size * lanes))
+    def __init__(
+        self,
+        code: Code,
+        table: Value,
+        kinds: Value,
+        size: int,
+        lanes: int,
+        width: int,
+        stage: Stage | MemoryStage,
+        length: Value | None = None,
+    ) -> None:
+        self.code, self._table, self._kinds, self._size, self._lanes = code, table, kinds, size, lanes
+        self._width, self._stage, self._length = width, stage, length
+
+    def numbers(self, j: Value, chunk: Value | None = None) -> Numbers:
+        code, lanes = self.code, self._lanes
+        table = self._table
+        if chunk is not None and self._length is not None:
+            table = code.at(table, chunk * self._length)
+        start = code.at(table, j * (self._size * lanes))
 
         def number(i: int, lone: bool = False) -> Value:
             if lanes > 1:
                 return code.load(start, i * lanes, Type("double", lanes))
-            return code.splat(code.load(start, i), 1 if lone else width)
+            return code.splat(code.load(start, i), 1 if lone else self._width)
 
-        return stage(values, number, code.load(kinds, j, INT), step)
+        return number
 
-    return at
+    def kind(self, j: Value) -> Value:
+        return self.code.load(self._kinds, j, INT)
+
+    def __call__(self, j: Value, values: Any, step: Value, chunk: Value | None = None) -> Any:
+        return self._stage(values, self.numbers(j, chunk), self.kind(j), step)
 
 
 def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:

@@ -16,10 +16,11 @@ import numpy as np
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Type, Value
-from sympflow.compiler.functions import times
-from sympflow.compiler.program import Program, derivatives, gradient, traced
+from sympflow.compiler.functions import FUNCTIONS, times
+from sympflow.compiler.program import Program, Traced, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
+from sympflow.kernels.approximations import OnInterval, Ranges, on_interval
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.stage_times import Driving
 
-__all__ = ["Shape", "Splitting", "SplittingCode", "shared"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange", "shared"]
 
 MOST_TABLES = 64  # that are kept
 LONG = 64  # operations of a stage, beyond which products of sums may better be left
@@ -53,6 +54,8 @@ class Splitting:
         Dimensions of Γ.
     driving : Driving, optional
         Of `symbols` with letters for what depends on the time.
+    ranges
+        Intervals of one position in which kicks are polynomials, equal but for rounding; its values are then in V.
     """
 
     symbols: SymbolicHamiltonian
@@ -61,13 +64,21 @@ class Splitting:
     compensated: bool = False
     friction: int | None = None
     driving: Driving | None = None
+    ranges: Ranges = ()
 
     @property
     def key(self) -> tuple[Any, ...]:
         """Same for systems that share their code: those that differ in the values of parameters alone."""
         of_system = self.symbols.H, self.symbols.parameters, self.symbols.q, self.symbols.p
         driving = None if self.driving is None else self.driving.key
-        return *of_system, self.level, self.monomials, self.compensated, self.friction, driving
+        return *of_system, self.level, self.monomials, self.compensated, self.friction, driving, self.ranges
+
+    @property
+    def polynomial(self) -> bool:
+        """True if stages are sums and products alone."""
+        symbols = self.symbols
+        V, T = symbols.V, symbols.T
+        return bool(V is not None and T is not None and V.is_polynomial(*symbols.q) and T.is_polynomial(*symbols.p))
 
     @property
     def kick_numbers(self) -> tuple[str, ...]:
@@ -86,9 +97,28 @@ class Splitting:
         """Terms of the kicks of each kind of stage: one, two, …; a polynomial has all of its own."""
         return [1, 2, 3][: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0)]
 
-    def kinds(self) -> list[Arranged]:
+    def kinds(self) -> Sequence[Arranged | WithinRange]:
         """The stages, those with the fewest terms first."""
-        return [self._arranged(terms) for terms in self.terms]
+        return [self._within_range(terms) if self.ranges else self._arranged(terms) for terms in self.terms]
+
+    @property
+    def cycles(self) -> float:
+        """About how long a single trajectory takes for a stage with all terms, in cycles."""
+        stage = self.kinds()[-1]
+        body = stage.near.body if isinstance(stage, WithinRange) else stage.body
+        known: dict[int, int] = {}
+        for x in body.operations:
+            ready = max((known.get(a.order, 0) for a in x.args if isinstance(a, Traced)), default=0)
+            known[x.order] = ready + FUNCTIONS[x.name].cost
+        return max(known.values(), default=0) + len(body) / 2
+
+    def _within_range(self, terms: int) -> Arranged | WithinRange:
+        """The stage as a polynomial in its range, if there is one."""
+        near = on_interval(_of_kick(self.symbols, terms), self.symbols.q[0], *self.ranges[0])
+        if near is None:
+            return self._arranged(terms)
+        arranged = NearShape(self, terms, near).arranged()[1]
+        return WithinRange(arranged, self._arranged(terms), near.low, near.high)
 
     def _arranged(self, terms: int) -> Arranged:
         """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
@@ -153,8 +183,12 @@ class Shape:
             again, u = [_dot(row, self._by_mass(product)) for row in hessian], v
             bent = [_dot([_dot(row, u) for row in rows], u) for rows in third]
             changes = [x - times(more[1], y + 0.5 * z) for x, y, z in zip(changes, again, bent, strict=True)]
-        for e, powers in zip(more if self.splitting.monomials else (), self.splitting.monomials, strict=True):
-            changes = [x - e * _slope_of_monomial(powers, i, self.q) for i, x in enumerate(changes)]
+        return self._with_monomials(changes)
+
+    def _with_monomials(self, changes: list[Any]) -> list[Any]:
+        letters, monomials = self.splitting.kick_numbers[1:], self.splitting.monomials
+        for e, powers in zip(letters if monomials else (), monomials, strict=True):
+            changes = [x - self.number[e] * _slope_of_monomial(powers, i, self.q) for i, x in enumerate(changes)]
         return changes
 
     def _by_mass(self, v: Sequence[Any]) -> list[Any]:
@@ -217,6 +251,75 @@ class Shape:
         return sums, left
 
 
+class NearShape(Shape):
+    """A stage of one position whose kick is a polynomial on an interval, with coefficients in the table."""
+
+    def __init__(self, splitting: Splitting, terms: int, near: OnInterval) -> None:
+        super().__init__(splitting, terms, True)
+        self._near = near
+
+    def _changes(self) -> list[Any]:
+        made, near = self.made, self._near
+        factors = [self.number[name] for name in self.splitting.kick_numbers[: self.terms]]
+        x = self.q[0] if near.center == 0 else made.letter(made.written(self.q[0] - near.center))
+        total = made.number(0.0)
+        for k, column in enumerate(near.coefficients.T.tolist()):
+            for sign, factor, c in zip((-1.0, 1.0, -1.0), factors, column, strict=False):
+                total = total + (sign * c) * factor * x**k
+        return self._with_monomials([total])
+
+
+class WithinRange:
+    """A stage in two ways: as a polynomial for positions in a range, exact for others; the same for all lanes.
+
+    Attributes
+    ----------
+    near : Arranged
+    table : callable
+        From the constants of a run to the numbers that both read.
+    """
+
+    def __init__(self, near: Arranged, exact: Arranged, low: float, high: float) -> None:
+        self.near, self._exact, self._low, self._high = near, exact, low, high
+        self.table = _Both(near.table, exact.table)
+
+    def body(self, q: Value, *rest: Value) -> list[Value]:
+        """The state after the stage."""
+        n, code = len(self.near.body.inputs) - len(self.near.table.outputs) - 1, q.code
+        state, column = (q, *rest[:n]), rest[n:]
+        here = len(self.near.table.outputs)
+        inside = (self._low <= q) & (q <= self._high)
+        near = self.near.body(*state, *column[:here])
+
+        def exact() -> list[Value]:
+            values = self._exact.body(*state, *column[here:])
+            return [code.select(inside, x, y) for x, y in zip(near, values, strict=True)]
+
+        return code.when(code.any(~inside), exact, lambda: near, rare=True)
+
+
+class _Both:
+    """Two programs of the same inputs, with the outputs of both."""
+
+    def __init__(self, *programs: Program) -> None:
+        self._programs = programs
+        self.outputs = [x for program in programs for x in program.outputs]
+
+    def __call__(self, *values: Any) -> list[Any]:
+        return [x for program in self._programs for x in program(*values)]
+
+
+def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
+    """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
+    V, M = symbols.V, symbols.inverse_mass
+    assert V is not None
+    slope = V.diff(symbols.q[0])
+    if terms == 1 or M is None:
+        return [slope]
+    product = slope.diff(symbols.q[0]) * M[0, 0] * slope
+    return [slope, product, (slope * M[0, 0] * product / 2).diff(symbols.q[0])][:terms]
+
+
 def _slopes(symbols: SymbolicHamiltonian, terms: int) -> Program:
     """∇V, and its second and third derivatives, as many orders as there are terms; rows of the tensors one by one."""
     given = (*symbols.q, *symbols.parameters)
@@ -267,21 +370,25 @@ class SplittingCode(Rollouts):
     Parameters
     ----------
     splitting : Splitting
+    chunked : bool, optional
+        See `Rollouts`; by default where stages are not polynomials.
     """
 
-    def __init__(self, splitting: Splitting) -> None:
+    def __init__(self, splitting: Splitting, chunked: bool | None = None) -> None:
         self._splitting = splitting
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         symbols = splitting.symbols
         super().__init__(2 * symbols.ndof * (1 + splitting.compensated), 2 * symbols.ndof)
         self.timed = splitting.driving is not None
+        self.chunked = self.timed or not splitting.polynomial if chunked is None else chunked
+        self.lanes = 8 if self.chunked else 16  # chunks need not wait for each other, registers side by side do
         self._own = len(symbols.values if self.timed else symbols.parameters)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SplittingCode, (self._splitting,)
 
     @cached_property
-    def _kinds(self) -> list[Arranged]:
+    def _kinds(self) -> Sequence[Arranged | WithinRange]:
         return self._splitting.kinds()
 
     @cached_property
@@ -304,6 +411,13 @@ class SplittingCode(Rollouts):
                 for result, x in zip(results, self._executed(k, values, column), strict=True):
                     result.value = x
         return [x.value for x in results]
+
+    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
+        code, type = step.code, numbers(0).type
+        for k in range(len(self._kinds)):
+            with code.given(code.apply("eq", (kind, k))):
+                column = self._column(k, type, numbers, step)
+                each(lambda values, k=k, column=column: self._executed(k, values, column))
 
     def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
         return self._kinds[k].body(*values, *column)
@@ -330,6 +444,16 @@ class SplittingCode(Rollouts):
         assert driving is not None
         fixed = given[clock.stop :]
         return [*given[: clock.start], *fixed, *driving.values_at(time, given[0], fixed)]
+
+    @property
+    def given_numbers(self) -> int:
+        """How many numbers of a column are given, from which those are computed that the code reads."""
+        return len(self._splitting.numbers)
+
+    def executed(self, given: Sequence[Any], values: list[Value]) -> list[Value]:
+        """The values after a stage of the last kind, by the numbers that are given."""
+        last = self._kinds[-1]
+        return last.body(*values, *last.table(*given))
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "step" and "step own" too."""

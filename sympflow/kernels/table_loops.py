@@ -9,7 +9,6 @@ the time as one more position, with the work of the drive as its momentum.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -18,21 +17,22 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
+from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
 from sympflow.compiler.functions import fma
-from sympflow.compiler.machine import address, compiled, host
-from sympflow.compiler.program import Program, fused, gradient, tangent, traced
+from sympflow.compiler.machine import address, host
+from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.rollouts import aligned
+from sympflow.kernels.rollouts import aligned, filled
+from sympflow.kernels.runs import finished
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["LabelErrors", "TableLoops", "table_loops"]
 
 MOST_OPERATIONS = 2000  # of a kick, beyond which compiling takes too long
-LANES = 8
+LANES = 16
 REGISTER = Type("double", LANES)
 ROUNDING = 1e-14  # of rows that are in proportion
 NONE = np.empty(0)
@@ -78,7 +78,6 @@ class TableLoops:
         self._driven = symbols.time is not None
         self._inverse_mass = np.array(symbols.inverse_mass, dtype=np.float64)
         damping = None if friction is None else tuple(tuple(map(float, row)) for row in friction.matrix(d))
-        self._addresses = address(self.kicks), address(self.values)
         self._maps = _maps(form, level, monomials, damping)
         sizes = [self._maps.terms if kick else 1 for kick in kicks]
         self.drifts = (np.cumsum(sizes) - sizes)[self.kicks == 0]
@@ -96,16 +95,17 @@ class TableLoops:
         errors = LabelErrors(self, y, t0, zero, zero + 1.0, no_slope, np.empty((*c.shape, 0)))
         return errors(c)[0].reshape(len(c), n_rows, y.shape[1])
 
-    def rows(self, linearized: bool, addresses: Sequence[int], *numbers: int) -> None:
-        """Call the compiled function: see `_Errors`."""
-        memory = aligned(self._maps.memory(len(self.kicks), numbers[2]))
-        sizes = len(self.kicks), len(self.drifts)
-        self._maps.function(linearized)(*self._addresses, *addresses, address(memory), *sizes, *numbers)
+    def function(self, linearized: bool) -> Callable[..., None]:
+        """The compiled function: see `_Errors`."""
+        return self._maps.function(linearized)
+
+    def memory(self, n_numbers: int) -> np.ndarray:
+        return aligned(self._maps.memory(len(self.kicks), n_numbers))
 
     def opened(self, y: np.ndarray, t0: np.ndarray | None) -> np.ndarray:
         """States (2d, N) with the times (N,) of a driven system after the positions, and its work after the momenta."""
         if not self._driven:
-            return np.ascontiguousarray(y)
+            return y
         assert t0 is not None
         d = len(y) // 2
         return np.concatenate([y[:d], t0[None], y[d:], 0 * t0[None]])
@@ -166,13 +166,14 @@ class LabelErrors:
         self.matrices = np.ascontiguousarray(design[:, leaders])
         used = np.flatnonzero(factors)
         used = used[np.argsort(leader[used], kind="stable")]
-        given = [_at_least(loops.opened(x, t0), 1), *(_at_least(a, times) for a in (y, scale, slope))]
-        places = np.stack([leader[used], used], axis=1)
-        self._arrays = [np.ascontiguousarray(a) for a in (*given, places, factors[used])]
-        self._addresses = [*map(address, self._arrays)]
-        n_errors, n = len(scale) + bool(len(slope)), self._arrays[0].shape[1]
-        self._sizes = n, design.shape[1], len(scale), len(slope), len(used), len(leaders)
+        given = [filled(loops.opened(x, t0), LANES), *(filled(a, LANES, times) for a in (y, scale, slope))]
+        places = np.concatenate([np.searchsorted(leader[used], np.arange(len(leaders) + 1)), used])
+        arrays = (*given, places, factors[used])
+        self._arrays = [loops.kicks, loops.values, *map(np.ascontiguousarray, arrays)]
+        n_errors, n, n_numbers = len(scale) + bool(len(slope)), given[0].shape[1], design.shape[1]
         self._shape = times, n_errors, n
+        sizes = len(loops.kicks), len(loops.drifts), times, n, n_numbers, len(scale), len(slope), len(leaders)
+        self._plan = np.array([*map(address, self._arrays), *sizes])
 
     def __reduce__(self) -> tuple[Any, ...]:
         return LabelErrors, (self._loops, *self._given)
@@ -187,25 +188,15 @@ class LabelErrors:
         `check` is called now and then, and may raise.
         """
         loops, (times, _, n) = self._loops, self._shape
-        r, J = np.empty(self._shape), np.empty((self._sizes[-1] if linearized else 0, *self._shape))
-        c, motions = np.ascontiguousarray(c), loops.motions(c)
-        addresses = address(c), address(motions), *self._addresses, address(r), address(J)
-        n_blocks = times * -(-n // LANES)
+        r, J = np.empty(self._shape), np.empty((self.matrices.shape[1] if linearized else 0, *self._shape))
+        memory, function = loops.memory(c.shape[1]), loops.function(linearized)
+        arrays = self._plan, np.ascontiguousarray(c), loops.motions(c), r, J, memory
+        addresses, n_blocks = [address(a) for a in arrays], times * -(-n // LANES)
         for first in range(0, n_blocks, BLOCKS):
             check()
-            last = min(first + BLOCKS, n_blocks)
-            loops.rows(linearized, addresses, times, *self._sizes, first, last)
+            function(*addresses, first, min(first + BLOCKS, n_blocks))
         errors, J = r[..., : self._count].ravel(), J[..., : self._count]
         return errors, np.ascontiguousarray(J).reshape(len(J), len(errors))
-
-
-def _at_least(x: np.ndarray, times: int) -> np.ndarray:
-    """Columns of labels (…, J N), of each time the last one again where there are fewer than lanes."""
-    n = x.shape[1] // times
-    if n >= LANES:
-        return x
-    each = x.reshape(len(x), times, n)
-    return np.concatenate([each, np.repeat(each[..., -1:], LANES - n, axis=-1)], axis=-1).reshape(len(x), times * LANES)
 
 
 def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -265,8 +256,7 @@ class _Maps:
         n_symbols = self.width + len(form.parameters)
         numbers = [f"x_{i}" for i in range(n_symbols)] + [f"c_{k}" for k in range(self.terms)]
         self.kick = fused(traced(self._kick, *numbers))
-        if len(self.kick) > MOST_OPERATIONS:
-            raise ValueError(f"`system` has a kick of {len(self.kick)} operations.")
+        _check_length(len(self.kick))
         self._functions: dict[bool, Callable[..., None]] = {}
 
     def _kick(self, *numbers: Any) -> list[Any]:
@@ -294,6 +284,7 @@ class _Maps:
                 terms.append([0.5 * (x + y) for x, y in zip(tangent(along, q, v), again, strict=True)])
         forces = [[-x for x in term] for term in terms]
         changes = [_dot(c, [force[i] for force in forces]) for i in range(width)]
+        _check_length(len(reached(changes)))
         slopes = [gradient(change, q) for change in changes]
         return [*changes, *(x for force in forces for x in force), *(slopes[i][j] for i, j in self.pairs)]
 
@@ -311,6 +302,11 @@ class _Maps:
         return self._functions[linearized]
 
 
+def _check_length(n: int) -> None:
+    if n > MOST_OPERATIONS:
+        raise ValueError(f"`system` has a kick of {n} operations.")
+
+
 def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
     """Σ xᵢ yᵢ of as many as there are of both."""
     total: Any = 0.0
@@ -323,52 +319,36 @@ def _product(A: Sequence[Sequence[Any]], x: Sequence[Any]) -> list[Any]:
     return [_dot(row, x) for row in A]
 
 
-class _Rows:
-    """Rows of memory, each a register of lanes."""
-
-    def __init__(self, code: Code, place: Value) -> None:
-        self.code, self.place = code, place
-
-    def __getitem__(self, i: Any) -> Value:
-        return self.code.load(self.place, i * LANES, REGISTER)
-
-    def __setitem__(self, i: Any, x: Any) -> None:
-        self.code.store(self.code.operand(x, REGISTER), self.place, i * LANES)
-
-    def part(self, i: Any) -> _Rows:
-        return _Rows(self.code, self.code.at(self.place, i * LANES))
-
-
 class _Errors:
     """The function of the errors r of labels, and of their derivatives J.
 
     Its arguments are the addresses of
 
-    - the kinds of stages (S,), 1 for a kick, and the values of parameters;
+    - a plan: the addresses of the kinds of stages (S,), 1 for a kick, and of the values of parameters; of the states X
+      (2D, N) at the start, of a driven system with t and a work of 0; of the labels Y and the weights of their errors
+      (R, J N), and those of one more (R', J N), a sum over components; of the derivatives of numbers by parameters that
+      are not 0 where those of each parameter begin (k + 1,), then the numbers (m,), and of their values (m,); then S,
+      the number of drifts, J, N, n, R, R', k;
     - the numbers c (J, n) at each time, and with friction the motions (J, drifts, 2 d²) of drifts;
-    - the states X (2D, N) at the start, of a driven system with t and a work of 0;
-    - the labels Y and the weights of their errors (R, J N), and those of one more (R', J N), a sum over components;
-    - the places (m, 2) of derivatives of numbers by parameters that are not 0, the parameter and the number, and their
-      values (m,);
     - r (J, errors, N), J (k, J, errors, N), and memory;
 
-    then S, the number of drifts, J, N, n, R, R', m, k, and the first and the last block of labels.
+    then the first and the last block of labels.
     """
 
     def __init__(self, maps: _Maps, linearized: bool) -> None:
         self.maps, self.linearized = maps, linearized
-        self._types = [*[POINTER] * 13, *[INT] * 11]
+        self._types = [*[POINTER] * 6, INT, INT]
         self.code = code = Module(host().fused).function("errors", self._types)
+        plan, self.c, self.motions, self.r, self.J, memory, self.first, self.last = code.arguments
         (
-            self.kinds, self.values, self.c, self.motions, self.X, self.Y, self.scale, self.slope, self.places,
-            self.design, self.r, self.J, memory,
-        ) = code.arguments[:13]  # fmt: skip
+            self.kinds, self.values, self.X, self.Y, self.scale, self.slope, self.places, self.design,
+        ) = (code.load(plan, i, POINTER) for i in range(8))  # fmt: skip
         (
             self.n_stages, self.n_drifts, self.n_times, self.n_states, self.n_numbers, self.n_rows, self.n_slopes,
-            self.n_places, self.n_parameters, self.first, self.last,
-        ) = code.arguments[13:]  # fmt: skip
+            self.n_parameters,
+        ) = (code.load(plan, i, INT) for i in range(8, 16))  # fmt: skip
         w = maps.width
-        self.W, self.A, self.B = (_Rows(code, code.at(memory, i * w * LANES)) for i in (0, 2, 4))
+        self.W, self.A, self.B = (Rows(code.at(memory, i * w * LANES), REGISTER) for i in (0, 2, 4))
         self.tape = self.B.part(self.n_numbers)
         self.zero = code.constant(0.0, REGISTER)
 
@@ -402,12 +382,10 @@ class _Errors:
                 with code.over(n_errors) as row:
                     self.back(row)
                     self.derivatives((j * n_errors + row) * n + start, self.n_times * n_errors * n)
-        code.give()
-        types = [ctypes.c_void_p if t == POINTER else ctypes.c_int64 for t in self._types]
-        return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *types))
+        return finished(code, self._types)
 
     @contextmanager
-    def stages(self, back: bool = False) -> Iterator[tuple[Value, Value, Value, _Rows]]:
+    def stages(self, back: bool = False) -> Iterator[tuple[Value, Value, Value, Rows]]:
         """Each stage: whether it is a kick, where its numbers begin, which drift it is, its tape."""
         code, terms = self.code, self.maps.terms
         none = code.constant(0, INT)
@@ -443,7 +421,7 @@ class _Errors:
 
     # the way there ----------------------------------------------------------------------------------------------------
 
-    def kicked(self, number: Value, tape: _Rows) -> None:
+    def kicked(self, number: Value, tape: Rows) -> None:
         maps, w = self.maps, self.maps.width
         program = maps.kick if self.linearized else Program(maps.kick.inputs, maps.kick.outputs[:w])
         c = [self.number(number + k) for k in range(maps.terms)]
@@ -453,7 +431,7 @@ class _Errors:
         for i, x in enumerate(changes[:w]):
             self.W[w + i] = self.W[w + i] + x
 
-    def drifted(self, number: Value, drift: Value, tape: _Rows) -> None:
+    def drifted(self, number: Value, drift: Value, tape: Rows) -> None:
         """The tape holds M⁻¹p and −Γp at the end."""
         d, w, friction = self.maps.d, self.maps.width, self.maps.friction
         a, y = self.number(number), [self.W[w + i] for i in range(d)]
@@ -496,7 +474,7 @@ class _Errors:
             with code.given(~kick):
                 self.drift_back(number, drift, tape)
 
-    def kick_back(self, number: Value, tape: _Rows) -> None:
+    def kick_back(self, number: Value, tape: Rows) -> None:
         w, terms = self.maps.width, self.maps.terms
         b = [self.A[w + i] for i in range(w)]
         for k in range(terms):
@@ -505,7 +483,7 @@ class _Errors:
         for i in range(w):
             self.A[i] = _fused(b, [slope[min(i, j), max(i, j)] for j in range(w)], self.A[i])
 
-    def drift_back(self, number: Value, drift: Value, tape: _Rows) -> None:
+    def drift_back(self, number: Value, drift: Value, tape: Rows) -> None:
         d, w = self.maps.d, self.maps.width
         a = [self.A[i] for i in range(w)]
         by_time = _fused(a, [tape[i] for i in range(w)])
@@ -526,12 +504,14 @@ class _Errors:
         """The derivatives by the parameters, into J."""
         code = self.code
         with code.over(self.n_parameters) as f:
-            code.store(self.zero, self.J, f * stride + place)
-        with code.over(self.n_places) as k:
-            f, number = (code.load(self.places, 2 * k + i, INT) for i in range(2))
-            at = f * stride + place
-            factor = code.splat(code.load(self.design, k), LANES)
-            code.store(fma(factor, self.B[number], code.load(self.J, at, REGISTER)), self.J, at)
+            begin, end = (code.load(self.places, f + i, INT) for i in range(2))
+
+            def more(k: Value, total: Sequence[Value]) -> list[Value]:
+                number = code.load(self.places, self.n_parameters + 1 + begin + k, INT)
+                return [fma(code.splat(code.load(self.design, begin + k), LANES), self.B[number], total[0])]
+
+            (total,) = code.loop(end - begin, [self.zero], more)
+            code.store(total, self.J, f * stride + place)
 
 
 def _fused(x: Sequence[Value], y: Sequence[Value], total: Value | None = None) -> Value:
