@@ -265,10 +265,10 @@ class Rollouts:
             counts[:], left = left[:, -1], left[:, :-1]
         if keeps:
             running[:] = left
-        if width == 1 and n_finite[0] < n_steps:
-            out[0, np.searchsorted(save, n_finite[0], side="right") :] = np.nan
+        for i in np.flatnonzero(n_finite < n_steps) if width == 1 else ():
+            out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
             if keeps:
-                running[0] = np.nan
+                running[i] = np.nan
 
     def rollout_processed(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> int:
         """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
