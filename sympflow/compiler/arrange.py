@@ -239,7 +239,7 @@ class Arrangement:
         if len(a.terms) > 1:
             a = self.letter(self.written(a))
         ((m, c),) = a.terms.items()
-        return Polynomial(self, {self._reduced(tuple((x, int(e * n)) for x, e in m)): 1.0 if c == 1.0 else c**n})
+        return Polynomial(self, {self._reduced(tuple((x, int(e * n)) for x, e in m if n)): 1.0 if c == 1.0 else c**n})
 
     # the body -----------------------------------------------------------------------------------------------------
 
