@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.models import Model
 from sympflow.learning.shooting import (
     FINEST,
@@ -24,7 +25,6 @@ from sympflow.learning.shooting import (
     rho,
     steppers,
 )
-from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
 FIRST_POINTS = 10  # of the pieces that a fit begins with
@@ -160,21 +160,23 @@ def fitted(
     scales, former = data.scales, theta if isinstance(theta, Fitted) else None
     theta = theta.theta if isinstance(theta, Fitted) else theta
     if theta is None:
-        theta = model.start(np.random.default_rng(seed))
-        if model.lagrangian:
+        theta, moved = model.start(np.random.default_rng(seed)), data
+        if model.lagrangian or model.velocities:
             assert isinstance(model, Model)
-            smooth = smoothed(data)
-            theta = model.lagrangian_start(smooth.points.T, smooth.slopes.T, scales)
+            theta, moved = lagrangian_start(model, data, theta)
         if model.stepper is None:
             steps = 1 if model.linear else MATCHED_STEPS
-            theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, steps)
+            theta = matched(model, theta, moved.pieces(MATCHED_POINTS), 1 / moved.scales, steps)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
     sigma = given if given is not None else 1e-2 * scales if former is None else former.sigma
     span = (
         former.span if former is not None else 0.0 if model.stepper is None else model.stepper.longest
     )  # a map of its own is fitted over all of a step
     pieces = data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
-    states = first_states(pieces) if former is None or not span else _states(former, data, pieces, sigma, setting)
+    if former is None or not span:
+        states = first_states(pieces, model, theta)
+    else:
+        states = _states(former, data, pieces, sigma, setting)
     costs: list[float] = []
     finer = 1.0
     for attempt in range(1 + ROUNDS):
@@ -227,7 +229,8 @@ def _states(found: Fitted, data: Trajectories, pieces: Trajectories, sigma: np.n
     """The initial states (N, 2d) of pieces, by a few points each: the first observation alone leads far astray."""
     few = data.pieces(FIRST_POINTS)
     short = Problem(found.model, few, found.method, sigma, frozen=True, huber=setting.huber)
-    orbits = minimized(short, found.theta, first_states(few), iterations=20, patience=1).orbits
+    starts = first_states(few, found.model, found.theta)
+    orbits = minimized(short, found.theta, starts, iterations=20, patience=1).orbits
     return np.concatenate(orbits, axis=1)[:, _starts(pieces.runs)].T
 
 
@@ -248,7 +251,8 @@ def _span(
     """The longest time over which orbits are followed: whole trajectories, unless their errors grow too fast."""
     limit = float(np.clip(PER_NOISE * np.min(scales / sigma), LEAST_GROWTH, GROWTH))
     frozen = Problem(model, data, method, sigma, frozen=True)
-    times = frozen.growth(theta, orbits[:, _starts(data.runs)].T, scales, limit)
+    spread = orbits.std(axis=1) if model.velocities else scales
+    times = frozen.growth(theta, orbits[:, _starts(data.runs)].T, spread, limit)
     soonest = float(np.quantile(times, 0.1, method="lower"))
     return soonest if math.isfinite(soonest) else max(run.span for run in data.runs)
 

@@ -24,16 +24,20 @@ class Inertia(Part):
         f, of q.
     entries : ndarray of int, shape (n, 3), optional
         For each θ the places k, i and j, i ≤ j; the default is all of them.
+    unit : bool
+        True if the constant of M₁₁ is 1, and none of θ: of velocities alone M is known but for a factor.
     """
 
     of = "y"
 
-    def __init__(self, functions: Waves, entries: np.ndarray | None = None) -> None:
+    def __init__(self, functions: Waves, entries: np.ndarray | None = None, unit: bool = False) -> None:
         d = functions.waves.shape[1]
-        self.functions = functions
+        self.functions, self.unit = functions, unit
         self.pairs = [(i, j) for i in range(d) for j in range(i, d)]
+        self._constant = (functions.waves == 0).all(axis=1) & (functions.powers.exponents == 0).all(axis=1)
         if entries is None:
-            entries = np.array([(k, i, j) for i, j in self.pairs for k in range(functions.n)])
+            whole = np.array([(k, i, j) for i, j in self.pairs for k in range(functions.n)])
+            entries = whole[~(unit & self._constant[whole[:, 0]] & (whole[:, 2] == 0))]
         self.entries, self.n = entries, len(entries)
         self._pair = np.array([self.pairs.index((i, j)) for i, j in entries[:, 1:].tolist()], dtype=int)
         self._double = np.array([1.0 if i == j else 2.0 for i, j in self.pairs])
@@ -51,17 +55,17 @@ class Inertia(Part):
         return True
 
     def subset(self, kept: np.ndarray) -> Inertia:
-        return Inertia(self.functions, self.entries[kept])
+        return Inertia(self.functions, self.entries[kept], self.unit)
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """The unit matrix, where it can be written."""
         k, i, j = self.entries.T
-        constant = (self.functions.waves == 0).all(axis=1) & (self.functions.powers.exponents == 0).all(axis=1)
-        return (constant[k] & (i == j)).astype(float)
+        return (self._constant[k] & (i == j)).astype(float)
 
     def _coefficients(self, theta: np.ndarray) -> np.ndarray:
         """θ as a matrix (pairs, functions)."""
         C = np.zeros((len(self.pairs), self.functions.n))
+        C[0] = self.unit * self._constant
         C[self._pair, self.entries[:, 0]] = theta
         return C
 
@@ -118,7 +122,7 @@ class Inertia(Part):
                 by[i] = f[k] * turned[pair] - 0.5 * first[i][k] * products[pair]
         return Linear(value, slopes, by)
 
-    def momenta(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         d, N = q.shape
         f, first, _ = self.functions.derivatives(q, False)
         k, pair = self.entries[:, 0], self._pair
@@ -130,7 +134,9 @@ class Inertia(Part):
         products = self._products(v)
         for i in range(d):
             made[d + i] = 0.5 * first[i][k] * products[pair]
-        return made
+        value = np.zeros((2 * d, N))
+        value[0] = self.unit * v[0]
+        return value, made
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         d = len(x) // 2

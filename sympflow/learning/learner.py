@@ -43,7 +43,7 @@ from sympflow.learning.models import Formula, FreeField, Model, Pairs, Part, Pol
 from sympflow.learning.shooting import Field, Method
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
-from sympflow.learning.trajectories import FEW, Trajectories, periods_of
+from sympflow.learning.trajectories import FEW, Run, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
@@ -143,7 +143,9 @@ def learn(
         As for `sympflow.train`; None for a search that ends by itself. A checkpoint is written after each model;
         `workers` share the replicas.
     **reading
-        Options of `Trajectories.read`, such as `units`, `order` and `velocity_mass`.
+        Options of `Trajectories.read`, such as `units`, `order` and `velocity_mass`. With observed="qv" the data have
+        velocities of a mass that is not known, with "q" positions alone: then H is learned but for a factor, which
+        makes the constant of M₁₁ 1, or that of M⁻¹. `flow.system.momenta(q, v)` are the momenta.
 
     Returns
     -------
@@ -252,7 +254,9 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: A
     if inverse is not None and any(part.of != "q" for part in parts):
         raise ValueError("`known` has a kinetic energy, and so has `mass`: leave out one of them.")
     rates = 0 if damping is False else 1 if damping is True else d
-    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts, _covariance(data))
+    momenta = None if data.velocities else _covariance(data)
+    periods = _periods(period, d)
+    return Said(data.scales, separable, inverse, rates, periods, parts, momenta, velocities=data.velocities)
 
 
 def _covariance(data: Trajectories) -> np.ndarray:
@@ -386,6 +390,11 @@ def without_growth(found: Fitted) -> Fitted:
         )
     moved = covariance[:, growing] @ np.linalg.pinv(covariance[np.ix_(growing, growing)]) @ theta[growing]
     return replace(found, theta=np.where(growing, 0.0, theta - moved))
+
+
+def _by_lagrange(model: Any) -> bool:
+    """True of a model whose numbers velocities tell by linear equations."""
+    return bool(model.velocities and model.lagrangian)
 
 
 Chosen = tuple[Candidate, Fitted, Held]
@@ -531,7 +540,7 @@ class Search:
         that leave much more of increments than the best of all are the last.
         """
         queue = [(FAMILIES[name].linear, [*FAMILIES[name].models(self.said)]) for name in names]
-        linear = [c for is_linear, candidates in queue if is_linear for c in candidates]
+        linear = [c for _, candidates in queue for c in candidates if c.model.linear or _by_lagrange(c.model)]
         found = best_by_increments(*self.folds[0], [candidate.model for candidate in linear])
         if found is None:
             return queue
@@ -553,7 +562,7 @@ class Search:
         )
         apart = bool(squares) and not promising
         order = sorted(range(len(names)), key=lambda i: apart and names[i] in separable)
-        late = [(True, [c for c in some if id(c) in hopeless]) for kind, some in queue if kind]
+        late = [(True, [c for c in some if id(c) in hopeless]) for _, some in queue]
         return [group for group in [*(kept[i] for i in order), *late] if group[1]]
 
     def _first_fold(self, model: Model, setting: Setting) -> tuple[Fitted, Held]:
@@ -678,7 +687,7 @@ class Search:
             if free.remedy:
                 warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=4)
                 return
-        smooth = smoothed(self.data)
+        smooth = smoothed(self._whole(self.data))
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.said.rates > 0
         said += " " + hint(library, smooth, self.data, otherwise, damped)
@@ -764,21 +773,35 @@ class Search:
                 groups.append((q, None))
             if any(part.of != "q" for part in parts):
                 groups.append((p, Polynomial.up_to(1, "p", self.data.scales[d:])))
-        errors = self.final.sigma * math.sqrt(self.final.fit.states.size / self.data.n_values)
+        errors = self._wide(self.final.sigma) * math.sqrt(self.final.fit.states.size / self.data.n_values)
         return [g for columns, part in groups for g in unseen(states, errors, columns, part)]
 
     def _states(self) -> np.ndarray:
         """The states (n, 2d) of all orbits that do not diverge; those of the data where all do."""
         states = self.final.states
         finite = np.isfinite(states).all(axis=1)
-        return states[finite] if finite.any() else self.all.states
+        return states[finite] if finite.any() else self._whole(self.all).states
+
+    def _wide(self, sizes: np.ndarray) -> np.ndarray:
+        """Sizes (2d,) of observations as such of states, whose momenta may be wider or narrower than velocities."""
+        if not self.data.velocities:
+            return sizes
+        return sizes * self.final.states.std(axis=0) / self.data.scales
+
+    def _whole(self, data: Trajectories) -> Trajectories:
+        """Trajectories of states, by the model that was learned where velocities were observed."""
+        if not data.velocities:
+            return data
+        model, theta = self.winner[0].model, self.winner[1].theta
+        runs = zip(data.runs, smoothed(data).states, strict=True)
+        return replace(data, runs=tuple(Run(run.t, model.states(theta, y)) for run, y in runs), velocities=False)
 
     def _domain(self) -> tuple[Box | Tube, np.ndarray]:
         """A box around the states (n, 2d) of all orbits, or a tube where they do not tell H beyond them; and these."""
         states = self._states()
         if self.unseen:
             fitted = next(data for data in (self.all, self.data) if data.n_points == len(states))
-            return tube(states, fitted.runs, self.all.scales), states
+            return tube(states, fitted.runs, self._wide(self.all.scales)), states
         low, high = states.min(axis=0), states.max(axis=0)
         wider = MARGIN * (high - low)
         return Box(low - wider, high + wider), states
@@ -894,7 +917,7 @@ class Search:
 
     def energy_scatter(self, flow: FlowMap) -> float | None:
         """The standard deviation of 𝓗 along a held-out trajectory, in their mean; None where no state is whole."""
-        runs = [run.y[:, np.isfinite(run.y).all(axis=0)] for run in self.held.runs]
+        runs = [run.y[:, np.isfinite(run.y).all(axis=0)] for run in self._whole(self.held).runs]
         energies = self._energy(flow, np.concatenate(runs, axis=1).T)
         along = np.split(energies, np.cumsum([y.shape[1] for y in runs])[:-1])
         scatter = [float(np.std(values)) for values in along if len(values) > 1]

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sympflow.learning.diagnosis import DRAG, TURNED
+from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.models import Forced, FreeField, Model, drags, turns
 from sympflow.learning.shooting import Field, increments_left, matched
 from sympflow.learning.smoothing import smoothed
@@ -121,6 +122,8 @@ def forced(model: Model) -> list[Reading]:
     d = model.ndof
     rows = tuple(range(2 * d))
     made = [] if model.rates else [Reading(replace(model, rates=d), rows, math.inf, *FRICTION, d)]
+    if model.velocities:  # among whose models there are those in magnetic fields
+        return made
     made += [Reading(Forced(model, turns), rows, math.inf, *TURNED_SAID, d * (d - 1) // 2)] if d > 1 else []
     return [*made, Reading(Forced(model, drags), rows, math.inf, *DRAG_SAID, d)]
 
@@ -179,7 +182,12 @@ def _affords(data: Trajectories, model: Field) -> bool:
 
 def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray) -> float:
     """The squares that a model which was fitted to increments leaves of held-out ones; infinite where it diverges."""
-    theta = matched(model, np.zeros(model.n), data, 1 / scales)
+    theta, moved = np.zeros(model.n), data
+    if model.velocities:
+        assert isinstance(model, Model)
+        theta, moved = lagrangian_start(model, data, model.start(np.random.default_rng(0)))
+    if model.linear:
+        theta = matched(model, theta, moved, 1 / moved.scales)
     squares = increments_left(model, theta, held, 1 / scales)
     return squares if math.isfinite(squares) else math.inf
 
