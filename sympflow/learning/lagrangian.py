@@ -7,6 +7,7 @@ observed they are the p of both equations. Where velocities are, L is known but 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,10 +18,8 @@ from sympflow.learning.trajectories import Run, Trajectories
 
 POINTS = 24
 """Number of points of a piece along which p is followed."""
-PASSES = 3
-"""Solutions for velocities, each with the friction and the masses of the one before."""
-LIKELY = 1e-2
-"""Weight of p = v, beside equations of motion that need not tell the masses of all motions apart."""
+STEPS, HALVINGS, SETTLED = 12, 6, 1e-2
+"""Gauss–Newton steps for masses, halvings of one, and the gain of a step that ends them."""
 DEGREE = 4
 """Degree of the polynomial in place of a potential that is not linear in its numbers."""
 
@@ -86,41 +85,78 @@ class Equations:
         return np.stack([column - rest for column in columns], axis=1).T
 
     def solved(self) -> np.ndarray:
-        """θ by linear least squares."""
-        theta, p = np.zeros(self.model.n), self.second
-        weights = np.diag(1 / self.scales[:, 0])
-        for _ in range(1 if self.observed else PASSES):
-            rows, right = self._rows(p, weights)
-            lengths = np.linalg.norm(rows, axis=0)
-            lengths[lengths == 0] = 1.0
-            theta = np.linalg.lstsq(rows / lengths, right, rcond=1e-10)[0] / lengths
-            if not self.observed:
-                p = self.momenta(theta, self.q, self.v)
-                inverse = np.linalg.pinv(self.masses(theta).mean(axis=0))
-                weights = inverse / self.scales
+        """θ by least squares: linear where momenta are observed, else by Gauss–Newton steps from M = 1."""
+        likely = self._stacked(self.by[: self.d] / self.scales[..., None])
+        theta = np.zeros(self.model.n)
+        right = ((self.second - self.value[: self.d]) / self.scales).ravel()
+        if self.observed:
+            rest, rows = self._rows(self.second)
+            rows, rest = self._stacked(rows / self.scales[..., None]), (rest / self.scales).ravel()
+            wide = np.concatenate([likely, np.zeros((len(likely), self.model.rates))], axis=1)
+            return _least(np.concatenate([wide, rows]), np.concatenate([right, -rest]))
+        theta[: self.n] = _least(likely, right)
+        left, J = self._left(theta)
+        forces = np.arange(self.model.n) >= self.n  # first those alone
+        forces[: self.n] = ~self.by_mass.any(axis=(0, 1, 3))
+        for attempt in range(STEPS):
+            step = _least(J if attempt else J * forces, -left)
+            for _ in range(HALVINGS):
+                after, K = self._left(theta + step)
+                if after @ after < left @ left:
+                    break
+                step = step / 2
+            else:
+                break
+            gained = 1 - (after @ after) / (left @ left)
+            theta, left, J = theta + step, after, K
+            if gained < SETTLED:
+                break
         return theta
 
-    def _rows(self, p: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The equations, rows (R, n) and right sides (R,), with the friction of momenta p (d, N) and weights (d, d)."""
-        d, rates = self.d, self.model.rates
-        friction = np.zeros((d, rates, p.shape[1]))
+    def _left(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """M⁻¹ times what the equations leave, and the derivative by θ; infinite where M is not positive definite."""
+        rest, rows = self._rows(self.momenta(theta, self.q, self.v))
+        M = self.masses(theta)
+        if not (np.isfinite(M).all() and (np.linalg.eigvalsh(M) > 0).all()):
+            return np.full(rest.size, np.inf), np.empty(0)
+        W = np.linalg.inv(M)
+        r = np.einsum("nij,jn->in", W, rest + np.einsum("ikn,k->in", rows, theta))
+        rows[:, : self.n] -= np.einsum("ijkn,jn->ikn", self.by_mass, r)
+        return (r / self.scales).ravel(), self._stacked(np.einsum("nij,jkn->ikn", W / self.scales, rows))
+
+    @cached_property
+    def by_mass(self) -> np.ndarray:
+        """The derivative of M by θ, (d, d, n, N)."""
+        units = (unit[:, None] * np.ones_like(self.q) for unit in (np.zeros(self.d), *np.eye(self.d)))
+        none, *columns = (self.model.momenta(self.q, v)[1][: self.d] for v in units)
+        return np.stack([column - none for column in columns], axis=1)
+
+    @staticmethod
+    def _stacked(rows: np.ndarray) -> np.ndarray:
+        """Rows (d, n, N) as a matrix (d N, n)."""
+        return rows.transpose(0, 2, 1).reshape(-1, rows.shape[1])
+
+    def _rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """p(t) − ∫ ∂L/∂q dt + Γ ∫ p dt less its mean over a piece, (d, N) for θ = 0, and its derivatives (d, n, N)."""
+        d, rates, N = self.d, self.model.rates, p.shape[1]
+        friction = np.zeros((d, rates, N))
         for i in range(d if rates else 0):
             friction[i, i if rates > 1 else 0] = p[i]
-        near = (1.0 if self.observed else LIKELY) / self.scales
-        wide = np.concatenate([self.by[:d], np.zeros_like(friction)], axis=1)
-        rows, right = [wide * near[..., None]], [(self.second - self.value[:d]) * near]
-        at = 0
-        for run in self.pieces:
-            here = slice(at, at := at + run.n_points)
-            pushes = np.concatenate(
-                [self.value[d:, None, here], self.by[d:, :, here], -friction[..., here]], axis=1
-            )
-            moved = integrals(run.t, pushes)
-            top = self.second[:, None, here] if self.observed else self.value[:d, None, here]
-            columns = np.zeros_like(wide[..., here]) if self.observed else wide[..., here]
-            whole = np.concatenate([top, columns], axis=1) - moved
-            whole = np.einsum("ij,jkn->ikn", weights, whole - whole.mean(axis=-1, keepdims=True))
-            rows.append(whole[:, 1:])
-            right.append(-whole[:, 0])
-        stacked = np.concatenate([part.transpose(0, 2, 1).reshape(-1, self.model.n) for part in rows])
-        return stacked, np.concatenate([part.ravel() for part in right])
+        top = np.concatenate([self.value[:d, None], self.by[:d], np.zeros((d, rates, N))], axis=1)
+        if self.observed:
+            top = np.concatenate([p[:, None], np.zeros((d, self.model.n, N))], axis=1)
+        pushes = np.concatenate([self.value[d:, None], self.by[d:], -friction], axis=1)
+        ends = np.cumsum([run.n_points for run in self.pieces])[:-1]
+        made = [
+            a - integrals(run.t, b)
+            for run, a, b in zip(self.pieces, np.split(top, ends, axis=-1), np.split(pushes, ends, axis=-1), strict=True)
+        ]
+        whole = np.concatenate([rows - rows.mean(axis=-1, keepdims=True) for rows in made], axis=-1)
+        return whole[:, 0], whole[:, 1:]
+
+
+def _least(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The solution of least squares, its columns in their lengths; the shortest where there are many."""
+    lengths = np.linalg.norm(rows, axis=0)
+    lengths[lengths == 0] = 1.0
+    return np.linalg.lstsq(rows / lengths, right, rcond=1e-10)[0] / lengths
