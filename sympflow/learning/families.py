@@ -52,7 +52,9 @@ class Said:
     flow_scaling : Scaling or None
         The units of a flow that is fitted itself, and its Δt; None for none.
     velocities : bool
-        True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or the constant of M₁₁.
+        True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or M₁₁ in the middle of the data.
+    middle : ndarray of shape (d,) or None
+        The mean of q.
     """
 
     scales: np.ndarray
@@ -64,6 +66,7 @@ class Said:
     momenta: np.ndarray | None = None
     flow_scaling: Scaling | None = None
     velocities: bool = False
+    middle: np.ndarray | None = None
 
     @property
     def ndof(self) -> int:
@@ -155,7 +158,7 @@ def _inertia(said: Said) -> Iterator[Candidate]:
     for order in () if said.kinetic_is_known else ORDERS:
         V = Waves.up_to(order, max(order, 2), "q", scales, periods)
         M = Waves.up_to(order, order, "q", scales, periods, constant=True)
-        part = Inertia(M, unit=said.velocities)
+        part = Inertia(M, unit=said.middle if said.velocities else None)
         if V.n + part.n <= MOST_TERMS:
             yield Candidate(f"H = ½ pᵀM(q)⁻¹p + V(q), M and V series of order {order}", said.whole(part, V))
 

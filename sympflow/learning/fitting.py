@@ -186,7 +186,8 @@ def fitted(
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
         gain = FINE if (attempt or former is not None) and setting.plausible(sigma) else COARSE
         most = STEPS if model.stepper is None else OWN_STEPS
-        fit = minimized(problem, theta, states, iterations=most, gain=gain, stop=setting.stop)
+        patience = 3 if former is None else 1  # near the minimum a step tells
+        fit = minimized(problem, theta, states, iterations=most, gain=gain, patience=patience, stop=setting.stop)
         theta, before = fit.theta, sigma
         costs += [cost / data.n_values for cost in fit.costs]
         if given is None:

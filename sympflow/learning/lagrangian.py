@@ -13,7 +13,7 @@ import numpy as np
 
 from sympflow.learning.models import Model, Network, Part, Polynomial
 from sympflow.learning.shooting import integrals
-from sympflow.learning.smoothing import smoothed
+from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
 POINTS = 24
@@ -24,9 +24,11 @@ DEGREE = 4
 """Degree of the polynomial in place of a potential that is not linear in its numbers."""
 
 
-def lagrangian_start(model: Model, data: Trajectories, theta: np.ndarray) -> tuple[np.ndarray, Trajectories]:
-    """θ by Lagrange's equations where they are linear in it, else as it was; and the data with momenta."""
-    smooth, d = smoothed(data), data.ndof
+def lagrangian_start(
+    model: Model, data: Trajectories, theta: np.ndarray, smooth: Smooth | None = None
+) -> tuple[np.ndarray, Trajectories]:
+    """θ by Lagrange's equations where they are linear in it, else as it was; and the data, smooth, with momenta."""
+    smooth, d = smooth or smoothed(data), data.ndof
     runs = [Run(run.t, y) for run, y in zip(data.runs, smooth.states, strict=True)]
 
     def with_momenta(states: list[np.ndarray]) -> Trajectories:
@@ -80,9 +82,8 @@ class Equations:
 
     def masses(self, theta: np.ndarray) -> np.ndarray:
         """M (N, d, d) at all points."""
-        units = [np.broadcast_to(unit[:, None], self.q.shape) for unit in (np.zeros(self.d), *np.eye(self.d))]
-        rest, *columns = (self.momenta(theta, self.q, unit) for unit in units)
-        return np.stack([column - rest for column in columns], axis=1).T
+        known, by = self.by_mass
+        return (known + np.einsum("ijkn,k->ijn", by, theta[: self.n])).T
 
     def solved(self) -> np.ndarray:
         """θ by least squares: linear where momenta are observed, else by Gauss–Newton steps from M = 1."""
@@ -94,10 +95,10 @@ class Equations:
             rows, rest = self._stacked(rows / self.scales[..., None]), (rest / self.scales).ravel()
             wide = np.concatenate([likely, np.zeros((len(likely), self.model.rates))], axis=1)
             return _least(np.concatenate([wide, rows]), np.concatenate([right, -rest]))
-        theta[: self.n] = _least(likely, right)
+        theta[: self.n] = _least(likely, right)  # p = v
         left, J = self._left(theta)
         forces = np.arange(self.model.n) >= self.n  # first those alone
-        forces[: self.n] = ~self.by_mass.any(axis=(0, 1, 3))
+        forces[: self.n] = ~self.by_mass[1].any(axis=(0, 1, 3))
         for attempt in range(STEPS):
             step = _least(J if attempt else J * forces, -left)
             for _ in range(HALVINGS):
@@ -121,38 +122,51 @@ class Equations:
             return np.full(rest.size, np.inf), np.empty(0)
         W = np.linalg.inv(M)
         r = np.einsum("nij,jn->in", W, rest + np.einsum("ikn,k->in", rows, theta))
-        rows[:, : self.n] -= np.einsum("ijkn,jn->ikn", self.by_mass, r)
+        rows[:, : self.n] -= np.einsum("ijkn,jn->ikn", self.by_mass[1], r)
         return (r / self.scales).ravel(), self._stacked(np.einsum("nij,jkn->ikn", W / self.scales, rows))
 
     @cached_property
-    def by_mass(self) -> np.ndarray:
-        """The derivative of M by θ, (d, d, n, N)."""
+    def by_mass(self) -> tuple[np.ndarray, np.ndarray]:
+        """M (d, d, N) for θ = 0, and its derivative by θ, (d, d, n, N)."""
         units = (unit[:, None] * np.ones_like(self.q) for unit in (np.zeros(self.d), *np.eye(self.d)))
-        none, *columns = (self.model.momenta(self.q, v)[1][: self.d] for v in units)
-        return np.stack([column - none for column in columns], axis=1)
+        none, *columns = (self.model.momenta(self.q, v) for v in units)
+        known, by = (np.stack([c[k] - none[k] for c in columns], axis=1)[: self.d] for k in (0, 1))
+        return known, by
 
     @staticmethod
     def _stacked(rows: np.ndarray) -> np.ndarray:
         """Rows (d, n, N) as a matrix (d N, n)."""
         return rows.transpose(0, 2, 1).reshape(-1, rows.shape[1])
 
+    def _along(self, top: np.ndarray, pushes: np.ndarray) -> np.ndarray:
+        """Momenta less the integrals of what pushes them, (…, N), less their mean over a piece."""
+        ends = np.cumsum([run.n_points for run in self.pieces])[:-1]
+        parts = zip(self._weights, np.split(top, ends, axis=-1), np.split(pushes, ends, axis=-1), strict=True)
+        made = [a - b @ weights for weights, a, b in parts]
+        return np.concatenate([rows - rows.mean(axis=-1, keepdims=True) for rows in made], axis=-1)
+
+    @cached_property
+    def _weights(self) -> list[np.ndarray]:
+        """The integrals (k, k) of what is 1 at one of the points of a piece, of each piece."""
+        return [integrals(run.t, np.eye(run.n_points)) for run in self.pieces]
+
+    @cached_property
+    def _conservative(self) -> np.ndarray:
+        """p(t) − ∫ ∂L/∂q dt for θ = 0, and its derivatives by θ but for friction: (d, 1 + n, N)."""
+        whole = np.concatenate([self.value[:, None], self.by], axis=1)
+        top, pushes = whole[: self.d], whole[self.d :]
+        if self.observed:
+            top = np.concatenate([self.second[:, None], np.zeros_like(top[:, 1:])], axis=1)
+        return self._along(top, pushes)
+
     def _rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """p(t) − ∫ ∂L/∂q dt + Γ ∫ p dt less its mean over a piece, (d, N) for θ = 0, and its derivatives (d, n, N)."""
-        d, rates, N = self.d, self.model.rates, p.shape[1]
-        friction = np.zeros((d, rates, N))
+        """p(t) − ∫ ∂L/∂q dt + Γ ∫ p dt for θ = 0, (d, N), and its derivatives (d, n, N), with these momenta p."""
+        d, rates = self.d, self.model.rates
+        friction = np.zeros((d, rates, p.shape[1]))
         for i in range(d if rates else 0):
             friction[i, i if rates > 1 else 0] = p[i]
-        top = np.concatenate([self.value[:d, None], self.by[:d], np.zeros((d, rates, N))], axis=1)
-        if self.observed:
-            top = np.concatenate([p[:, None], np.zeros((d, self.model.n, N))], axis=1)
-        pushes = np.concatenate([self.value[d:, None], self.by[d:], -friction], axis=1)
-        ends = np.cumsum([run.n_points for run in self.pieces])[:-1]
-        made = [
-            a - integrals(run.t, b)
-            for run, a, b in zip(self.pieces, np.split(top, ends, axis=-1), np.split(pushes, ends, axis=-1), strict=True)
-        ]
-        whole = np.concatenate([rows - rows.mean(axis=-1, keepdims=True) for rows in made], axis=-1)
-        return whole[:, 0], whole[:, 1:]
+        whole = self._conservative
+        return whole[:, 0], np.concatenate([whole[:, 1:], self._along(np.zeros_like(friction), -friction)], axis=1)
 
 
 def _least(rows: np.ndarray, right: np.ndarray) -> np.ndarray:

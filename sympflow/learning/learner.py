@@ -56,7 +56,7 @@ TIME_BUDGET = 60.0  # seconds
 WIDE = 32  # trajectories from which orbits side by side cost no more than their steps; of fewer long ones are cut
 LONG_POINTS, LONG = 100, 12.0  # points, and times in which states move by their spread, that the pieces have at least
 ALONE = 24  # points of the pieces of a trajectory that is the only one, at least
-HOPELESS = 4.0  # squares of increments, over those of the best model, from which a model is one of the last
+HOPELESS = 2.0  # squares of increments, over those of the best model, from which a model is one of the last
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
 DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
@@ -144,8 +144,8 @@ def learn(
         `workers` share the replicas.
     **reading
         Options of `Trajectories.read`, such as `units`, `order` and `velocity_mass`. With observed="qv" the data have
-        velocities of a mass that is not known, with "q" positions alone: then H is learned but for a factor, which
-        makes the constant of M₁₁ 1, or that of M⁻¹. `flow.system.momenta(q, v)` are the momenta.
+        velocities of a mass that is not known, with "q" positions alone: then H is learned but for a factor, by which
+        (M⁻¹)₁₁ is 1, or M₁₁ in the middle of q where M depends on q. `flow.system.momenta(q, v)` are the momenta.
 
     Returns
     -------
@@ -255,8 +255,9 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: A
         raise ValueError("`known` has a kinetic energy, and so has `mass`: leave out one of them.")
     rates = 0 if damping is False else 1 if damping is True else d
     momenta = None if data.velocities else _covariance(data)
-    periods = _periods(period, d)
-    return Said(data.scales, separable, inverse, rates, periods, parts, momenta, velocities=data.velocities)
+    middle = np.nanmean(np.concatenate([run.y[:d] for run in data.runs], axis=1), axis=1)
+    of_data: dict[str, Any] = {"momenta": momenta, "velocities": data.velocities, "middle": middle}
+    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts, **of_data)
 
 
 def _covariance(data: Trajectories) -> np.ndarray:
@@ -609,7 +610,7 @@ class Search:
             "training_chi2": found.costs[-1],
             "held_out_loss": held.loss,
             "correlation": held.correlation,
-            "noise": float(np.mean(found.sigma / self.data.scales)),
+            "noise": float(np.mean((found.sigma / self.data.scales)[found.fit.counts > 0])),
         }
         self.history.append({"model": candidate.name, **figures})
         self.bar.tries(len(self.history), f"{candidate.name}: held-out loss {held.loss:.3g}")
@@ -896,15 +897,16 @@ class Search:
     def figures(self, dt: float) -> dict[str, float]:
         """The figures of the chosen model on the held-out trajectories, before its last fit to all of them."""
         _, found, held = self.winner
+        noise = {name: float(s) for name, s, n in zip(self.data.names, found.sigma, found.fit.counts, strict=True) if n}
         made = {
             "held_out_loss": held.loss,
             "held_out_trajectories": len(self.held.runs),
             "residual_correlation": held.correlation,
-            "noise": float(np.sqrt(np.mean(found.sigma**2))),
+            "noise": math.sqrt(np.mean(np.square([*noise.values()]))),
         }
         if self.tested and self.tested[0] is not None:
             made["unconstrained_share"] = self.tested[0].share
-        made |= {f"noise_{name}": float(s) for name, s in zip(self.data.names, found.sigma, strict=True)}
+        made |= {f"noise_{name}": sigma for name, sigma in noise.items()}
         passed = np.concatenate([run.t - run.t[0] for run in held.pieces])
         residuals = np.concatenate(held.residuals, axis=1)
         seen = np.isfinite(residuals).any(axis=0)

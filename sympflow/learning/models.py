@@ -351,6 +351,10 @@ class Waves(Part):
         """The terms (n, N), their slopes (m, n, N), and for i ≤ j their second derivatives (n, N) if asked for."""
         m, N = x.shape
         wave, turned = self._turns(x)
+        if not self.powers.exponents.any():  # of angles alone
+            slopes = self.waves.T[..., None] * turned
+            pairs = combinations_with_replacement(range(m), 2) if twice else ()
+            return wave, slopes, {(i, j): -(self.waves[:, i] * self.waves[:, j])[:, None] * wave for i, j in pairs}
         powers = self.powers.tables(x)
         whole = self.powers.monomials(powers, self.powers.exponents)
         slopes = np.empty((m, self.n, N))

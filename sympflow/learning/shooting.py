@@ -477,7 +477,7 @@ class Problem:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def normal(self, theta: np.ndarray, states: np.ndarray) -> Normal:
-        """The normal equations at a point."""
+        """The normal equations at a point, as far as its orbits are finite."""
         N, m, n = len(states), 2 * self.model.ndof, 0 if self.frozen else self.model.n
         made = Normal(np.empty((N, m, m)), np.empty((N, m, n)), np.zeros((n, n)), np.empty((N, m)), np.zeros(n), 0.0)
         for batch in self.batches:
@@ -488,6 +488,9 @@ class Problem:
                 assert X is not None
                 r, weight = self._weighted(batch, k, seen)
                 made.cost += self._cost(r)
+                if not math.isfinite(made.cost):
+                    made.cost = math.inf
+                    return made
                 for i in range(m):
                     J = X[i] * (np.sqrt(weight[i]) / self.sigma[i])
                     rest = np.sqrt(weight[i]) * r[i]
@@ -633,11 +636,10 @@ def minimized(
         if found is None:
             reason = "no step lowers the cost"
             break
-        theta, states, cost = found
-        normal = problem.normal(theta, states)
+        theta, states, normal = found
         scale = np.maximum(scale, np.diagonal(normal.C))
-        costs.append(cost)
-        if len(costs) > patience and cost > (1 - gain) * costs[-1 - patience]:
+        costs.append(normal.cost)
+        if len(costs) > patience and normal.cost > (1 - gain) * costs[-1 - patience]:
             reason = "it has converged"
             break
     return Fit(problem, theta, states, costs[-1], normal, costs, reason)
@@ -651,17 +653,18 @@ def _stepped(
     scale: np.ndarray,
     level: Damping,
     before: float,
-) -> tuple[np.ndarray, np.ndarray, float] | None:
-    for _ in range(TRIES):
+) -> tuple[np.ndarray, np.ndarray, Normal] | None:
+    for attempt in range(TRIES):
         solved = normal.solved(level.value, scale)
         if solved is not None:
             step, moved, promised = solved
             trial = theta if problem.frozen else theta + step, states + moved
-            after = problem.cost(*trial)
+            made = None if attempt else problem.normal(*trial)  # the first is mostly taken
+            after = problem.cost(*trial) if made is None else made.cost
             gain = (before - after) / promised if promised > 0 and math.isfinite(after) else -1.0
             if gain > 0:
                 level.accepted(gain)
-                return *trial, after
+                return *trial, made or problem.normal(*trial)
         level.rejected()
     return None
 

@@ -21,7 +21,7 @@ from sympflow.learning.diagnosis import DRAG, TURNED
 from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.models import Forced, FreeField, Model, drags, turns
 from sympflow.learning.shooting import Field, increments_left, matched
-from sympflow.learning.smoothing import smoothed
+from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
 DEGREES = (1, 2, 3)
@@ -150,19 +150,20 @@ def best_by_increments(
     affordable = [k for k, model in enumerate(models) if _affords(fitted, model)]
     if not affordable or not others.runs:
         return None
-    squares = {k: _left(models[k], fitted, others, scales) for k in affordable}
+    smooth = smoothed(fitted) if data.velocities else None
+    squares = {k: _left(models[k], fitted, others, scales, smooth) for k in affordable}
     best = min(affordable, key=lambda k: squares[k])
     if not 0 < squares[best] < math.inf:
         return best, None, squares
 
     def compared(reading: Reading) -> Reading:
         a, b = reading.of(fitted), reading.of(others)
-        return replace(reading, share=_left(reading.field, a, b, scales[[*reading.rows]]) / squares[best])
+        return replace(reading, share=_left(reading.field, a, b, scales[[*reading.rows]], smooth) / squares[best])
 
     free = [free_reading(scales, degree) for degree in DEGREES]
     found = [compared(reading) for reading in free if _affords(fitted, reading.field)]
     plain = [reading for k in affordable for reading in forced(models[k]) if _affords(fitted, reading.field)]
-    if d > 1:
+    if d > 1 and not data.velocities:
         turned = (*range(0, 2 * d, 2), *range(1, 2 * d, 2))
         plain += [Reading(models[k], turned, math.inf, *PAIRS) for k in affordable]
     plain = [compared(reading) for reading in plain]
@@ -180,12 +181,14 @@ def _affords(data: Trajectories, model: Field) -> bool:
     return model.n <= MOST_NUMBERS and PER_NUMBER * model.n < data.n_values
 
 
-def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray) -> float:
+def _left(
+    model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray, smooth: Smooth | None = None
+) -> float:
     """The squares that a model which was fitted to increments leaves of held-out ones; infinite where it diverges."""
     theta, moved = np.zeros(model.n), data
     if model.velocities:
         assert isinstance(model, Model)
-        theta, moved = lagrangian_start(model, data, model.start(np.random.default_rng(0)))
+        theta, moved = lagrangian_start(model, data, model.start(np.random.default_rng(0)), smooth)
     if model.linear:
         theta = matched(model, theta, moved, 1 / moved.scales)
     squares = increments_left(model, theta, held, 1 / scales)
