@@ -85,6 +85,8 @@ class Setting:
     rival : ndarray of shape (2d,) or None
         The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is given
         up.
+    sketch : bool
+        True to end with orbits of a few points.
     """
 
     noise: np.ndarray | None = None
@@ -93,6 +95,7 @@ class Setting:
     seen: np.ndarray | None = None
     lag: float = 0.0
     rival: np.ndarray | None = None
+    sketch: bool = False
 
     def plausible(self, noise: np.ndarray) -> bool:
         """True unless a model leaves so much (2d,) that it is rejected whatever its last digits are."""
@@ -197,7 +200,7 @@ def fitted(
         orbits = np.concatenate(fit.orbits, axis=1)
         coarse = fit.step_error(np.maximum(sigma, EXACT * scales)) > STEP_ERROR
         finer = finer / 10 if coarse else finer
-        longer = _span(model, data, method, theta, orbits, scales, sigma)
+        longer = 0.0 if setting.sketch else _span(model, data, method, theta, orbits, scales, sigma)
         settled = np.allclose(sigma, before, rtol=SETTLED, atol=EXACT * scales.min())
         if longer <= 1.5 * span and settled and not coarse:
             break

@@ -56,6 +56,7 @@ TIME_BUDGET = 60.0  # seconds
 WIDE = 32  # trajectories from which orbits side by side cost no more than their steps; of fewer long ones are cut
 LONG_POINTS, LONG = 100, 12.0  # points, and times in which states move by their spread, that the pieces have at least
 ALONE = 24  # points of the pieces of a trajectory that is the only one, at least
+MANY = 20  # numbers of a model that is simplified before its orbits are followed
 HOPELESS = 2.0  # squares of increments, over those of the best model, from which a model is one of the last
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
@@ -581,9 +582,21 @@ class Search:
             over = self.best is not None and (self.best[2].exact or setting.stop())
             if over or worse == 2 or not self._affords(candidate):
                 return
-            made = self._try(candidate, setting, session)
+            sparse = self._sparse(candidate, setting)
+            made = None if sparse is None else self._try(sparse, setting, session)
+            if made is None or not made[2].explained:
+                made = self._try(candidate, setting, session)
             better = best is None or gains(best[2], made[2])
             worse, best = (0, made) if better else (worse + 1, best)
+
+    def _sparse(self, candidate: Candidate, setting: Setting) -> Candidate | None:
+        """A model of many numbers whose orbits take long, without the terms that orbits of a few points do not ask for."""
+        if not candidate.model.lagrangian or candidate.model.n < MANY:
+            return None
+        found = fitted(candidate.model, self.data, replace(setting, sketch=True), seed=self.seed)
+        if not math.isfinite(found.fit.cost):
+            return None
+        return pruned(candidate, found.theta, found.fit.normal.precision(), self.data.n_values)
 
     def _affords(self, candidate: Candidate) -> bool:
         """True if there are more numbers than the model and the initial states have."""
