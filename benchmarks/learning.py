@@ -532,7 +532,9 @@ def measured_rows(options: argparse.Namespace) -> list[Row]:
                 field, seconds = timed(lambda x=x, v=v, of=of: networks.sparse_field(x, v, of.angles))  # type: ignore[misc]
             else:
                 steps = max(options.networks, 1)
-                field, seconds = timed(lambda kind=kind, x=x, v=v, steps=steps: networks.learned_field(kind, x, v, steps))  # type: ignore[misc]
+                field, seconds = timed(
+                    lambda kind=kind, x=x, v=v, steps=steps: networks.learned_field(kind, x, v, steps)
+                )  # type: ignore[misc]
             theirs[kind] = error(networks.followed(field, start, judged)[:, :d]), seconds
         period = 2 * np.pi if of.angles else None
         flow, seconds = timed(

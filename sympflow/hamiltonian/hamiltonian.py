@@ -153,7 +153,10 @@ class Hamiltonian:
             left = v - self.gradient(y, t)[..., d:]
             if bool((abs(left) <= FOUND * abs(v).max()).all()):
                 return p
-            p = p + _library(left).linalg.solve(self.hessian(y, t)[..., d:, d:], left[..., None])[..., 0]
+            try:
+                p = p + _library(left).linalg.solve(self.hessian(y, t)[..., d:, d:], left[..., None])[..., 0]
+            except (np.linalg.LinAlgError, RuntimeError):  # the latter of torch
+                break
         raise ValueError("`v` are velocities of no momenta that Newton's method finds: give p itself.")
 
     def time_derivative(self, y: Array, t: Any = None) -> Array:

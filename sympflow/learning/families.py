@@ -168,7 +168,9 @@ def _magnetic(said: Said) -> Iterator[Candidate]:
     exponents = [np.eye(2 * d, dtype=int)[[i, d + j]].sum(axis=0) for i, j in combinations(range(d), 2)]
     for degree, V in _few(DEGREES, "q", said.scales[:d]) if exponents else ():
         turn = Polynomial("y", exponents, said.scales)
-        yield Candidate(f"H = ½ pᵀM⁻¹p + Σ b_ij q_i p_j + V, V a polynomial of degree {degree}", said.separated(turn, V))
+        yield Candidate(
+            f"H = ½ pᵀM⁻¹p + Σ b_ij q_i p_j + V, V a polynomial of degree {degree}", said.separated(turn, V)
+        )
 
 
 def _pairs(said: Said) -> Iterator[Candidate]:
@@ -285,9 +287,9 @@ def families(said: Said, name: str | None) -> list[str]:
     if name is not None and not (FAMILIES[name].tells(said) and any(True for _ in FAMILIES[name].models(said))):
         raise ValueError(
             f"`family` {name!r} does not apply: series need the `period` of an angle, pairs the coordinates of two "
-            "bodies or more in two or three dimensions, functions H(q, p) and flows momenta, a magnetic field velocities "
-            "in two dimensions or more, flows nothing that is known of H, and other families not too many degrees of "
-            "freedom."
+            "bodies or more in two or three dimensions, functions H(q, p) and flows momenta, a magnetic field "
+            "velocities in two dimensions or more, flows nothing that is known of H, and other families not too many "
+            "degrees of freedom."
         )
     if name is not None:
         return [name]

@@ -27,7 +27,7 @@ from sympflow.learning.shooting import (
 )
 from sympflow.learning.trajectories import Run, Trajectories
 
-FIRST_POINTS = 10  # of the pieces that a fit begins with
+FIRST_POINTS, SKETCH_POINTS = 10, 30  # of the pieces that a fit begins with, and that one of all terms has
 MATCHED_POINTS = 24  # of those whose increments give its start
 MATCHED_STEPS = 60
 ROUNDS = 4  # of longer pieces, or of another noise
@@ -175,7 +175,7 @@ def fitted(
     span = (
         former.span if former is not None else 0.0 if model.stepper is None else model.stepper.longest
     )  # a map of its own is fitted over all of a step
-    pieces = data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
+    pieces = data.pieces(span=span) if span else data.pieces(SKETCH_POINTS if setting.sketch else FIRST_POINTS)
     if former is None or not span:
         states = first_states(pieces, model, theta)
     else:

@@ -590,7 +590,7 @@ class Search:
             worse, best = (0, made) if better else (worse + 1, best)
 
     def _sparse(self, candidate: Candidate, setting: Setting) -> Candidate | None:
-        """A model of many numbers whose orbits take long, without the terms that orbits of a few points do not ask for."""
+        """A model of many numbers whose orbits take long, without the terms that short orbits do not ask for."""
         if not candidate.model.lagrangian or candidate.model.n < MANY:
             return None
         found = fitted(candidate.model, self.data, replace(setting, sketch=True), seed=self.seed)

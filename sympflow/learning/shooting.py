@@ -484,15 +484,14 @@ class Problem:
             size = len(batch.index)
             A, B, a = np.zeros((m, m, size)), np.zeros((m, n, size)), np.zeros((m, size))
             for k, x, X in self._orbits(batch, theta, states, True):
-                seen, X = self.model.observed(theta, x, X)
-                assert X is not None
+                seen, by = self.model.observed(theta, x, X)
                 r, weight = self._weighted(batch, k, seen)
                 made.cost += self._cost(r)
                 if not math.isfinite(made.cost):
                     made.cost = math.inf
                     return made
                 for i in range(m):
-                    J = X[i] * (np.sqrt(weight[i]) / self.sigma[i])
+                    J = by[i] * (np.sqrt(weight[i]) / self.sigma[i])
                     rest = np.sqrt(weight[i]) * r[i]
                     by_state, by_theta = J[:m], J[m:]
                     a += by_state * rest

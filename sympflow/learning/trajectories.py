@@ -516,7 +516,7 @@ def _of_mapping(data: Mapping[str, Any], ndof: int | None, time: str | None, q: 
         if len({a.shape for a in arrays.values()}) > 1:
             raise ValueError(f"{said}: columns must be of one length.")
         return imported("pandas", "Reading columns").DataFrame(arrays)
-    if any(half is None or np.shape(half) != np.shape(halves[0]) for half in halves):
+    if len({() if half is None else half.shape for half in halves}) > 1 or halves[0] is None:
         raise ValueError(f"{said}: give t with y (N, 2d, n), or with q and p of one shape, (N, d, n) or (d, n).")
     runs = t.ndim == 2 or ndof == 1  # q (N, n) of one degree of freedom
     made = [a[:, None] if a.ndim == 2 and runs else a for a in halves if a is not None]

@@ -9,7 +9,7 @@ import sympy
 from scipy.integrate import solve_ivp
 
 import sympflow
-from sympflow.learning.families import FAMILIES, Candidate, Said, pruned
+from sympflow.learning.families import FAMILIES, Candidate, pruned
 from sympflow.learning.fitting import Held, Setting, fitted, judged, left_out, restored
 from sympflow.learning.inertia import Inertia
 from sympflow.learning.learner import (

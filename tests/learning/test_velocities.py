@@ -18,9 +18,7 @@ from sympflow.systems import double_pendulum
 t = np.linspace(0.0, 2.0, 101)
 PENDULUM = sympflow.HamiltonianSystem.from_sympy("p**2 - cos(q)", name="light")  # of mass ½
 CARTS = sympflow.HamiltonianSystem.from_sympy("p1**2 + p2**2/3 + q1**2/2 + (q1 - q2)**2 + q2**4/4", name="carts")
-CHARGE = sympflow.HamiltonianSystem.from_sympy(
-    "(p1 + q2)**2/2 + (p2 - q1)**2/2 + q1**2/2 + q2**4/4", name="charge"
-)
+CHARGE = sympflow.HamiltonianSystem.from_sympy("(p1 + q2)**2/2 + (p2 - q1)**2/2 + q1**2/2 + q2**4/4", name="charge")
 
 
 def observations(system, observed, runs=5, noise=0.0):
