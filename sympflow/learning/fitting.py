@@ -234,7 +234,7 @@ def _states(found: Fitted, data: Trajectories, pieces: Trajectories, sigma: np.n
     few = data.pieces(FIRST_POINTS)
     short = Problem(found.model, few, found.method, sigma, frozen=True, huber=setting.huber)
     starts = first_states(few, found.model, found.theta)
-    orbits = minimized(short, found.theta, starts, iterations=20, patience=1).orbits
+    orbits = minimized(short, found.theta, starts, iterations=20, patience=1, stop=setting.stop).orbits
     return np.concatenate(orbits, axis=1)[:, _starts(pieces.runs)].T
 
 
@@ -342,7 +342,7 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
     states = _states(found, held, pieces, sigma, setting)
-    fit = minimized(problem, found.theta, states, iterations=20, patience=1)
+    fit = minimized(problem, found.theta, states, iterations=20, patience=1, stop=setting.stop)
     residuals = fit.residuals
     ends = np.cumsum([run.n_points for run in held.runs])
     owner = np.searchsorted(ends, _starts(pieces.runs), side="right")

@@ -56,6 +56,7 @@ TIME_BUDGET = 60.0  # seconds
 WIDE = 32  # trajectories from which orbits side by side cost no more than their steps; of fewer long ones are cut
 LONG_POINTS, LONG = 100, 12.0  # points, and times in which states move by their spread, that the pieces have at least
 ALONE = 24  # points of the pieces of a trajectory that is the only one, at least
+SHARE = 3  # of families that are still to be tried, whose time is given to the next
 MANY = 20  # numbers of a model that is simplified before its orbits are followed
 HOPELESS = 2.0  # squares of increments, over those of the best model, from which a model is one of the last
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
@@ -460,6 +461,8 @@ class Search:
     """The trajectories as they were before they were cut; None if they were not."""
     final: Fitted = field(init=False)
     """The chosen model, fitted to all trajectories."""
+    late: Callable[[], bool] = lambda: False
+    """True once there is no time for another model."""
 
     @property
     def data(self) -> Trajectories:
@@ -501,6 +504,7 @@ class Search:
     def run(self, names: list[str], session: Session) -> None:
         """Fit models of these families until one explains the held-out trajectories, or no richer one does better."""
         deadline = session.deadline.part(1 - TABLE_SHARE) if session.time_budget is not None else session.deadline
+        self.late = deadline.over
         setting = replace(self.setting, stop=deadline.over)
         total = sum(1 for name in names for _ in FAMILIES[name].models(self.said))
         with session.bar(total, "Models") as self.bar:
@@ -513,7 +517,7 @@ class Search:
                     break
                 if self.best is not None and not linear and self.freedom(setting) is not None:
                     break
-                own = deadline.part(min(2 / (len(queue) - place), 1.0))
+                own = deadline.part(min(SHARE / (len(queue) - place), 1.0))
                 self._climb(candidates, replace(setting, stop=own.over), session)
         if self.best is None:
             raise ValueError(
@@ -584,7 +588,7 @@ class Search:
                 return
             sparse = self._sparse(candidate, setting)
             made = None if sparse is None else self._try(sparse, setting, session)
-            if made is None or not made[2].explained:
+            if made is None or not (made[2].explained or setting.stop()):
                 made = self._try(candidate, setting, session)
             better = best is None or gains(best[2], made[2])
             worse, best = (0, made) if better else (worse + 1, best)
@@ -611,7 +615,7 @@ class Search:
                 self.save(session)
         else:
             found = restored(candidate.model, self.data, numbers, setting)
-        chosen = candidate, found, left_out(found, self.folds, self.setting)
+        chosen = candidate, found, left_out(found, self.folds, replace(self.setting, stop=self.late))
         self._note(chosen, session)
         return chosen
 
@@ -631,10 +635,10 @@ class Search:
             session.callback(len(self.history), figures)
 
     def _try(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
-        """Fit a model, and keep it if it is the best so far."""
+        """Fit a model, and keep it if it is the best so far, and was judged before the time was up."""
         rival = None if self.best is None else self.best[1].sigma
         made = self._fit(candidate, replace(setting, rival=rival), session)
-        if self.best is None or gains(self.best[2], made[2]):
+        if self.best is None or (not self.late() and gains(self.best[2], made[2])):
             self.best = made
         return made
 
@@ -645,6 +649,8 @@ class Search:
         rich, simple = self.winner, self._fit(candidate, setting, session)
         fewer = rich[0].model.n - candidate.model.n
         lost = 2 * (simple[1].loss(rich[1].sigma) - rich[1].loss(rich[1].sigma))
+        if self.late():
+            return
         if simple[2].exact or lost < fewer * math.log(self.data.n_values):
             self.best = simple
 

@@ -15,7 +15,7 @@ from sympflow.learning.shooting import first_states
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import double_pendulum
 
-t = np.linspace(0.0, 2.0, 101)
+t = np.linspace(0.0, 2.0, 51)
 PENDULUM = sympflow.HamiltonianSystem.from_sympy("p**2 - cos(q)", name="light")  # of mass ½
 CARTS = sympflow.HamiltonianSystem.from_sympy("p1**2 + p2**2/3 + q1**2/2 + (q1 - q2)**2 + q2**4/4", name="carts")
 CHARGE = sympflow.HamiltonianSystem.from_sympy("(p1 + q2)**2/2 + (p2 - q1)**2/2 + q1**2/2 + q2**4/4", name="charge")
@@ -91,14 +91,14 @@ def test_what_is_observed_of_a_state_has_the_derivatives_that_are_said(inertial,
 )
 @pytest.mark.parametrize("observed", ["qv", "q"])
 def test_motions_are_found_by_shooting(system, family, place, period, observed):
-    """Accelerations at the data, which no gauge changes, to rounding and the scheme."""
+    """Accelerations at the data, which no gauge changes, of trajectories without noise."""
     data, y = observations(system, observed)
     model = candidate(family, data, place, period)
-    found = fitted(model, data, Setting())
+    found = fitted(model, data, Setting(np.full(2 * system.ndof, 1e-5)))  # as far as they are to be followed
     v = system.vector_field(y[0].T).T[: system.ndof]
     seen = np.concatenate([y[0, : system.ndof], v])
     right = np.einsum("nij,nj->in", system.field_jacobian(y[0].T), system.vector_field(y[0].T))[: system.ndof]
-    assert accelerations(model, found.theta, seen) == pytest.approx(right, abs=1e-6)
+    assert accelerations(model, found.theta, seen) == pytest.approx(right, abs=1e-3)
 
 
 def test_friction_is_told_by_velocities():
@@ -119,9 +119,10 @@ def test_the_noise_of_velocities_biases_nothing():
         assert found.sigma[0] == pytest.approx(0.01, rel=0.1)
 
 
-def test_learn_gives_h_and_the_momenta(tmp_path):
-    data, y = observations(PENDULUM, "qv", noise=0.005)
-    flow = sympflow.learn(data, period=2 * np.pi, family="waves", dt=0.5)
+def test_learn_gives_h_and_the_momenta():
+    spring = sympflow.HamiltonianSystem.from_sympy("p**2 + q**2", name="spring")
+    data, y = observations(spring, "qv", noise=0.005)
+    flow = sympflow.learn(data, family="polynomial", dt=0.5)
     v = 2 * y[:, 1, 0]
     p = flow.system.momenta(y[:, :1, 0], v[:, None])
     assert p[:, 0] == pytest.approx(v, abs=1e-12)
@@ -173,4 +174,4 @@ def test_the_first_velocity_is_the_slope_of_the_positions():
     data, y = observations(PENDULUM, "q")
     model = Model(1, (FixedKinetic(np.eye(1)),), velocities=True)
     starts = first_states(data, model, np.zeros(0))
-    assert starts[:, 1] == pytest.approx(2 * y[:, 1, 0], abs=1e-3)
+    assert starts[:, 1] == pytest.approx(2 * y[:, 1, 0], abs=0.02)  # of a cubic over 0.36
