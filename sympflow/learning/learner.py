@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import warnings
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -45,6 +44,7 @@ from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
 from sympflow.learning.trajectories import FEW, Run, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
+from sympflow.storage.identity import digest
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
 from sympflow.training.starts import suited_step
@@ -297,11 +297,9 @@ def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
 
 def _identity(data: Trajectories, said: Said, setting: Setting, options: dict[str, Any]) -> dict[str, Any]:
     """The description that a search must share with the one that it goes on with."""
-    numbers = [*(run.t for run in data.runs), *(run.y.ravel() for run in data.runs)]
-    numbers += [v for v in (said.inverse_mass, said.periods, setting.noise) if v is not None]
-    digest = zlib.crc32(np.concatenate([np.ravel(v) for v in numbers]).tobytes())
     known = [str(part.formula) for part in said.known]
-    return {"config": json.dumps(options), "architecture": json.dumps(known), "fingerprint": [float(digest)]}
+    of_data = digest([data, said.inverse_mass, said.periods, setting.noise])
+    return {"config": json.dumps(options), "architecture": json.dumps(known), "system": of_data}
 
 
 def _noise(noise: Any, data: Trajectories) -> np.ndarray | None:
