@@ -531,7 +531,7 @@ def measured_rows(options: argparse.Namespace) -> list[Row]:
             if kind == "SINDy":
                 field, seconds = timed(lambda x=x, v=v, of=of: networks.sparse_field(x, v, of.angles))  # type: ignore[misc]
             else:
-                steps = max(options.networks, 1)
+                steps = 4 * options.networks  # beyond which neither is better
                 field, seconds = timed(
                     lambda kind=kind, x=x, v=v, steps=steps: networks.learned_field(kind, x, v, steps)
                 )  # type: ignore[misc]

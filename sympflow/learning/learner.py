@@ -593,7 +593,7 @@ class Search:
 
     def _sparse(self, candidate: Candidate, setting: Setting) -> Candidate | None:
         """A model of many numbers whose orbits take long, without the terms that short orbits do not ask for."""
-        if not candidate.model.lagrangian or candidate.model.n < MANY:
+        if candidate.model.n < MANY or not candidate.model.lagrangian:
             return None
         found = fitted(candidate.model, self.data, replace(setting, sketch=True), seed=self.seed)
         if not math.isfinite(found.fit.cost):
