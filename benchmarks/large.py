@@ -28,7 +28,7 @@ from measuring import fragments
 from numba import njit, prange
 
 from sympflow import HamiltonianSystem, solve
-from sympflow.kernels.modules import at_most
+from sympflow.kernels.threads import at_most
 
 OPTIONS: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 H = 0.05

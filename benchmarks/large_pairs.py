@@ -25,7 +25,7 @@ from measuring import fragments
 from numba import njit
 
 from sympflow import HamiltonianSystem, solve
-from sympflow.kernels.modules import at_most
+from sympflow.kernels.threads import at_most
 
 SOFTENING, H = 0.05, 1e-4
 

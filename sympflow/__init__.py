@@ -21,6 +21,7 @@ _HOME = {
     "time_transformed": "hamiltonian.time_transformation",
     "doubled": "hamiltonian.doubling",
     "solve": "solver",
+    "choose_step": "integrators.choosing",
     "ensemble": "ensembles.sweep",
     "Solution": "solution",
     "Interrupted": "integrators.contract",
@@ -62,6 +63,18 @@ _HOME = {
     "time_reversal_error": "metrics.accuracy",
 }
 _MODULES = ("systems", "interop")
+_ROOMS = (
+    "ensembles",
+    "flow",
+    "hamiltonian",
+    "integrators",
+    "learning",
+    "metrics",
+    "schemes",
+    "storage",
+    "studies",
+    "testing",
+)
 
 __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
 
@@ -80,6 +93,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.doubling import doubled as doubled
     from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
+    from sympflow.integrators.choosing import choose_step as choose_step
     from sympflow.integrators.contract import Interrupted as Interrupted
     from sympflow.integrators.registry import available as available
     from sympflow.integrators.registry import get as get
@@ -122,7 +136,7 @@ if FORMER_PATHS not in sys.meta_path:
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
+    if name in (*_MODULES, *_ROOMS):
         return import_module(f"sympflow.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'sympflow' has no attribute {name!r}")

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy
 
@@ -202,6 +201,8 @@ class EventSearch:
 
         def g(s: float) -> float:
             return known[s] if s in known else event.value(s, inside(s))
+
+        from scipy.optimize import brentq  # half of the imports of a run, which most runs do without
 
         return float(brentq(g, a, b, xtol=4 * _EPS, rtol=4 * _EPS))
 

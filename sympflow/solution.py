@@ -11,7 +11,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy
-from sympflow.hamiltonian.scales import weights
+from sympflow.hamiltonian.scales import known_scale, weights
 
 if TYPE_CHECKING:
     import os
@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.integrators.contract import Integrator
     from sympflow.storage.runs import RunStore
-
-SMALLEST_SCALE = 1e-12
-"""|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
 
 
 @dataclass
@@ -374,16 +371,6 @@ def check_solution(sol: object, name: str = "sol") -> None:
     """Raise a TypeError unless `sol` is a Solution."""
     if not isinstance(sol, Solution):
         raise TypeError(f"`{name}` must be a Solution; got {type(sol).__name__}. Pass what solve() returns.")
-
-
-def known_scale(system: HamiltonianSystem, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:
-    """The system's `energy_scale`, else |H0| of the states y0 (..., 2d); NaN where H0 is 0 but for rounding: (...)."""
-    if system.energy_scale is not None:
-        return np.full_like(H0, system.energy_scale)
-    with np.errstate(all="ignore"):
-        y = y0.astype(float)
-        terms = np.abs(y * np.asarray(system.gradient(y, None if system.autonomous else t0))).sum(-1)
-        return np.where(np.isfinite(H0) & (np.abs(H0) <= SMALLEST_SCALE * terms), np.nan, np.abs(H0))
 
 
 def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> np.ndarray:

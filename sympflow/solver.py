@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -23,26 +24,31 @@ from sympflow.arguments import (
     check_t_eval,
     check_t_span,
 )
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable
+from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable, to_numpy
 from sympflow.events import EventSearch, parse
+from sympflow.hamiltonian.scales import default_step
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import report_lanes, run_and_search
+from sympflow.integrators.base import FixedStep, report_lanes, run_and_search
+from sympflow.integrators.choosing import check_tolerance, choose_method, step_for
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
+from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
+    smaller_tolerance,
     warn_of_leap,
     warn_of_loss,
-    warn_of_tolerance,
 )
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.impulses import run_between_impulses
 from sympflow.integrators.progress import Asked, Progress
-from sympflow.integrators.registry import build, check_applies, naming_plugin
-from sympflow.solution import Solution, StoredSolution, joined
+from sympflow.integrators.registry import build, check_applies, get, naming_plugin
+from sympflow.solution import Solution, StoredSolution, energy_change, joined
+from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
+    from sympflow.storage.runs import RunStore
 
 BACKENDS = ("auto", "compiled", "array", "cuda")
 MAX_EVENT_SAMPLES = 100_000_000
@@ -53,10 +59,12 @@ _FLOAT64 = np.dtype(np.float64)
 
 def solve(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | Array | None = None,
     *,
+    tol: float | None = None,
+    tol_of: str = "energy",
     params: Mapping[str, ArrayLike] | None = None,
     t_eval: ArrayLike | None = None,
     dense_output: bool = False,
@@ -79,14 +87,24 @@ def solve(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator, or trained flow
-        A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow.
+        Or the name of a scene, such as "henon-heiles", or H as a formula, such as "p**2/2 + q**4/4".
+    method : str, Integrator, or trained flow, optional
+        A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow. By
+        default one that suits the system, the first of these that applies: a flow that ships for it ("sympflow");
+        "log_kahan_li8" where V falls without bound towards q = 0; "srkn11b" where T = ½ pᵀM⁻¹p; "kahan_li8" where H is
+        separable; "gauss_legendre6"; "dop853". The message and `stats["chosen"]` say which, and why.
     t_span : (float, float), optional
         Start and end; the end may lie before the start. The default is the system's. With a terminal event the end may
         be infinite: without the event the run ends after a million steps, with status −1.
     y0 : array_like or tensor of shape (..., 2d), optional
         Initial state [q, p], or a batch of them. The default is the system's. A NumPy array gives float64 (integers are
         promoted); a tensor gives a tensor of its dtype and device, and gradients flow to it.
+    tol : float, optional
+        The largest relative energy error that is asked for. A method of fixed steps takes the step that
+        `sympflow.choose_step` finds by short trial runs; for "sympflow" it chooses the flow, see its option. The run
+        itself is checked: where its energy error is larger, a RuntimeWarning and the message say so.
+    tol_of : {"energy", "state"}
+        See `sympflow.choose_step`.
     params : mapping of str to array_like, optional
         Values of parameters of the system for each trajectory: numbers, or arrays that broadcast with the batch of y0;
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
@@ -168,13 +186,19 @@ def solve(
     """
     if is_tensor(y0):
         check_not_traced("solve")
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
-    integrator = build(method, options)
+    system = given_system(system)
+    given, chosen = options, None
+    if tol is not None:
+        check_tolerance(tol, tol_of)
+        given = {**options, "tol": tol} if isinstance(method, str) and "tol" in get(method).options() else options
+    integrator = None if method is None else build(method, given)
     search = check_events(events, event_step)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     system.check_times(t0, t1)
+    if integrator is None:
+        simple = events is None and store is None and params is None and not dense_output
+        integrator, chosen = choose_method(system, y_start, options, tol, simple, flows=params is None)
     rows = None
     if params is not None:
         rows, y_start = check_params(system, params, y_start, integrator)
@@ -211,8 +235,26 @@ def solve(
             "`resume` and `checkpoint_every` are for runs with a `store`, and `same` with them: give one, or leave "
             "them out."
         )
+    if tol is not None and "tol" not in integrator.options():
+        integrator = replace(integrator, dt=step_for(integrator, problem, tol, tol_of))  # type: ignore[type-var]
+    elif system.step_is_open and isinstance(integrator, FixedStep) and not integrator.trained and readable(y_start):
+        integrator = replace(integrator, dt=integrator.dt or default_step(system, to_numpy(y_start)))
+    sol = _shown(integrator, problem, action, rows, progress)
+    if tol is not None and store is None and system.autonomous and system.conservative and tol_of == "energy":
+        _check_tolerance_met(sol, tol)
+    if chosen is not None:
+        sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"
+        sol.message += f" Method {sol.integrator.label!r} was chosen: {chosen}."
+    return sol
+
+
+def _shown(
+    integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None, progress: Asked
+) -> Solution:
+    """The solution of a validated problem, with a bar where that is asked for."""
     if progress is False:
         return _answered(integrator, problem, action, rows)
+    t0, t1 = problem.t0, problem.t1
     sign = math.copysign(1.0, t1 - t0)
     bar = Progress(progress, abs(t1 - t0), lambda done: f"t = {t0 + sign * done:.6g} of {t1:.6g}")
     try:
@@ -222,6 +264,17 @@ def solve(
     finally:
         bar.end()
     return sol
+
+
+def _check_tolerance_met(sol: Solution, tol: float) -> None:
+    """Note a run whose energy error is larger than was asked for."""
+    with warnings.catch_warnings(action="ignore"):  # of an error that is absolute
+        error = float(np.max(np.abs(energy_change(sol)), initial=0.0))
+    sol.stats["energy_error"] = error
+    if error > tol:
+        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
+        sol.message += f" {note}"
+        warnings.warn(note, RuntimeWarning, stacklevel=3)
 
 
 def check_backend(backend: Any, integrator: Integrator) -> None:
@@ -246,9 +299,9 @@ def _answered(integrator: Integrator, problem: Problem, action: str, rows: Param
     return _solved_rows(integrator, problem, action, rows)
 
 
-def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
-    """The solution of a validated problem."""
-    system, y_start = problem.system, problem.y0
+def _solved(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None = None) -> Solution:
+    """The solution of a validated problem; `rows` are the parameters of its trajectories, where they have some."""
+    given, system, y_start = problem, problem.system, problem.y0
     n_times = 0 if problem.t_eval is None else len(problem.t_eval)
     between = system.between_impulses
     integrator = integrator.resolved(between, y_start, abs(problem.t1 - problem.t0), n_times)
@@ -272,7 +325,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
     elif problem.store is not None:
         run = partial(_run_stored, action=action)
     else:
-        check_memory(integrator, replace(problem, system=between))
+        check_memory(integrator, problem if between is system else replace(problem, system=between))
 
     start, stopped = time.perf_counter(), None
     with naming_plugin(integrator):
@@ -282,21 +335,22 @@ def _solved(integrator: Integrator, problem: Problem, action: str) -> Solution:
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
+    if integrator.absolute_tolerance and stopped is None and readable(outcome.y) and np.all(outcome.status >= 0):
+        atol = smaller_tolerance(outcome, system, integrator.absolute_tolerance)
+        if atol is not None:
+            afresh = replace(given, events=given.events and given.events.afresh())
+            return _solved(replace(integrator, atol=atol), afresh, action, rows)  # type: ignore[type-var]
     passed = False
-    if system.poles is not None and problem.diagnosed and problem.letters is None and problem.store is None:
-        from sympflow.integrators.diagnosis import note_poles
-
+    if (system.poles is not None or problem.letters is not None) and problem.diagnosed and problem.store is None:
         if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
-            passed = note_poles(outcome, integrator, problem, stacklevel=4)
+            passed = note_poles(outcome, integrator, problem, rows, stacklevel=4 + (rows is not None))
+        if stopped is None and problem.letters is None and readable(outcome.y):
+            warn_of_cancelling(outcome, problem, stacklevel=4)
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
     if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
-        from sympflow.integrators.diagnosis import note_singularities
-
         note_singularities(outcome, integrator, problem, passed)
     if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
-    if integrator.absolute_tolerance and not failed and problem.store is None and readable(outcome.y):
-        warn_of_tolerance(outcome, system, integrator.absolute_tolerance, stacklevel=4)
     if system.functions_given and readable(outcome.y):
         system.check_functions_along(outcome.y)
     if integrator.trained:
@@ -347,7 +401,7 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     pieces: list[tuple[np.ndarray, Solution]] = []
     try:
         for index, part in groups:
-            sol = _solved(integrator, part, action)
+            sol = _solved(integrator, part, action, rows.taken(index))
             pieces.append((index, sol))
             if problem.diagnosed and part.letters is not None and not sol.success:
                 _note_singularities(sol, integrator, part, rows.taken(index))
@@ -363,8 +417,6 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
 
 def _note_singularities(sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows) -> None:
     """Note when solutions with parameters of their own become infinite, of the first `MOST_DIAGNOSED` that fail."""
-    from sympflow.integrators.diagnosis import note_singularities
-
     status = np.asarray(sol.status)
     failed, times = np.flatnonzero(status < 0), np.full(len(status), np.nan)
     for few, system, _ in itertools.islice(rows.taken(failed).distinct(), MOST_DIAGNOSED):
@@ -430,6 +482,7 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
     expected = steps + 2 if problem.t_eval is None else problem.t_eval.size
     store.prepare(known, provenance(system, integrator, (problem.t0, problem.t1)), y0, int(min(expected, 1e9)))
     compiled = {"backend": "compiled"}  # by which states are looked at in a compiled pass
+    before: Problem | None = None
 
     def look(t: np.ndarray, y: np.ndarray) -> None:
         """Check the outputs of a window, as `_solved` checks all outputs."""
@@ -438,6 +491,14 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
             system.check_functions_along(y)
         if integrator.trained:
             check_system_along(piece, integrator, system, y0)
+        if problem.diagnosed and system.poles is not None:
+            nonlocal before
+            if before is None:
+                before = replace(problem, store=None, progress=None, diagnosed=False)
+                if n := store.length:  # which holds what was before
+                    before = replace(before, t0=float(store.times(n - 1)[0]), y0=store.states(n - 1)[..., 0])
+            _look_for_poles(store, Outcome(t, y, 0, "", {}), integrator, before)
+            before = replace(before, t0=float(t[-1]), y0=y[-1])
         if action != "ignore" and "domain_exit" not in store.noted:
             check_domain(piece, integrator, system, action)
             if "domain_exit" in piece.stats:
@@ -445,6 +506,15 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
 
     store.look = look
     return integrator.run(problem), problem
+
+
+def _look_for_poles(store: RunStore, piece: Outcome, integrator: Integrator, before: Problem) -> None:
+    """Note that a run passed a pole between outputs of a window, and the state before them; of each trajectory once."""
+    known = np.array(store.noted.get("failed_at", np.full(before.y0.shape[:-1], np.nan)), dtype=float)
+    piece.status = np.where(np.isnan(known), 0, -1) if known.ndim else 0 if np.isnan(known) else -1
+    if note_poles(piece, integrator, before, None, stacklevel=6):
+        at = np.where(np.isnan(known), piece.stats["failed_at"], known)
+        store.noted |= {"failed_at": at.tolist(), "passed": store.noted.get("passed", piece.message)}
 
 
 def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> None:

@@ -14,6 +14,7 @@ from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
 from sympflow.integrators.base import FINISHED, Integrator, Outcome
 from sympflow.integrators.interpolants import Piecewise, hermite
 from sympflow.integrators.tableaux import ADAPTIVE as TORCHDIFFEQ_ADAPTIVE
+from sympflow.kernels.explicit_loops import compiled_field
 
 OSCILLATOR, HH = systems.harmonic_oscillator(), systems.henon_heiles()
 ADAPTIVE = ["rk45", "dop853", *TORCHDIFFEQ_ADAPTIVE]
@@ -97,7 +98,8 @@ def test_the_results_are_scipys(method):
     """Times, states, statuses and outputs of `solve_ivp` itself, with all attributes at once."""
     events = [event(zero_q, direction=1), event(lambda t, y: y[1], terminal=3), event(lambda t, y: y[0] - 0.1)]
     for t_span in ((0, 30), (0, -30)):
-        theirs = solve_ivp(HH, t_span, HH.y0, method=method.upper(), events=events, dense_output=True)
+        field = compiled_field(HH)
+        theirs = solve_ivp(field, t_span, HH.y0, method=method.upper(), events=events, dense_output=True)
         ours = solve(HH, method, t_span, events=events, dense_output=True)
         assert (ours.status, ours.message) == (theirs.status, theirs.message)
         np.testing.assert_allclose(ours.t, theirs.t, rtol=8 * EPS)

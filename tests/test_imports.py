@@ -23,13 +23,29 @@ def test_systems_need_sympy_only():
 
 
 @pytest.mark.parametrize("backend", ["array", "auto"])
-def test_a_verlet_solve_loads_no_torch(backend):
+def test_a_verlet_solve_loads_sympy_only(backend):
     code = (
         "import sympflow\n"
         f"sol = sympflow.solve(sympflow.systems.henon_heiles(), 'verlet', (0, 1), backend={backend!r})\n"
         "sol.energy(); sympflow.available()"
     )
-    assert not loaded_after(code) & {"torch", "matplotlib", "torchdiffeq", "safetensors"}
+    assert loaded_after(code) == {"sympy"}
+
+
+@pytest.mark.parametrize("scene", ["henon_heiles", "harmonic_oscillator"])
+def test_runs_of_primed_flows_and_networks_load_no_numba(scene):
+    code = f"import sympflow\nsympflow.solve(sympflow.systems.{scene}(), 'sympflow', (0, 10))"
+    assert "numba" not in loaded_after(code)
+
+
+@pytest.mark.parametrize("scene", ["henon_heiles", "pendulum", "fput_beta", "driven_pendulum", "harmonic_oscillator"])
+def test_a_flow_that_ships_loads_no_torch(scene):
+    code = (
+        "import sympflow\n"
+        f"sol = sympflow.solve(sympflow.systems.{scene}(), 'sympflow', (0, 10))\n"
+        "assert sol.success and sol.stats['backend'] == 'compiled'"
+    )
+    assert "torch" not in loaded_after(code)
 
 
 def test_scipy_methods_load_no_torch():

@@ -13,7 +13,7 @@ from sympflow.commands import completion
 from sympflow.commands.console import Quiet, in_options, out, print_table, ready_file, reporting, show, write_solution
 from sympflow.commands.words import (
     Backend,
-    Method,
+    OneMethod,
     Own,
     State,
     Step,
@@ -31,12 +31,12 @@ def solve(
     ctx: typer.Context,
     system: Systems = None,
     own: Own = None,
-    method_name: Method = "sympflow",
+    method_name: OneMethod = None,
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
     tol: Annotated[
-        float | None, typer.Option(help="Take the cheapest shipped flow with so small a relative energy error.")
+        float | None, typer.Option(help="Choose the step, or the shipped flow, for this relative energy error.")
     ] = None,
     n_outputs: Annotated[
         int | None, typer.Option(help="Number of equal intervals between outputs. Default: every step.")
@@ -70,6 +70,8 @@ def solve(
 
       sympflow solve pendulum --method rk45:rtol=1e-8 --y0 1.5,0
 
+      sympflow solve "p**2/2 + q**4/4" --y0 1,0 --tol 1e-9
+
       sympflow solve own.py:spring --stiffness 4 --method kahan_li8
 
       sympflow solve --system quartic.toml --method gauss_legendre6 --out orbit.csv
@@ -83,7 +85,7 @@ def solve(
         if to is not None and to.suffix not in (".csv", ".npz"):
             raise ValueError(f"`--out` must end in .csv or .npz; got {str(to)!r}.")
         scene = one_scene(system, own)
-        chosen = configured(method_name)
+        chosen = None if method_name is None else configured(method_name)
         span = interval(scene, t_end)
         times = None if n_outputs is None else _instants(*span, n_outputs)
         if to is not None:

@@ -16,6 +16,7 @@ import typer
 
 from sympflow.arguments import check_t_span
 from sympflow.commands import completion
+from sympflow.hamiltonian.expression import FUNCTIONS
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.systems import SYSTEMS, harmonic_oscillator
@@ -59,6 +60,15 @@ Method = Annotated[
     typer.Option(
         "--method",
         help="A name, name:option=value, or a .safetensors file.",
+        autocompletion=completion.one_method,
+    ),
+]
+OneMethod = Annotated[
+    str | None,
+    typer.Option(
+        "--method",
+        "--methods",
+        help="A name, name:option=value, or a .safetensors file. Default: one that suits the system.",
         autocompletion=completion.one_method,
     ),
 ]
@@ -238,12 +248,34 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     return names, shared
 
 
+FORMULA = re.compile(r"\*|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
+"""A word that is H, and not the name of a scene."""
+
+
+def _formula(text: str) -> Callable[..., HamiltonianSystem]:
+    """The function that makes a system of H as text, by the values of its other symbols."""
+    known = {*FUNCTIONS, "pi"}
+    words = dict.fromkeys(w for w in re.findall(r"[A-Za-z_]\w*", text) if w not in known)
+
+    def make(**values: float) -> HamiltonianSystem:
+        if missing := [f"--{name}" for name in names if name not in values]:
+            raise Usage(f"`{missing[0]}` is missing, the value of a symbol in {text!r}: give it, as in {missing[0]} 1.")
+        return HamiltonianSystem.from_sympy(text, params=values)
+
+    names = [word for word in words if not re.fullmatch(r"[qp]\d*", word)]
+    given = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=float) for name in names]
+    make.__signature__ = inspect.Signature(given)  # type: ignore[attr-defined]
+    return make
+
+
 def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]]:
     """The name of a scene, the function that makes it, and its parameters, of a word such as ``pendulum:t_end=5``."""
     if match := FILE.fullmatch(word):
         path, rest = Path(match["path"]), (match["rest"] or "").split(":")
         name = rest.pop(0) if rest[0] and "=" not in rest[0] else None
         return "-".join(filter(None, (path.stem, name))), file_factory(path, name), [pair for pair in rest if pair]
+    if FORMULA.search(word):
+        return "formula", _formula(word), []
     name, *pairs = word.split(":")
     name = name.replace("_", "-")
     if name not in scene_names():

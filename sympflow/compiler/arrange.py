@@ -9,6 +9,7 @@ trajectory and the lanes of registers, so that their bits agree.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -19,7 +20,9 @@ from sympflow.compiler.program import Program, Recording, Traced
 __all__ = ["Arranged", "Arrangement"]
 
 MOST_TERMS = 64  # of a product that is multiplied out
-MOST_TRIED = 12  # terms of a polynomial for which all ways to nest it are compared
+MOST_TRIED = 10  # terms of a polynomial for which all ways to nest it are compared
+MOST_RICH = 5  # terms for which products are tried that only letters share
+MOST_SEARCHED = 1000  # polynomials, and parts of these, for which they are
 
 Monomial = tuple[tuple[int, int], ...]
 """Letters, by their order in the recording, with their exponents; sorted."""
@@ -101,6 +104,8 @@ class Arrangement:
         self._entries: dict[int, Traced] = {}
         self._from_table: list[Traced] = []
         self._plans: dict[Any, Plan] = {}
+        self._powers: dict[int, tuple[int, int]] = {}
+        self._searched = 0
         self._states: list[Traced] = []
         for name, ready in states:
             node = self._body.input(name)
@@ -145,7 +150,56 @@ class Arrangement:
                 return self._product(args[0], self.number_of(1.0 / constants[1]))
             if constants[0] is None or constants[0] != 1.0:
                 return self._product(args[0], self.apply("div", [self.number(1.0), args[1]]))
-        return self.letter(self.operation(name, *[self.written(x) for x in args]))
+            if (inverse := self._inverse(args[1])) is not None:
+                return inverse
+        node = self.operation(name, *[self.written(x) for x in args])
+        if name in ("sqrt", "div") and isinstance(node, Traced) and isinstance(base := node.args[-1], Traced):
+            self._nodes[base.order] = base
+            self._powers |= {base.order: (base.order, 2), node.order: (base.order, 1 if name == "sqrt" else -2)}
+        return self.letter(node)
+
+    def _inverse(self, x: Polynomial) -> Polynomial | None:
+        """1/x where x is a product of roots and reciprocals: the same of other powers."""
+        if len(x.terms) != 1:
+            return None
+        ((m, c),) = x.terms.items()
+        if not all(y in self._powers and self._powers[y][1] != 2 for y, _ in m):
+            return None
+        halves = {self._powers[y][0]: 0 for y, _ in m}
+        for y, e in m:
+            base, power = self._powers[y]
+            halves[base] -= power * e
+        return Polynomial(self, {self._of_halves(halves): 1.0 if c == 1.0 else 1.0 / c})
+
+    def _reduced(self, m: Monomial) -> Monomial:
+        """A product of letters in which a base, its root and its reciprocal do not cancel."""
+        known = [(y, e) for y, e in m if y in self._powers]
+        bases = [self._powers[y][0] for y, _ in known]
+        if len(set(bases)) == len(bases) and not any(self._powers[y][1] == 1 and e > 1 for y, e in known):
+            return m
+        halves = dict.fromkeys(bases, 0)
+        for y, e in known:
+            base, power = self._powers[y]
+            halves[base] += power * e
+        return tuple(sorted([*((y, e) for y, e in m if y not in self._powers), *self._of_halves(halves)]))
+
+    def _of_halves(self, halves: dict[int, int]) -> Monomial:
+        """The product of bases to these powers, in halves: of the base, its root and its reciprocal."""
+        made: list[tuple[int, int]] = []
+        for base, n in halves.items():
+            whole, root = (n // 2, n % 2)
+            if root:
+                made.append((self._made("sqrt", base), 1))
+            if whole:
+                made.append((base, whole) if whole > 0 else (self._made("div", base), -whole))
+        return tuple(sorted(made))
+
+    def _made(self, name: str, base: int) -> int:
+        """The letter of the root or the reciprocal of a base."""
+        args = [self._nodes[base]] if name == "sqrt" else [1.0, self._nodes[base]]
+        node = self.operation(name, *args)
+        self._nodes[node.order], self._powers[node.order] = node, (base, 1 if name == "sqrt" else -2)
+        return node.order
 
     def number_of(self, coefficient: Any) -> Polynomial:
         return Polynomial(self, {(): coefficient})
@@ -166,7 +220,7 @@ class Arrangement:
         terms: Terms = {}
         for m, c in a.terms.items():
             for n, d in b.terms.items():
-                key = _times(m, n)
+                key = self._reduced(_times(m, n))
                 total = terms.get(key, 0.0) + c * d
                 terms[key] = total
         return Polynomial(self, {m: c for m, c in terms.items() if not (isinstance(c, float) and c == 0)})
@@ -177,7 +231,7 @@ class Arrangement:
         if len(a.terms) > 1:
             a = self.letter(self.written(a))
         ((m, c),) = a.terms.items()
-        return Polynomial(self, {tuple((x, int(e * n)) for x, e in m): 1.0 if c == 1.0 else c**n})
+        return Polynomial(self, {self._reduced(tuple((x, int(e * n)) for x, e in m)): 1.0 if c == 1.0 else c**n})
 
     # the body -----------------------------------------------------------------------------------------------------
 
@@ -261,12 +315,21 @@ class Arrangement:
         if len(terms) == 1:
             ((m, c),) = terms.items()
             return self._one(m, c)
-        few = len(terms) <= MOST_TRIED
+        few = len(terms) <= MOST_TRIED and self._searched < MOST_SEARCHED
+        self._searched += few
         plans = (plan for m in self._factors(terms, few) for plan in self._nested(terms, m))
         return min(plans, key=lambda plan: plan.cost if few else plan.cost[::-1])
 
     def _factors(self, terms: Terms, few: bool) -> list[Monomial]:
-        """Products of letters to take out."""
+        """Products of letters to take out: those that terms share, and the last known of a term that shares none."""
+        single = _powers_of_one(terms)
+        if single is not None:
+            x, powers = single
+            step = math.gcd(*powers)
+            if powers[0] > 0 or step == powers[-1]:
+                return [((x, powers[0] or step),)]
+            doubled: list[Monomial] = [((x, step * 2**k),) for k in range((powers[-1] // step).bit_length())]
+            return doubled if few else doubled[-1:]
         counts: dict[Monomial, int] = {}
         for m in terms:
             for i, (x, e) in enumerate(m):
@@ -276,7 +339,11 @@ class Arrangement:
                     for y, _ in m[i + 1 :]:
                         counts[(x, 1), (y, 1)] = counts.get(((x, 1), (y, 1)), 0) + 1
         if few:
-            return list(counts)
+            rich = len(terms) <= MOST_RICH
+            shared = [m for m, n in counts.items() if n > 1 or (rich and all(counts[(x, 1),] > 1 for x, _ in m))]
+            alone = [m for m in terms if m and not any(_divides(factor, m) for factor in shared)]
+            last = max(((self._known[x], x) for m in alone for x, _ in m), default=None)
+            return shared if last is None else [*shared, ((last[1], 1),)]
         return sorted((m for m in counts if m[0][1] == 1), key=lambda m: -counts[m])[:1]
 
     def _nested(self, terms: Terms, factor: Monomial) -> Iterator[Plan]:
@@ -284,6 +351,8 @@ class Arrangement:
         inside = {_without(m, factor): c for m, c in terms.items() if _divides(factor, m)}
         outside = {m: c for m, c in terms.items() if not _divides(factor, m)}
         x, A, B = self._one(factor, 1.0), self._plan(inside), self._plan(outside)
+        if len(factor) == 1 and factor[0][1] > 2:  # powers of a polynomial in one letter, which others share
+            x = x._replace(operations=0)
         both, operations = max(x.depth, A.depth), x.operations + A.operations + B.operations
 
         def product() -> Any:
@@ -343,6 +412,14 @@ def _times(m: Monomial, n: Monomial) -> Monomial:
     for x, e in n:
         powers[x] = powers.get(x, 0) + e
     return tuple(sorted(powers.items()))
+
+
+def _powers_of_one(terms: Terms) -> tuple[int, list[int]] | None:
+    """The letter of a polynomial in one, and its powers in order; None where there are more letters."""
+    letters = {x for m in terms for x, _ in m}
+    if len(letters) != 1:
+        return None
+    return letters.pop(), sorted(m[0][1] if m else 0 for m in terms)
 
 
 def _divides(factor: Monomial, m: Monomial) -> bool:

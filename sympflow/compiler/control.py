@@ -8,13 +8,13 @@ reassociates or fuses: a scalar and every lane of a register get the same operat
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from sympflow.compiler.numbers import Number
 
-__all__ = ["BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Type", "Value", "Variable"]
+__all__ = ["BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Rows", "Type", "Value", "Variable"]
 
 
 class Type(NamedTuple):
@@ -109,6 +109,32 @@ class Variable:
         self._code.store(x, self._place)
 
 
+class Rows:
+    """Memory as numbers of one type, one after the other."""
+
+    __slots__ = ("code", "place", "type")
+
+    def __init__(self, place: Value, type: Type) -> None:
+        self.code, self.place, self.type = place.code, place, type
+
+    def __getitem__(self, i: Any) -> Value:
+        return self.code.load(self.place, i * self.type.width, self.type)
+
+    def __setitem__(self, i: Any, x: Any) -> None:
+        self.code.store(self.code.operand(x, self.type), self.place, i * self.type.width)
+
+    def add(self, i: Any, *products: tuple[Value, Value]) -> None:
+        """Add products to number i."""
+        total = self[i]
+        for x, y in products:
+            total = self.code.fma(x, y, total)
+        self[i] = total
+
+    def part(self, i: Any) -> Rows:
+        """The numbers from i on."""
+        return Rows(self.code.at(self.place, i * self.type.width, self.type.scalar), self.type)
+
+
 class Module:
     """The functions of one piece of machine code, and what they need.
 
@@ -164,6 +190,10 @@ def literal(x: float, type: Type) -> str:
     else:
         text = str(int(x))
     return text if type.width == 1 else f"splat ({type.scalar} {text})"
+
+
+def _vector(scalar: str, numbers: Iterable[int]) -> str:
+    return f"<{', '.join(f'{scalar} {x}' for x in numbers)}>"
 
 
 _PLAIN = {"add": "fadd", "sub": "fsub", "mul": "fmul", "times": "fmul", "div": "fdiv"}
@@ -232,6 +262,16 @@ class Code:
         given = ", ".join(f"{a.type} {a.name}" for a in args)
         return self._new(result, f"call {result or 'void'} @{name}({given})")
 
+    def call_address(self, address: Value, args: Sequence[Value], result: Type | None = None) -> Value:
+        """Write a call of a function at an address."""
+        given = ", ".join(f"{a.type} {a.name}" for a in args)
+        return self._new(result, f"call {result or 'void'} {address.name}({given})")
+
+    def call_at(self, address: Value, args: Sequence[Value], result: Type | None = None) -> Value:
+        """Write a call of a function at an address."""
+        given = ", ".join(f"{a.type} {a.name}" for a in args)
+        return self._new(result, f"call {result or 'void'} {address.name}({given})")
+
     def outlined(
         self,
         name: str,
@@ -268,14 +308,17 @@ class Code:
     def unpack(self, packed: Value, types: Sequence[Type]) -> list[Value]:
         return [self._new(t, f"extractvalue {packed.type} {packed.name}, {i}") for i, t in enumerate(types)]
 
+    def lane(self, x: Value, k: int) -> Value:
+        """The number in one lane."""
+        return self._new(Type(x.type.scalar), f"extractelement {x.type} {x.name}, i64 {k}")
+
     def lanes(self, function: Callable[..., Value], args: Sequence[Value], result: Type) -> Value:
         """Call a function of scalars with one lane after the other."""
         if result.width == 1:
             return function(*args)
         total = Value(self, result, "poison")
         for k in range(result.width):
-            lane = [self._new(Type(a.type.scalar), f"extractelement {a.type} {a.name}, i64 {k}") for a in args]
-            y = function(*lane)
+            y = function(*(self.lane(a, k) for a in args))
             total = self._new(result, f"insertelement {result} {total.name}, {y.type} {y.name}, i64 {k}")
         return total
 
@@ -339,6 +382,25 @@ class Code:
         first = self._new(type, f"insertelement {type} poison, {x.type} {x.name}, i64 0")
         return self._new(type, f"shufflevector {type} {first.name}, {type} poison, <{width} x i32> zeroinitializer")
 
+    def lane_numbers(self, width: int) -> Value:
+        """0, 1, … in the lanes."""
+        return Value(self, INT, "0") if width == 1 else Value(self, Type("i64", width), _vector("i64", range(width)))
+
+    def total(self, x: Value) -> Value:
+        """The sum of all lanes, halves added to halves."""
+        while x.type.width > 2:
+            half = Type(x.type.scalar, x.type.width // 2)
+            n, rest = half.width, f"{x.type} poison"
+            low, high = (
+                self._new(half, f"shufflevector {x.type} {x.name}, {rest}, <{n} x i32> {_vector('i32', lanes)}")
+                for lanes in (range(n), range(n, 2 * n))
+            )
+            x = low + high
+        if x.type.width == 1:
+            return x
+        first, last = (self._new(Type(x.type.scalar), f"extractelement {x.type} {x.name}, i64 {k}") for k in (0, 1))
+        return first + last
+
     def any(self, condition: Value) -> Value:
         """True if a condition holds in any lane."""
         if condition.type.width == 1:
@@ -357,12 +419,21 @@ class Code:
     def load(self, pointer: Value, index: Any = 0, type: Type = DOUBLE, shared: bool = False) -> Value:
         """The value at an index of an array of scalars, aligned as these are; `shared` if another thread changes it."""
         place = self.at(pointer, index, type.scalar)
-        kind = "load volatile" if shared else "load"
-        return self._new(type, f"{kind} {type}, ptr {place.name}, align {_SIZES[type.scalar]}")
+        kind, order = ("load atomic volatile", " seq_cst") if shared else ("load", "")
+        return self._new(type, f"{kind} {type}, ptr {place.name}{order}, align {_SIZES[type.scalar]}")
 
     def store(self, x: Value, pointer: Value, index: Any = 0) -> None:
         place = self.at(pointer, index, x.type.scalar)
         self._lines.append(f"  store {x.type} {x.name}, ptr {place.name}, align {_SIZES[x.type.scalar]}")
+
+    def added(self, x: Value, pointer: Value, index: Any = 0) -> Value:
+        """Add to a whole number that several threads change, and return it as it was."""
+        place = self.at(pointer, index, x.type.scalar)
+        return self._new(x.type, f"atomicrmw add ptr {place.name}, {x.type} {x.name} seq_cst")
+
+    def address(self, x: Value) -> Value:
+        """A whole number as the address of memory, which others may read and write too."""
+        return self._new(POINTER, f"inttoptr i64 {x.name} to ptr")
 
     def memory(self, count: int, type: Type = DOUBLE) -> Value:
         """Room for so many values on the stack, aligned to 64 bytes."""
@@ -370,6 +441,12 @@ class Code:
         name = f"%m{self._count}"
         self._entry.append(f"  {name} = alloca [{count} x {type}], align 64")
         return Value(self, POINTER, name)
+
+    def array(self, name: str, values: Iterable[Any], type: Type = DOUBLE) -> Value:
+        """The address of numbers that stand in the module, under a name of it."""
+        numbers = [f"{type} {literal(x, type)}" for x in values]
+        self.module.declare(name, f'@"{name}" = internal constant [{len(numbers)} x {type}] [{", ".join(numbers)}]')
+        return Value(self, POINTER, f'@"{name}"')
 
     def variable(self, x: Value) -> Variable:
         """A variable with this value; the machine keeps it in a register."""
@@ -380,6 +457,7 @@ class Code:
     @contextmanager
     def over(self, count: Any) -> Iterator[Value]:
         """Execute what is written inside for k = 0 … count − 1, none if the count is not positive."""
+        count = self.operand(count, INT)
         k = self.variable(self.constant(0, INT))
         with self.during(lambda: k.value < count):
             yield k.value
@@ -510,4 +588,4 @@ class Code:
         self._lines.append(f"  br label %{label}")
 
 
-_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1}
+_SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1, "ptr": 8}

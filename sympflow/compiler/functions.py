@@ -127,7 +127,7 @@ FUNCTIONS: dict[str, Function] = {
     "neg": Function(np.negative, "neg", lambda y, a: (-1.0,), 1),
     "fma": Function(_multiply_add, _multiply_add, lambda y, a, b, c: (b, a, 1.0), 4),
     "pow": Function(np.power, "pow", _power_rule, 120, "**"),
-    "sqrt": Function(np.sqrt, "sqrt", lambda y, x: (0.5 / y,), 20),
+    "sqrt": Function(np.sqrt, "sqrt", lambda y, x: (0.5 * y * (1.0 / x),), 20),
     "abs": Function(np.abs, "abs", lambda y, x: (apply("sign", x),), 1),
     "sign": Function(np.sign, _sign, lambda y, x: (0.0,), 4),
     "min": Function(np.minimum, "minimum", _chosen(-1.0), 3),

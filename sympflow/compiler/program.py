@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.numbers import Number
 
-__all__ = ["Program", "Traced", "derivatives", "gradient", "tangent", "traced"]
+__all__ = ["Program", "Traced", "derivatives", "fused", "gradient", "tangent", "traced"]
 
 
 class Traced(Number):
@@ -96,6 +97,9 @@ def _product(a: Any, b: Any) -> Any:
                 return -y
             if isinstance(y, Traced) and y.name == "neg":
                 return -x * y.args[0]
+            factor = y.args[0] if isinstance(y, Traced) and y.name == "mul" else None
+            if isinstance(factor, float) and (_halves(x) or _halves(factor)):  # exact
+                return (x * factor) * y.args[1]
         if isinstance(x, Traced) and x.name == "neg":
             return -(x.args[0] * y)
     return None
@@ -103,7 +107,7 @@ def _product(a: Any, b: Any) -> Any:
 
 def _quotient(a: Any, b: Any) -> Any:
     if isinstance(b, float) and b != 0:
-        return a * (1.0 / b) if math.frexp(b)[0] in (0.5, -0.5) else None  # exact
+        return a * (1.0 / b) if _halves(b) else None  # exact
     return 0.0 if _is(a, 0.0) else None
 
 
@@ -120,9 +124,9 @@ def _power(x: Any, n: Any) -> Any:
         return 1.0 / x
     if n == 0.5:
         return apply("sqrt", x)
-    if n % 1 == 0.5 and abs(n) <= MOST_ROOTS:  # of the root or its reciprocal, which other powers share
+    if n % 1 == 0.5 and abs(n) <= MOST_ROOTS:  # of the root, and of the reciprocal, which need not wait for it
         root = apply("sqrt", x)
-        return (root if n > 0 else 1.0 / root) ** abs(2 * n)
+        return root ** (2 * n) if n > 0 else root * (1.0 / x) ** (0.5 - n)
     return (1.0 / x) ** -n if n < 0 and n % 1 == 0 else None
 
 
@@ -149,6 +153,11 @@ _SIMPLER: dict[str, Callable[..., Any]] = {
     "fma": _fused,
     "where": _choice,
 }
+
+
+def _halves(x: float) -> bool:
+    """True of a power of two, with which products are exact."""
+    return math.frexp(x)[0] in (0.5, -0.5)
 
 
 def _is(x: Any, value: float) -> bool:
@@ -201,6 +210,33 @@ def _written(x: Traced) -> str:
     args = [repr(a) for a in x.args]
     infix = FUNCTIONS[x.name].infix
     return f"{args[0]} {infix} {args[1]}" if infix else f"{x.name}({', '.join(args)})"
+
+
+def fused(program: Program) -> Program:
+    """Return the program with products that are used once joined to the sums that use them, in the same recording."""
+    used = Counter(a.order for x in program.operations for a in x.args if isinstance(a, Traced))
+    used.update(x.order for x in program.outputs if isinstance(x, Traced))
+    of: dict[int, Any] = {x.order: x for x in program.inputs}
+
+    def new(x: Any) -> Any:
+        return of[x.order] if isinstance(x, Traced) else x
+
+    def is_product(x: Any) -> bool:
+        return isinstance(x, Traced) and x.name in ("mul", "times") and used[x.order] == 1
+
+    for x in program.operations:
+        a, b, *_ = (*x.args, None)
+        if x.name == "add" and (is_product(a) or is_product(b)):
+            product, rest = (a, b) if is_product(a) else (b, a)
+            of[x.order] = apply("fma", *map(new, product.args), new(rest))
+        elif x.name == "sub" and is_product(a):
+            of[x.order] = apply("fma", *map(new, a.args), -new(b))
+        elif x.name == "sub" and is_product(b):
+            first, second = map(new, b.args)
+            of[x.order] = apply("fma", -first, second, new(a))
+        else:
+            of[x.order] = apply(x.name, *map(new, x.args))
+    return Program(program.inputs, [new(x) for x in program.outputs])
 
 
 def traced(function: Callable[..., Sequence[Any]], *names: str) -> Program:

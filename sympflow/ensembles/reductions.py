@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.ensembles.chunks import Chunk
+from sympflow.hamiltonian.scales import known_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.solution import known_scale
 
 Fields = dict[str, tuple[tuple[int, ...], np.dtype]]
 """Names of what is kept of each orbit, with the shape of one orbit and the dtype."""

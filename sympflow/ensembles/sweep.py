@@ -24,8 +24,10 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import build, check_applies
-from sympflow.kernels.modules import at_most, compiling_alone
+from sympflow.kernels.modules import compiling_alone
+from sympflow.kernels.threads import at_most
 from sympflow.solver import check_backend, check_own_parameters
+from sympflow.systems.given import given_system
 from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
 
 if TYPE_CHECKING:
@@ -131,8 +133,7 @@ def ensemble(
     >>> result.final.shape
     (100, 4)
     """
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    system = given_system(system)
     integrator = build(method, options)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)

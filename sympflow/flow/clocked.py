@@ -19,11 +19,11 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arrays import to_numpy
-from sympflow.flow.files import MAX_DEGREE, Refused, checked_integer
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, Binding, PrimedPotential
+from sympflow.flow.records import MAX_DEGREE, Refused, checked_integer
 from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.fingerprint import check_for_flows

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor, nn
 
 from sympflow.arrays import to_numpy
 from sympflow.flow.potentials import Time
+from sympflow.flow.tables import free_numbers
 
 
 class FreeTable(nn.Module):
@@ -53,18 +53,7 @@ class FreeTable(nn.Module):
         present: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
-        representative = np.minimum(np.arange(n), np.arange(n)[::-1]) if palindromic else np.arange(n)
-        count = np.bincount(representative)
-        last = len(count) - 1
-        kept = range(n) if present is None else present
-        self._free = [(i, k) for i in range(last + 1) if i in kept for k in range(terms) if i != last or k >= bound]
-        basis, offset = np.zeros((n, terms, len(self._free))), np.zeros((n, terms))
-        for column, (i, k) in enumerate(self._free):
-            basis[representative == i, k, column] = 1.0
-            if k < bound:
-                basis[representative == last, k, column] = -count[i] / count[last]
-        if total is not None:
-            offset[representative == last, 0] = total / count[last]
+        self._free, basis, offset = free_numbers(n, terms, palindromic, bound, total, present)
         like: dict[str, Any] = {"dtype": dtype, "device": device}
         self.register_buffer("basis", torch.as_tensor(basis, **like), persistent=False)
         self.register_buffer("offset", torch.as_tensor(offset, **like), persistent=False)
@@ -74,6 +63,12 @@ class FreeTable(nn.Module):
     def table(self) -> Tensor:
         """All c_ik: (n, K)."""
         return self.offset + self.basis @ self.free
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """All c_ik as an array of float64, the same bits wherever the parameter is."""
+        basis, offset, free = (to_numpy(x).astype(float) for x in (self.basis, self.offset, self.free))
+        return offset + basis @ free
 
     @torch.no_grad()
     def set(self, table: np.ndarray) -> None:
@@ -144,22 +139,6 @@ class Coefficients(FreeTable):
         c = self.offset[i] + self.basis[i] @ self.free
         tau, m = t / self.dt, self.power
         return t ** (m - 1) * sum((m + e) * c_k * tau**e for c_k, e in zip(c, self.exponents, strict=True))
-
-
-@dataclass(frozen=True)
-class Entry:
-    """± t^m c_i(t/Δt): the place of one c_i in a flow, with its sign."""
-
-    column: Coefficients
-    row: int
-    sign: int = 1
-
-    def value(self, t: Time) -> Time:
-        return self.sign * self.column.value(self.row, t)
-
-    def rate(self, t: Time) -> Time:
-        """Its time derivative."""
-        return self.sign * self.column.rate(self.row, t)
 
 
 class Column(FreeTable):

@@ -22,12 +22,13 @@ from torch import Tensor
 
 from sympflow.arguments import floats, plain
 from sympflow.arrays import jvp, per_state
-from sympflow.flow.files import Refused, checked_integer
 from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.known import UNCOMPENSATED
 from sympflow.flow.layers import Layer
 from sympflow.flow.potentials import Time
 from sympflow.flow.primed_potentials import Binding
-from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
+from sympflow.flow.records import Refused, checked_integer
+from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian import collocation
 from sympflow.hamiltonian.fingerprint import check_for_flows

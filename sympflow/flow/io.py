@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 
-from sympflow.flow.files import FORMAT, KEY, load
+from sympflow.flow.files import load
 from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.records import FORMAT, KEY
 from sympflow.flow.shipped import shipped
 
 __all__ = ["FORMAT", "KEY", "load", "save", "shipped"]

@@ -9,9 +9,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
-from sympflow.flow.files import checked_widths
 from sympflow.flow.flow_map import FlowMap, to_values
 from sympflow.flow.potentials import activation_named, count_weights, hidden_widths, outer
+from sympflow.flow.records import checked_widths
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import check_memory, checked_device, checked_dtype

@@ -27,8 +27,8 @@ from sympflow.lazy import announced, distribution, load_announced
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
     from importlib.metadata import EntryPoint
 
-    from sympflow.kernels.network_loops import NetworkLayer
     from sympflow.kernels.network_tangents import TrainedNetwork
+    from sympflow.kernels.networks import NetworkLayer
 
 Time = float | Tensor
 
@@ -231,8 +231,8 @@ def register_activation(
         An elementwise function σ of tensors, C² (a torch.nn.Module for instance), whose derivatives are found by
         forward-mode differentiation; or an `Activation`, which has them in closed form.
     compiled : callable, optional
-        A function of a number a that returns σ(a) and σ'(a), one of Numba or one that Numba compiles. With it flows
-        run compiled, else by array operations.
+        A function of a number a that returns σ(a) and σ'(a), by operators; one with branches or functions of a module
+        is compiled by Numba, or is one of Numba. With it flows run compiled, else by array operations.
 
     Raises
     ------
@@ -518,7 +518,7 @@ class MLPPotential(Potential):
         return K, k, list(self.biases), list(self.weights), w
 
     def network(self, is_kick: bool) -> NetworkLayer:
-        from sympflow.kernels.network_loops import NetworkLayer
+        from sympflow.kernels.networks import NetworkLayer
 
         K, k, b, W, w = self.folded()
 
@@ -530,9 +530,10 @@ class MLPPotential(Potential):
         return NetworkLayer(*first, biases, weights, array(w), self._sigma.compiled)
 
     def trained(self) -> TrainedNetwork | None:
-        from sympflow.kernels.network_tangents import BENDING, TrainedNetwork
+        from sympflow.kernels.activations import SLOPES
+        from sympflow.kernels.network_tangents import TrainedNetwork
 
-        if self.activation not in BENDING or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
+        if self.activation not in SLOPES or self.weight_x.dtype != torch.float64 or self.weight_x.device.type != "cpu":
             return None
         inner = [*self.biases, *self.weights]
         units = [1 / self.scale.expand_as(self.weight_x), 1 / self.tau.expand_as(self.weight_t)]

@@ -14,10 +14,10 @@ of Δt only K is executed, as the χ between two steps cancel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -25,9 +25,9 @@ from torch import Tensor, nn
 
 from sympflow.arguments import check_flag, plain
 from sympflow.arrays import to_numpy
-from sympflow.flow.coefficients import Coefficients, Entry
-from sympflow.flow.files import MAX_DEGREE, MAX_LAYERS, Refused, checked_integer
+from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.frozen import PrimedKnown
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import Time
 from sympflow.flow.primed_potentials import (
@@ -41,396 +41,21 @@ from sympflow.flow.primed_potentials import (
     Sum,
     Term,
 )
+from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Substep, Tables, columns_of, substeps_of
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
-from sympflow.hamiltonian.domain import states_of
 from sympflow.hamiltonian.fingerprint import check_for_flows
-from sympflow.hamiltonian.local_states import DRAWN, LocalStates
-from sympflow.hamiltonian.monomials import MOST_MONOMIALS, Monomials, monomials
+from sympflow.hamiltonian.local_states import LocalStates
+from sympflow.hamiltonian.monomials import Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.schemes import CURVATURE as CURVATURE_LEVEL
-from sympflow.schemes import POLYNOMIAL as POLYNOMIAL_LEVEL
-from sympflow.schemes import SCHEMES, Scheme, compose, scheme_evaluations, scheme_named
+from sympflow.schemes import SCHEMES, Scheme, compose, scheme_named
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
-    from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.kernels.flow_loops import PrimedFlowKernel
-    from sympflow.kernels.stages import StageTable
-
-Kind = Literal["kick", "drift"]
-
-WORSE = 2.0
-"""Times the energy error of a ring that a lattice with ends may have for the numbers of a flow to hold there."""
-MOST_KEPT = 256  # a flow with a processor has five for each step length
+    pass
 
 
-@dataclass(frozen=True)
-class PrimedShape:
-    """The architecture of a primed flow.
-
-    Parameters
-    ----------
-    first : {"kick", "drift"}
-        The map that comes first, in the kernel and in the processor.
-    maps : int
-        How many kicks and drifts the kernel has.
-    degree : int
-        Degree in t of t b(t/Δt) and t a(t/Δt).
-    palindromic, force_gradient : bool
-    processor : int
-        Number C of pairs of χ, 2C + 1 maps; 0 for none.
-    curvature : bool
-        True if kicks with force gradients have curvature terms too, for symbolic systems and lattices.
-    monomials : tuple of tuple of int
-        The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
-    timed : bool
-        True if the drifts of the kernel add up to t at every t, as they must with friction, with an exact e^{−γt},
-        and in a driven system, in which the time moves with them.
-    gradient_kicks : tuple of int, optional
-        The kicks of the kernel, counted from 0, that have force gradients, where others have none.
-    curvature_kicks : tuple of int, optional
-        Those of them that have curvature terms, where others have none.
-
-    Raises
-    ------
-    ValueError
-        If there is no such flow.
-    """
-
-    first: Kind
-    maps: int
-    degree: int
-    palindromic: bool
-    force_gradient: bool
-    processor: int = 0
-    curvature: bool = False
-    monomials: Monomials = ()
-    timed: bool = False
-    gradient_kicks: tuple[int, ...] | None = None
-    curvature_kicks: tuple[int, ...] | None = None
-
-    def __post_init__(self) -> None:
-        maps, degree, processor = self.maps, self.degree, self.processor
-        for name, value, least in (("maps", maps, 1), ("degree", degree, 1), ("processor", processor, 0)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                kind = "positive" if least else "non-negative"
-                remedy = "give 1 or more" if least else "0 is for none"
-                raise ValueError(f"`{name}` must be a {kind} integer; got {value!r}: {remedy}.")
-        if maps < 2 or (self.palindromic and maps % 2 == 0):
-            raise ValueError(f"`maps` must be at least 2, and odd for a palindrome; got {maps}: add a kick or a drift.")
-        if processor and degree < 2:
-            raise ValueError(
-                f"`degree` must be at least 2 with a processor, whose lowest power of t is t²; got {degree}."
-            )
-        if self.curvature and not self.force_gradient:
-            raise ValueError("`curvature` goes with force gradients: leave it out.")
-        if self.monomials and self.force_gradient:
-            raise ValueError("`monomials` stand in place of force gradients: leave these out.")
-        if self.gradient_kicks is not None:
-            self._check_kicks("force_gradient", self.gradient_kicks, self.force_gradient)
-        if self.curvature_kicks is not None:
-            self._check_kicks("curvature", self.curvature_kicks, self.curvature)
-            if self.gradient_kicks is not None and not set(self.curvature_kicks) <= set(self.gradient_kicks):
-                raise ValueError(
-                    f"`curvature` {self.curvature_kicks!r} names kicks without force gradients: name some of "
-                    f"{self.gradient_kicks!r}."
-                )
-
-    def _check_kicks(self, name: str, kicks: tuple[int, ...], has: bool) -> None:
-        n = self.kernel.count("kick")
-        if not kicks or not has or list(kicks) != sorted(set(kicks) & set(range(n))):
-            raise ValueError(
-                f"`{name}` {kicks!r} does not name kicks from 0 to {n - 1}, each once and in order: name some, "
-                "or take True for all, False for none."
-            )
-        if self.palindromic and kicks != tuple(n - 1 - i for i in reversed(kicks)):
-            raise ValueError(
-                f"`{name}` {kicks!r} is not the same from either end of {n} kicks: name their mirror images "
-                "too, or take palindromic=False."
-            )
-
-    @property
-    def kernel(self) -> tuple[Kind, ...]:
-        """The kinds of the maps of K."""
-        return _alternating(self.first, self.maps)
-
-    @property
-    def outer(self) -> tuple[Kind, ...]:
-        """The kinds of the maps of χ."""
-        return _alternating(self.first, 2 * self.processor + 1 if self.processor else 0)
-
-    def columns(self, sequence: Sequence[Kind], dt: float, total: float | None, **like: Any) -> Columns:
-        """Return untrained columns of the numbers of K, whose kicks and drifts have a `total` of 1, or of χ."""
-        if not sequence:
-            return Columns()
-        powers, mirrored = range(0, self.degree, 2 if self.palindromic else 1), self.palindromic and total is not None
-
-        def column(kind: Kind, power: int, total: float | None = None, **more: Any) -> Coefficients:
-            return Coefficients(sequence.count(kind), tuple(powers), dt, power, mirrored, total, **more, **like)
-
-        having, curved = (None, None) if total is None else (self.gradient_kicks, self.curvature_kicks)
-        curved = having if curved is None else curved
-
-        return Columns(
-            column("kick", 1, total),
-            column("drift", 1, total, always=self.timed and total is not None),
-            column("kick", 3, present=having) if self.force_gradient else None,
-            column("kick", 5, present=curved) if self.curvature else None,
-            nn.ModuleList(column("kick", 3) for _ in self.monomials) if self.monomials else None,
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {
-            "first": self.first,
-            "maps": self.maps,
-            "degree": self.degree,
-            "palindromic": self.palindromic,
-            "force_gradient": self.force_gradient,
-            "processor": self.processor,
-            "curvature": self.curvature,
-            **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
-            **({"timed": True} if self.timed else {}),
-            **({} if self.gradient_kicks is None else {"gradient_kicks": list(self.gradient_kicks)}),
-            **({} if self.curvature_kicks is None else {"curvature_kicks": list(self.curvature_kicks)}),
-        }
-
-    @classmethod
-    def from_dict(cls, plan: Any, ndof: int) -> Self:
-        """Return the shape that a file describes, all of which is checked.
-
-        Raises
-        ------
-        Refused, ValueError
-        """
-        if not isinstance(plan, dict) or plan.get("first") not in ("kick", "drift"):
-            raise Refused("its plan of a primed flow is missing")
-        flags: dict[str, Any] = {name: plan.get(name) for name in ("palindromic", "force_gradient")}
-        flags |= {name: plan.get(name, False) for name in ("curvature", "timed")}
-        for name, value in flags.items():
-            if not isinstance(value, bool):
-                raise Refused(f"its {name} is neither true nor false")
-        maps = checked_integer(plan.get("maps"), "number of maps", MAX_LAYERS)
-        degree = checked_integer(plan.get("degree"), "degree", MAX_DEGREE)
-        processor = plan.get("processor", 0)
-        if processor != 0 or isinstance(processor, bool):
-            processor = checked_integer(processor, "processor", MAX_LAYERS)
-        flags |= {name: _checked_kicks(plan.get(name)) for name in ("gradient_kicks", "curvature_kicks")}
-        exponents = _checked_monomials(plan.get("monomials", []), ndof)
-        return cls(plan["first"], maps, degree, processor=processor, monomials=exponents, **flags)
-
-
-def _alternating(first: Kind, n: int) -> tuple[Kind, ...]:
-    """Return the kinds of n maps."""
-    other: Kind = "drift" if first == "kick" else "kick"
-    return tuple(first if i % 2 == 0 else other for i in range(n))
-
-
-def _checked_kicks(plan: Any) -> tuple[int, ...] | None:
-    if plan is None:
-        return None
-    if not isinstance(plan, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in plan):
-        raise Refused("its kicks with force gradients or curvature terms are not a list of integers")
-    return tuple(plan)
-
-
-def _checked_monomials(plan: Any, ndof: int) -> Monomials:
-    if not isinstance(plan, list) or len(plan) > MOST_MONOMIALS:
-        raise Refused(f"its monomials are not a list of at most {MOST_MONOMIALS}")
-    for m in plan:
-        if not isinstance(m, list) or len(m) != ndof:
-            raise Refused(f"its monomials do not have {ndof} exponents each")
-        if not all(isinstance(e, int) and not isinstance(e, bool) and 0 <= e <= MAX_DEGREE for e in m):
-            raise Refused(f"its monomials have exponents that are not integers from 0 to {MAX_DEGREE}")
-    exponents = tuple(tuple(m) for m in plan)
-    if len(set(exponents)) < len(exponents) or (0,) * ndof in exponents:
-        raise Refused("its monomials are not different ones that vary with q")
-    return exponents
-
-
-class Columns(NamedTuple):
-    """The columns of a sequence of maps; all None if it is empty."""
-
-    kicks: Any = None
-    drifts: Any = None
-    gradients: Any = None
-    curvatures: Any = None
-    polynomials: Any = None
-
-
-@dataclass(frozen=True)
-class Substep:
-    """A kick or a drift of the flow: its coefficient, and those of a kick's other terms.
-
-    These are a force gradient and a curvature, or one for each monomial of a polynomial.
-    """
-
-    kind: Kind
-    weight: Entry
-    more: tuple[Entry, ...] = ()
-
-    @property
-    def entries(self) -> tuple[Entry, ...]:
-        return self.weight, *self.more
-
-
-def substeps_of(sequence: Sequence[Kind], columns: Columns, sign: int) -> list[Substep]:
-    """Return the maps of a sequence, with their places in the columns."""
-    kicks, drifts, gradients, curvatures, polynomials = columns
-    more = [c for c in (gradients, curvatures) if c is not None] if polynomials is None else polynomials
-    made = []
-    for i, kind in enumerate(sequence):
-        one, *others = [kicks, *more] if kind == "kick" else [drifts]
-        made.append(Substep(kind, Entry(one, i // 2, sign), tuple(Entry(c, i // 2, sign) for c in others)))
-    return made
-
-
-class Tables:
-    """The numbers of kicks and drifts of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials.
-
-    Parameters
-    ----------
-    substeps : sequence of Substep
-        χ⁻¹, K, χ, with the numbers that they have now.
-    outer : int
-        How many of them χ has.
-    dt : float
-        Δt.
-    monomials
-        Of the polynomials of kicks, where they have them.
-    """
-
-    def __init__(self, substeps: Sequence[Substep], outer: int, dt: float, monomials: Monomials = ()) -> None:
-        last = len(substeps) - outer
-        self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
-        self.dt, self.processed = dt, outer > 0
-        self.kernel: PrimedFlowKernel | None = None  # the compiled loops that were made of these last
-        self.carried: Any = None  # the flow of another shape of a lattice that was made of these last
-        self.monomials = monomials
-        self.level = POLYNOMIAL_LEVEL if monomials else max(len(s.more) for s in substeps)
-        numbers = [c.table for c in columns_of(substeps)]
-        self.placements = {(c.dtype, c.device) for c in numbers}
-        exponents = columns_of(substeps)[0].exponents
-        self._coefficients = {id(c): to_numpy(c.table).astype(float) for c in columns_of(substeps)}
-        self._exponents = np.array(exponents, dtype=float)
-        self._even = exponents[1:2] != (1,)
-        self._kept: dict[Any, Any] = {}
-
-    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return what `make` gives, made once for each key."""
-        if key not in self._kept:
-            if len(self._kept) > MOST_KEPT:
-                self._kept.clear()
-            self._kept[key] = make()
-        return self._kept[key]
-
-    def scheme(self, part: str, t: float | None, back: bool = False) -> Scheme:
-        """The part at t ∈ (0, Δt], the default Δt; `back` its inverse."""
-
-        def make() -> Scheme:
-            return self.scheme(part, t).inverse() if back else self._frozen(part, t)
-
-        return self.kept((part, t, back), make)
-
-    def polynomials(self, back: bool) -> StageTable:
-        """The stages of ψ̄_t or of its inverse for all t, as coefficients of polynomials (m, K).
-
-        Kicks and drifts are divided by t, gradients and polynomials in q by t³, curvatures by t⁵. They multiply the
-        powers 0 … K−1 of `variable`; K is at least 3, by zeros if need be.
-        """
-
-        from sympflow.kernels.stages import StageTable
-
-        def make() -> StageTable:
-            parts, sign = self._parts["primed"], -1 if back else 1
-            substeps = reversed(parts) if back else parts
-            stages = self._stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
-            numbers = np.array(stages, dtype=float)  # (m, columns, K)
-            numbers = np.pad(numbers, ((0, 0), (0, 0), (0, max(0, 3 - numbers.shape[2]))))
-            kicks, gradients, curvatures = (numbers[:, i] for i in range(3))
-            return StageTable(self.level, kicks, numbers[:, -1], gradients, curvatures, numbers[:, 3:-1])
-
-        return self.kept(("polynomials", back), make)
-
-    def variable(self, t: np.ndarray) -> np.ndarray:
-        """t/Δt, or its square where all polynomials are even.
-
-        Raises
-        ------
-        ValueError
-            If a t lies beyond Δt.
-        """
-        tau = t / self.dt
-        if not (tau <= 1 + 1e-12).all():
-            raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t.max():g}.")
-        return tau * tau if self._even else tau
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count forces, force gradients and curvature terms of a run: `FlowMap.evaluations`."""
-
-        def make() -> dict[str, int]:
-            counts = [scheme_evaluations(self.scheme("primed kernel", None), n_steps, n_saved, 0, backend)]
-            if n_extra:
-                counts.append(scheme_evaluations(self.scheme("primed", None), 0, 0, n_extra, backend))
-            if self.processed:  # once at the start, and for each output
-                n = n_saved + (n_steps > 0)
-                counts.append(scheme_evaluations(self.scheme("primed processor", None), 0, 0, n, backend))
-            return {name: sum(count[name] for count in counts) for name in counts[0]}
-
-        return dict(self.kept((n_steps, n_saved, n_extra, backend), make))
-
-    def _frozen(self, part: str, t: float | None) -> Scheme:
-        t = self.dt if t is None else float(t)
-        if not 0 < t <= self.dt * (1 + 1e-12):
-            raise ValueError(
-                f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t!r}: longer times are several steps, of at most dt."
-            )
-        powers = (t / self.dt) ** self._exponents
-        values = {column: table @ powers for column, table in self._coefficients.items()}
-        stages = self._stages((s.kind, _numbers(s, values, 1)) for s in self._parts[part])
-        columns = [tuple(map(float, column)) for column in zip(*stages, strict=True)]
-        kicks, gradients, curvatures, drifts = *columns[:3], columns[-1]
-        source = f"a primed SympFlow, Δt = {self.dt:g}, frozen at t = {t:g}"
-        more: dict[str, Any] = {"curvatures": curvatures} if self.level == CURVATURE_LEVEL else {}
-        if self.monomials:
-            more = {"polynomials": tuple(zip(*columns[3:-1], strict=True)), "monomials": self.monomials}
-        return Scheme(part, None, kicks, drifts, gradients, source, self.level > 0, **more)
-
-    def _stages(self, substeps: Iterable[tuple[Kind, list[Any]]]) -> list[list[Any]]:
-        """[kick, gradient, curvature, polynomial …, drift] of the stages, neighbours of one kind merged."""
-        stages: list[list[Any]] = []
-        before = "drift"
-        width = 3 + len(self.monomials)
-        for kind, numbers in substeps:
-            zero = 0 * numbers[0]
-            if kind == "drift" and stages:
-                stages[-1][-1] = stages[-1][-1] + numbers[0]
-            elif kind == "drift":
-                stages.append([zero] * width + numbers)
-            else:
-                # Polynomials stand in place of force gradients and curvatures.
-                kick = [numbers[0], *([zero] * 2 if self.monomials else []), *numbers[1:]]
-                kick += [zero] * (width - len(kick))
-                if before == "kick" and stages:
-                    stages[-1][:-1] = [one + two for one, two in zip(stages[-1][:-1], kick, strict=True)]
-                else:
-                    stages.append([*kick, zero])
-            before = kind
-        return stages
-
-
-def columns_of(substeps: Sequence[Substep]) -> list[Coefficients]:
-    """Return the distinct columns that the substeps take their numbers from."""
-    entries = [entry for s in substeps for entry in s.entries]
-    return list({id(entry.column): entry.column for entry in entries}.values())
-
-
-def _numbers(s: Substep, values: dict[int, np.ndarray], sign: int) -> list[Any]:
-    """Return the coefficients of a substep, out of those of the columns."""
-    return [sign * e.sign * values[id(e.column)][e.row] for e in s.entries]
-
-
-class PrimedFlow(SympFlow):
+class PrimedFlow(PrimedKnown, SympFlow):
     """A SympFlow of kicks and drifts, in turn, that are primed with V and T; made by `SympFlow.primed`.
 
     A palindromic one has even polynomials b, γ, c, a, and its kernel reads the same backwards, which makes K
@@ -461,8 +86,6 @@ class PrimedFlow(SympFlow):
         The maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
-    takes_friction = takes_driving = True
-
     def __init__(
         self,
         ndof: int,
@@ -475,8 +98,16 @@ class PrimedFlow(SympFlow):
         FlowMap.__init__(self, ndof, dt)
         self.shape = shape
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        inside = shape.columns(shape.kernel, self.dt, 1.0, **like)
-        outside = shape.columns(shape.outer, self.dt, None, **like)
+
+        def column(name: str, n: int, exponents: tuple[int, ...], power: int, *given: Any, **more: Any) -> Coefficients:
+            palindromic, total = given
+            return Coefficients(n, exponents, self.dt, power, palindromic, total, **more, **like)
+
+        def columns(sequence: Sequence[Kind], total: float | None) -> Columns:
+            made = shape.columns(sequence, total, column)
+            return made if made.polynomials is None else made._replace(polynomials=nn.ModuleList(made.polynomials))
+
+        inside, outside = columns(shape.kernel, 1.0), columns(shape.outer, None)
         self.kicks, self.drifts, self.gradients, self.curvatures, self.polynomials = inside
         self.processor_kicks, self.processor_drifts, self.processor_gradients = outside[:3]
         self.processor_curvatures, self.processor_polynomials = outside[3:]
@@ -588,10 +219,6 @@ class PrimedFlow(SympFlow):
         return self.shape.processor
 
     @property
-    def monomials(self) -> Monomials:
-        return self.shape.monomials
-
-    @property
     def dtype(self) -> torch.dtype:
         return self._number().dtype
 
@@ -663,24 +290,12 @@ class PrimedFlow(SympFlow):
                 f"`t` must be a number in (0, dt] = (0, {self.dt:g}]; got {t!r}: leave it out for dt."
             ) from None
 
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
-
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> PrimedFlowKernel:
-        tables = self.tables
-        if tables.kernel is not None and tables.kernel.system is system and not compensated:
-            return tables.kernel
-        from sympflow.kernels.flow_loops import PrimedFlowKernel
-
-        for placement in tables.placements:
+    def check_compilable(self) -> None:
+        for placement in {(column.free.dtype, column.free.device) for _, column in self.columns()}:
             check_compilable(*placement)
-        if compensated:
-            return PrimedFlowKernel(tables, system, compensated=True)
-        tables.kernel = PrimedFlowKernel(tables, system, step=self._step_of_arrays)
-        return tables.kernel
 
     @torch.no_grad()
-    def _step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
+    def step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
         """ψ̄_h of rows y (N, 2d) at times t, for h < 0 the inverse of ψ̄_|h|, each with its own h (N,)."""
         out = self.lift(torch.from_numpy(np.array(y)), torch.from_numpy(np.array(t, dtype=float)))
         for rows, back in ((h > 0, False), (h < 0, True)):
@@ -713,14 +328,6 @@ class PrimedFlow(SympFlow):
     def system(self) -> HamiltonianSystem | None:
         """The system whose V and T the flow uses, None for one loaded without it."""
         return self._binding.system if self._binding.known else None
-
-    def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
-        of_one_size = self.monomials or (self.fingerprint is not None and not self.lattice_terms)
-        return system if of_one_size else system.few_sites
-
-    @property
-    def kept_ndof(self) -> int:
-        return self.ndof if self.system is None else self.known_by(self.system).ndof
 
     def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file the V and T of its system; itself.
@@ -785,56 +392,17 @@ class PrimedFlow(SympFlow):
         return other
 
     def bound(self, system: HamiltonianSystem) -> Self:
-        if not self._binding.known:
-            return self.bind(system)
-        mine, theirs = self._binding.system.local, system.local
-        if mine is theirs or mine is None or theirs is None or _size(mine) == _size(theirs):
-            return self
-        tables = self.tables
-        if tables.carried is None or tables.carried.system is not system:
-            tables.carried = self._carried(system)
-        return tables.carried
+        return self.of_size(system) if self._binding.known else self.bind(system)
 
-    def check_ends(self, system: HamiltonianSystem) -> None:
-        if system.local is None:
-            return
-        ring = self.figures.get("ends_periodic")
-        for end in dict.fromkeys(system.local.ends):
-            error = self.figures.get(f"ends_{end}")
-            if ring is None or error is None or error <= WORSE * ring:
-                continue
-            raise ValueError(
-                f"`system` {system.name!r} has {end} ends, at which bonds are missing and the numbers of this "
-                f"flow hold less: a relative energy error of {error:.1e} was measured on a few sites with such "
-                f"ends, {ring:.1e} on a ring. Fit one by sympflow.train(system)."
-            )
-
-    def _carried(self, system: HamiltonianSystem) -> Self:
+    def carried(self, system: HamiltonianSystem) -> Self:
         """This flow, of another size of its system, with what is known of it."""
         other = self._of(system, self.shape).requires_grad_(False)
-        other.describe(self.description)
-        if isinstance(self.domain, LocalStates):
-            other.domain = self.domain.of(system)
-        elif self.domain is not None:
-            assert self.system is not None
-            other.domain = states_of(self.system, self.domain.sample(DRAWN)).of(system)
+        other.describe(self.description_for(system))
         return other
-
-    @property
-    def driven(self) -> bool:
-        return self._binding.known and not self._binding.system.autonomous
-
-    @property
-    def period(self) -> float | None:
-        return self._binding.system.period if self._binding.known else None
 
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
         return super().initial_velocity(x, t0) if self.system is None else self.system.vector_field(x, t0)
-
-
-def _size(local: LocalHamiltonian) -> tuple[Any, ...]:
-    return local.shape, local.ends, local.ndof
 
 
 def _is_timed(system: HamiltonianSystem) -> bool:

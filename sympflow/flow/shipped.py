@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from sympflow.hamiltonian.fingerprint import Identity, same_system, without_friction
 
 if TYPE_CHECKING:
+    from sympflow.flow.known import KnownFlow
     from sympflow.hamiltonian.system import HamiltonianSystem
 
 DEFAULT_TOL = 1e-6
@@ -131,6 +132,16 @@ class ShippedFlow:
         from sympflow.hamiltonian.time_transformation import time_transformed
 
         return load(self.path, system=time_transformed(system, self.shift))
+
+    def known(self, system: HamiltonianSystem) -> KnownFlow:
+        """The flow of a system for compiled runs: of one of numbers or of networks these, without torch."""
+        if self.shift is not None or self.kind != "sympflow":
+            return self.load(system)
+        from sympflow.flow.frozen import FrozenFlow, FrozenNetwork
+
+        if self.stages is not None:
+            return FrozenFlow.of_file(self.path, system)
+        return FrozenNetwork.of_file(self.path, system) or self.load(system)
 
 
 class ShippedFlows(Sequence[ShippedFlow]):

@@ -21,11 +21,12 @@ from torch import Tensor
 from sympflow.arguments import check_flag, plain
 from sympflow.arrays import jvp, to_numpy
 from sympflow.flow.coefficients import Column
-from sympflow.flow.files import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.known import UNCOMPENSATED
 from sympflow.flow.layers import Layer
 from sympflow.flow.potentials import Time
-from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
+from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
+from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows

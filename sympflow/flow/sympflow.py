@@ -12,14 +12,8 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.flow.families import family
-from sympflow.flow.files import (
-    MAX_LAYERS,
-    MAX_PARAMETERS,
-    Refused,
-    checked_widths,
-    count_parameters,
-)
 from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.known import UNCOMPENSATED
 from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
 from sympflow.flow.potentials import (
     MLPPotential,
@@ -30,6 +24,7 @@ from sympflow.flow.potentials import (
     module_weights,
     potential_named,
 )
+from sympflow.flow.records import MAX_LAYERS, MAX_PARAMETERS, Refused, checked_widths, count_parameters
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import Kept, check_compilable, check_memory
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -37,13 +32,8 @@ from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
-    from sympflow.kernels.network_loops import MLPFlowKernel
     from sympflow.kernels.network_tangents import NetworkTangents
-
-UNCOMPENSATED = (
-    "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
-    "flow of SympFlow.primed."
-)
+    from sympflow.kernels.networks import MLPFlowKernel
 
 
 class SympFlow(FlowMap):
@@ -468,7 +458,7 @@ class SympFlow(FlowMap):
         return self._network.current(self._compiled)
 
     def _compiled(self) -> MLPFlowKernel:
-        from sympflow.kernels.network_loops import MLPFlowKernel
+        from sympflow.kernels.networks import MLPFlowKernel
 
         networks = [layer.network() for layer in self.layers]  # type: ignore[operator]
         check_compilable(self.dtype, self.device)

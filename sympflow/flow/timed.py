@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from sympflow.arguments import plain
-from sympflow.flow.files import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer, checked_widths
-from sympflow.flow.files import count_parameters as parameters_of
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.potentials import MLPPotential, Potential, Time, hidden_widths
+from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer, checked_widths
+from sympflow.flow.records import count_parameters as parameters_of
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow, pairs_of_layers
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
-    from sympflow.kernels.network_loops import NetworkLayer
     from sympflow.kernels.network_tangents import TrainedNetwork
+    from sympflow.kernels.networks import NetworkLayer
 
 
 @dataclass(frozen=True)

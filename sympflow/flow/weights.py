@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Generic, TypeVar
@@ -13,6 +11,7 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import to_numpy
+from sympflow.flow.records import numbers_checksum
 
 T = TypeVar("T")
 
@@ -95,12 +94,7 @@ def check_compilable(dtype: torch.dtype, device: torch.device) -> None:
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:
     """SHA-256 of the tensors by name: their names, dtypes, shapes and little-endian bytes."""
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        array = tensors[name].detach().cpu().numpy()
-        digest.update(json.dumps([name, str(array.dtype), array.shape]).encode())
-        digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
-    return digest.hexdigest()
+    return numbers_checksum({name: value.detach().cpu().numpy() for name, value in tensors.items()})
 
 
 class Contents:

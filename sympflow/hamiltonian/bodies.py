@@ -5,8 +5,9 @@ from __future__ import annotations
 import copy
 import math
 import reprlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, cached_property
+from itertools import combinations
 from typing import Any, Self
 
 import numpy as np
@@ -16,6 +17,7 @@ from sympflow.arguments import check_kept, plain, real_number
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 MOST_AXES = 3
 MOST_NEAR = 300
@@ -32,6 +34,8 @@ FEW = 4, 7, 13
 """Bodies of a piece in one, two and three dimensions."""
 JUDGED = 13
 """Bodies of the cluster on which a flow is judged, where there are more."""
+MOST_WRITTEN = 45
+"""Differences of coordinates of two bodies up to which pairs are written out: six bodies in space."""
 MANY = 8, 19, 38
 """Bodies of a cluster of which long runs are made, in one, two and three dimensions."""
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
@@ -174,7 +178,7 @@ class PairsHamiltonian(LocalHamiltonian):
         other = copy.copy(self)
         other.params = _checked_params({**self.params, **values})
         other.constants = (*other.params.values(), *self.constants[len(self.params) :])
-        for name in ("terms", "bond_length"):
+        for name in ("terms", "bond_length", "written"):
             vars(other).pop(name, None)
         other._check_continuous()
         return other
@@ -183,6 +187,46 @@ class PairsHamiltonian(LocalHamiltonian):
     def work(self) -> int:
         pairs = self.n_bodies * (self.n_bodies - 1) // 2
         return 2 * (pairs if self.cutoff is None else min(pairs, MOST_NEAR * self.n_bodies))
+
+    @property
+    def is_few(self) -> bool:
+        """True of so few bodies that their pairs are written out."""
+        return self.n_bodies * (self.n_bodies - 1) // 2 * self.dim <= MOST_WRITTEN
+
+    @cached_property
+    def written(self) -> SymbolicHamiltonian | None:  # type: ignore[override]
+        if not self.is_few or self.box is not None or self.cutoff is not None:
+            return None
+        q, p = (sp.symbols(f"{name}1:{self.ndof + 1}", real=True) for name in "qp")
+        masses = np.repeat(self.masses, self.dim).tolist()
+        T = sp.Add(*(x**2 / sp.Float(2 * m) for x, m in zip(p, masses, strict=True)))
+        named = {c: sp.Symbol(f"{name}_", real=True) for c, name in zip(self.c, self.params, strict=True)}
+        columns = [[sp.Float(x) for x in column] for column in self.columns.tolist()]
+        V = self.written_potential(q, sp.Float(self.softening**2), columns, named)
+        return SymbolicHamiltonian(T + V, {f"{name}_": value for name, value in self.params.items()})
+
+    def written_potential(
+        self,
+        q: Sequence[sp.Expr],
+        softening: sp.Expr,
+        columns: Sequence[Sequence[sp.Expr]],
+        c: Mapping[sp.Symbol, sp.Expr],
+        box: Sequence[sp.Expr] = (),
+    ) -> sp.Expr:
+        """V of all pairs, in letters of positions, ε², columns of bodies, parameters and the sides of the box."""
+        terms = []
+        for i, j in combinations(range(self.n_bodies), 2):
+            d = [q[self.dim * i + k] - q[self.dim * j + k] for k in range(self.dim)]
+            for k, side in enumerate(box):
+                d[k] -= side * sp.floor(d[k] / side + sp.Rational(1, 2))
+            s = sp.Add(*(x**2 for x in d)) + softening
+            put = {a: column[i] for a, column in zip(self.first, columns, strict=True)}
+            put |= {b: column[j] for b, column in zip(self.second, columns, strict=True)}
+            term = self.V.xreplace({**c, **put}).subs(self.s, s)
+            if self.cutoff is not None:
+                term = sp.Piecewise((term, s < c[self.c[-1]]), (0, True))
+            terms.append(term)
+        return sp.Add(*terms)
 
     # a few of many ----------------------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import ast
+import keyword
 import math
 import re
 import unicodedata
@@ -15,6 +16,8 @@ from collections.abc import Callable, Collection
 from typing import Any
 
 import sympy as sp
+
+from sympflow.hamiltonian.removable import with_sinc
 
 MAX_TEXT = 100_000  # characters
 MAX_NESTING = 100  # brackets and powers in each other
@@ -84,7 +87,7 @@ def read(text: str, names: Collection[str] = ()) -> sp.Expr:
     try:
         tree = ast.parse(_grouped(" ".join(text.replace("^", "**").split())), mode="eval").body
     except (SyntaxError, ValueError) as error:
-        raise Unreadable(getattr(error, "msg", None) or str(error)) from None
+        raise Unreadable(_remedy(text) or getattr(error, "msg", None) or str(error)) from None
     except (RecursionError, MemoryError):
         raise Unreadable("it is nested too deeply") from None
     value, _ = _Reader(_spelled(names)).visit(tree, 0)
@@ -110,6 +113,7 @@ def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
     f = expression.xreplace(
         {s: sp.Symbol(spelled.get(_normal(s.name), s.name), real=True) for s in expression.free_symbols}
     )
+    f = with_sinc(f)
     for extremum in f.atoms(sp.Max, sp.Min):
         _check_compared(type(extremum).__name__, len(extremum.args))
     return f
@@ -149,6 +153,16 @@ def _check_characters(text: str) -> None:
         depth += (character in "([{") - (character in ")]}")
         if depth > MAX_NESTING:
             raise Unreadable(f"it is nested more than {MAX_NESTING} deep")
+
+
+def _remedy(text: str) -> str | None:
+    """What to write in place of a text that is not Python."""
+    if found := re.search(r"(?<![\w.])(\d+\.?\d*)([A-Za-z(]\w*)", text):
+        return f"{found[0]} lacks a sign: write {found[1]}*{found[2]}"
+    if found := re.search(r"[²³⁴½¼√·×÷−π]", text):
+        return f"{found[0]} is not understood: write q**2, sqrt(q), *, /, - and pi"
+    words = [word for word in re.findall(r"[A-Za-z_]\w*", text) if keyword.iskeyword(word)]
+    return f"{words[0]} is a word of Python: choose another name, such as {words[0]}_" if words else None
 
 
 _TOKEN = re.compile(r"\s*(\.?\d[\w.]*(?:(?<=[eE])[+-]\d+)?|[^\W\d]\w*|\*\*|//|<<|>>|[<>=!]=|.)")
@@ -306,6 +320,11 @@ class _Reader:
         if isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in RELATIONS:
             left, right = self.visit(node.left, depth)[0], self.visit(node.comparators[0], depth)[0]
             return RELATIONS[type(node.ops[0])](left, right)
+        if isinstance(node, ast.BinOp | ast.BoolOp) or (isinstance(node, ast.Compare) and len(node.ops) > 1):
+            raise Unreadable(
+                f"the condition {_excerpt(node)} is not a single comparison: order the pieces, as in "
+                "Piecewise((0, q < 0), (q, q < 1), (1, True))"
+            )
         raise Unreadable(f"the condition {_excerpt(node)} is not understood: write it as q > 0 or True")
 
 

@@ -213,9 +213,16 @@ class Hamiltonian:
 
     def with_force(self, force: ExternalForce) -> Self:
         """Return the system with p' = −∂H/∂q − Γp + F(q, p), which its vector field, and no H, holds."""
-        forced = copy.copy(self)
+        forced = self._copied()
         forced.name, forced.external_force = f"{self.name}_forced", force
         return forced
+
+    def _copied(self) -> Self:
+        """A copy without what was found out of the original, which is to be another system."""
+        other = copy.copy(self)
+        for name in [name for name in vars(other) if isinstance(getattr(type(other), name, None), cached_property)]:
+            del vars(other)[name]
+        return other
 
     def as_doubled(self) -> Doubled:
         """Return the system itself if it is a doubled one.
@@ -317,9 +324,7 @@ class Hamiltonian:
         form = self._definition.between_impulses
         if form is self._definition:
             return self
-        between = copy.copy(self)
-        for name in ("fingerprint", "linear_part", "expression"):
-            vars(between).pop(name, None)
+        between = self._copied()
         Hamiltonian.__init__(between, self.name, form, self.inverse_mass, self.quadratic_kinetic)
         between.symbols, between.autonomous = form, not form.timed
         return between
@@ -556,6 +561,11 @@ class Hamiltonian:
     def local(self) -> LocalHamiltonian | None:
         """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         return self._definition if self._definition.loops else None
+
+    @property
+    def written(self) -> SymbolicHamiltonian | None:
+        """The symbolic definition, or that of a few bodies in pairs, written out when it is asked for; else None."""
+        return self.symbols if self.local is None else self.local.written
 
     @cached_property
     def expression(self) -> str | None:

@@ -18,7 +18,7 @@ import sympy as sp
 from sympflow.arrays import Array, is_tensor, library
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
-from sympflow.hamiltonian.symbolic import generate, printable
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
 __all__ = ["LocalHamiltonian", "check_memory", "letters", "parsed"]
 
@@ -55,6 +55,8 @@ class LocalHamiltonian(Definition, ABC):
     shape: tuple[int, ...] = ()
     ends: tuple[str, ...] = ()
     noun: str = "system"
+    written: SymbolicHamiltonian | None = None
+    """H in symbols, of a system so small that it is written out when symbols are asked for."""
     loops: str
     inverse_mass: np.ndarray | None
     quadratic_kinetic: bool

@@ -72,16 +72,18 @@ class ParameterRows:
         ValueError
             If it has none, with its values.
         """
-        values = {name: float(column[row]) for name, column in self._columns.items()}
         try:
-            return self.system.with_params(**values)
+            return self.system.with_params(**{name: float(column[row]) for name, column in self._columns.items()})
         except (ValueError, TypeError) as error:
             where = ", ".join(map(str, np.unravel_index(row, self.shape)))
-            shown = ", ".join(f"{name} = {value:.9g}" for name, value in [*values.items()][:MOST_SHOWN])
             raise ValueError(
-                f"`params` has {shown} (trajectory {where}), for which there is no system: {error} Leave these values "
-                "out."
+                f"`params` has {self.shown(row)} (trajectory {where}), for which there is no system: {error} Leave "
+                "these values out."
             ) from error
+
+    def shown(self, row: int) -> str:
+        """The values of a trajectory, in words."""
+        return ", ".join(f"{name} = {column[row]:.9g}" for name, column in [*self._columns.items()][:MOST_SHOWN])
 
     def distinct(self) -> Iterator[Rows]:
         """The trajectories by their values, each with its own system."""

@@ -14,6 +14,7 @@ import sympy as sp
 __all__ = ["LatticePoles", "Place", "Poles", "SymbolicPoles", "places"]
 
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
+MOST_SHOWN = 100  # characters of terms
 DIGITS, HALVINGS = 50, 100  # of the arithmetic in which H is judged beside such a place, and of the way to it
 BESIDE = 1e-3, 1e-6, 1e-9
 """Distances from a place, in parts of a step, at which H is compared: of a finite one the differences decrease."""
@@ -27,11 +28,48 @@ class Place(NamedTuple):
     cell: sp.Expr
 
 
+class Cancelling(NamedTuple):
+    """Terms f of H in one letter s, of that column, that are infinite at a value of s where their sum is not."""
+
+    f: sp.Expr
+    s: sp.Symbol
+    at: float
+    column: int
+
+    @property
+    def name(self) -> str:
+        """The terms and the place, in words that go before a colon."""
+        text = _written(self.f)
+        return f"at {self.s} = {self.at:.6g}, {text if len(text) < MOST_SHOWN else text[:MOST_SHOWN] + ' …'}"
+
+    def loss(self, distance: float, visited: np.ndarray) -> float:
+        """The error of ∂f/∂s at a distance from the value, beside what it is at values (n,) of s."""
+        double, exact = _slopes(self.f, self.s)
+        x = self.at + np.concatenate([side * distance * np.linspace(0.5, 2.0, 16) for side in (-1, 1)])
+        with np.errstate(all="ignore"), mpmath.workdps(DIGITS):
+            right = [complex(exact(mpmath.mpf(v))) for v in x.tolist()]
+            error = np.abs(np.broadcast_to(double(x), x.shape) - right)
+            size = np.abs(np.broadcast_to(double(visited), visited.shape))
+        return float(np.nanmax(error) / np.nanmedian(size))
+
+
 class Poles(Protocol):
     """The places at which H of a system may be infinite, in columns."""
 
-    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    @property
+    def cancelling(self) -> Sequence[Cancelling]:
+        """Terms of H that cancel where each is infinite."""
+
+    @property
+    def watched(self) -> bool:
+        """False if H has cancelling terms alone."""
+
+    def look(
+        self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Numbers (..., m) that differ on the two sides of a place, H and T: states (..., 2d), times (...).
+
+        Numbers are values of the parameters of a `parametric` form.
 
         Where these cost more than such a number, H is 0, or NaN where it is no number, and T None. Where H has no
         part T there is one of its size.
@@ -61,17 +99,23 @@ class SymbolicPoles:
         parts = [symbols.V, symbols.T] if symbols.separable else [symbols.H]
         self._letters, self._places = letters, [(place, f) for f in parts for place in places(f, letters)]
         self._m = len(self._places)
+        self.cancelling = [c for f in parts for c in cancelling(f, letters)]
         if not self._places:
             return
         T = symbols.T if symbols.separable else sp.Add(*[sp.Abs(s * sp.diff(symbols.H, s)) for s in letters])
-        self._look = symbols.evaluated("cells", [*(place.cell for place, _ in self._places), symbols.H, T])
+        cells = [sp.S.Zero if place.g.is_nonnegative else place.cell for place, _ in self._places]
+        self._look = symbols.evaluated("cells", [*cells, symbols.H, T])
         self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
 
     def __bool__(self) -> bool:
+        return bool(self._places or self.cancelling)
+
+    @property
+    def watched(self) -> bool:
         return bool(self._places)
 
-    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        values = self._look(y, *self._time(y, t))
+    def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        values = self._look(y, *self._time(y, t), numbers=numbers)
         return values[..., : self._m], values[..., -2], values[..., -1]
 
     def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
@@ -124,7 +168,10 @@ class LatticePoles:
         terms = [(lattice.U, lattice.x), *((V, lattice.r) for V in lattice.bonds.values())]
         return any(places(f, x) for f, x in terms)
 
-    def look(self, y: np.ndarray, t: Any) -> tuple[np.ndarray, np.ndarray, None]:
+    cancelling: Sequence[Cancelling] = ()
+    watched = True
+
+    def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         cells = self._columns("cells", _cells, y)
         ending = self._columns("endings", _endings, y)
         return cells, np.where(np.isnan(ending).any(-1), np.nan, 0.0), None
@@ -243,6 +290,21 @@ def places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
 
     An exponent by a parameter counts as negative where it is written so.
     """
+    return tuple(place for place in _places(f, x) if _removable(f, place) is None)
+
+
+def cancelling(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[Cancelling]:
+    """The terms of f that cancel where a letter of x has a value, as those of csch(q) - 1/q at 0."""
+    found = []
+    for place in _places(f, x):
+        if (terms := _removable(f, place)) is not None:
+            (s,) = terms.free_symbols
+            found.append(Cancelling(terms, s, _root(place, s), x.index(s)))
+    return found
+
+
+@lru_cache(maxsize=64)
+def _places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
     found = [g for function in f.atoms(*_SINGULAR) for g in _SINGULAR[function.func](*function.args)]
     for power in f.atoms(sp.Pow):
         if power.exp.could_extract_minus_sign() or (
@@ -250,8 +312,7 @@ def places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
         ):
             found.append(power.base)
     by_cell = {place.cell: place for g in found for place in _split(g, x)}
-    kept = [place for place in by_cell.values() if not _is_removable(f, place)]
-    return tuple(sorted(kept, key=lambda place: sp.default_sort_key(place.cell)))
+    return tuple(sorted(by_cell.values(), key=lambda place: sp.default_sort_key(place.cell)))
 
 
 def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
@@ -321,17 +382,24 @@ def _plain(g: sp.Expr) -> sp.Expr:
     return g.xreplace({a: sp.Float(a, 17) for a in g.atoms(sp.Rational) if not a.is_Integer})
 
 
-def _is_removable(f: sp.Expr, place: Place) -> bool:
-    """Return True if f, of one letter, is finite where a linear g vanishes, as sin(r)/r at 0."""
-    if len(f.free_symbols) != 1 or not isinstance(place.cell, sp.sign):
-        return False
-    (s,) = f.free_symbols
+def _root(place: Place, s: sp.Symbol) -> float:
     g = place.cell.args[0]
-    if not g.is_polynomial(s) or sp.degree(g, s) != 1:
-        return False
-    root = float(-g.subs(s, 0) / sp.diff(g, s))
+    return float(-g.subs(s, 0) / sp.diff(g, s))
+
+
+@lru_cache(maxsize=256)
+def _removable(f: sp.Expr, place: Place) -> sp.Expr | None:
+    """The terms of f in the one letter of a linear g, if their sum is finite where it vanishes, as sin(r)/r at 0."""
+    if not isinstance(place.cell, sp.sign) or len(place.g.free_symbols) != 1:
+        return None
+    (s,) = place.g.free_symbols
+    f = sp.Add(*[term for term in sp.Add.make_args(f) if term.has(s)])
+    g = place.cell.args[0]
+    if f.free_symbols != {s} or not g.is_polynomial(s) or sp.degree(g, s) != 1:
+        return None
+    root = _root(place, s)
     width = abs(root) or 1.0
-    return not infinite_between(f, place.cell, (s,), [root - width], [root + width])
+    return None if infinite_between(f, place.cell, (s,), [root - width], [root + width]) else f
 
 
 def infinite_between(
@@ -368,3 +436,10 @@ def _precise(f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...]) -> tuple
     f = f.replace(lambda e: type(e).__name__ == "sampled", lambda _: sp.S.One)
     function, number = (sp.lambdify(letters, e, "mpmath") for e in (f, cell))
     return function, number
+
+
+@lru_cache(maxsize=64)
+def _slopes(f: sp.Expr, s: sp.Symbol) -> tuple[Any, Any]:
+    """The derivative of f in double precision, and in the arithmetic of mpmath."""
+    slope = sp.diff(f, s).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
+    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", "numpy"], "mpmath"))

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import sympy as sp
 
 from sympflow.compiler.functions import apply, where
+from sympflow.hamiltonian.removable import sinc
 
-__all__ = ["NotRecorded", "can_be_recorded", "evaluator"]
+__all__ = ["NotRecorded", "can_be_recorded", "check_recorded", "evaluator"]
 
 
 class NotRecorded(ValueError):
@@ -30,6 +32,16 @@ def _folded(name: str) -> Callable[..., Any]:
     return function
 
 
+def _sinc(x: Any) -> Any:
+    """sin(x)/x, near 0 by its series, whose derivatives do not cancel there."""
+    near, squared = abs(x) < 1.0, x * x
+    series: Any = 0.0
+    for k in range(10, -1, -1):
+        series = series * squared + (-1.0) ** k / math.factorial(2 * k + 1)
+    far = where(near, 1.0, x)
+    return where(near, series, apply("sin", far) / far)
+
+
 # fmt: off
 _RULES: dict[type, Callable[..., Any]] = {
     sp.exp: lambda x: apply("exp", x), sp.log: lambda x: apply("log", x),
@@ -42,7 +54,7 @@ _RULES: dict[type, Callable[..., Any]] = {
     sp.asinh: lambda x: apply("asinh", x), sp.acosh: lambda x: apply("acosh", x),
     sp.atanh: lambda x: apply("atanh", x), sp.erf: lambda x: apply("erf", x),
     sp.erfc: lambda x: apply("erfc", x), sp.Abs: abs, sp.sign: lambda x: apply("sign", x),
-    sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
+    sp.sinc: _sinc, sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
     sp.Max: _folded("max"), sp.Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
     sp.Not: lambda x: apply("not", x),
     sp.StrictLessThan: lambda x, y: apply("lt", x, y), sp.LessThan: lambda x, y: apply("le", x, y),
@@ -59,8 +71,17 @@ def _heaviside(x: Any, at_zero: Any = 0.5) -> Any:
 def can_be_recorded(f: sp.Expr) -> bool:
     """True if `evaluator` has a rule for every function in an expression."""
     functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
-    known = (sp.Piecewise, sp.Heaviside, sp.logic.boolalg.BooleanAtom)
+    known = (sp.Piecewise, sp.Heaviside, sinc, sp.logic.boolalg.BooleanAtom)
     return all(a.func in _RULES or isinstance(a, known) for a in functions)
+
+
+def check_recorded(f: sp.Expr) -> None:
+    """Raise a ValueError with the term of an expression of which `evaluator` has no rule for a function."""
+    for term in sp.Add.make_args(f):
+        if not can_be_recorded(term):
+            raise ValueError(
+                f"`system` has the term {term}, for which there is no compiled function: use backend='array'."
+            )
 
 
 def evaluator(numbers: Mapping[sp.Symbol, Any]) -> Callable[[sp.Expr], Any]:
@@ -97,6 +118,8 @@ def _value(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
         return apply("pow", value(base), value(exponent))
     if isinstance(f, sp.Piecewise):
         return _piecewise(f, value)
+    if isinstance(f, sinc):
+        return value(f.written_out)
     if isinstance(f, sp.Heaviside):
         return _heaviside(*(value(x) for x in f.args))
     rule = _RULES.get(f.func)

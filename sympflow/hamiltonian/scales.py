@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from contextlib import suppress
+from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from sympflow.hamiltonian.times import probe_times
-
-if TYPE_CHECKING:
-    from sympflow.hamiltonian.system import HamiltonianSystem
 
 STATES = 64
 """States of a domain at which Hessians are taken, where there is no y0."""
@@ -19,17 +17,40 @@ MOST_DENSE = 200
 SLOW = 0.1
 """Radians in a step of the system, the rate where nothing in H gives one."""
 
-_KNOWN: WeakKeyDictionary[HamiltonianSystem, np.ndarray] = WeakKeyDictionary()
+STEP = 0.05
+"""Radians of the fastest motion in a default step."""
+MOST_RATES = 16  # states of a batch at which rates are taken
+
+SMALLEST_SCALE = 1e-12
+"""|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
 
 
-def natural_scale(system: HamiltonianSystem) -> np.ndarray:
+class Scene(Protocol):
+    """The properties of a `HamiltonianSystem` by which its scales are known."""
+
+    ndof: int
+    domain: Any
+    t_span: tuple[float, float]
+    energy_scale: float | None
+
+    @property
+    def dt(self) -> float: ...
+
+    @property
+    def between_impulses(self) -> Any: ...
+
+
+_KNOWN: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
+
+
+def natural_scale(scene: Scene) -> np.ndarray:
     """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω).
 
     s_i⁴ = ∂²H/∂q_i² / ∂²H/∂p_i² at q = p = 0, if both are positive and finite; else s_i² = ω/|∂²H/∂p_i²| at y0, or
     over the domain, ω being `fastest_rate`. Without a y0 and a domain s_i = 1. Of a driven system it is that at
     `t_span[0]`. Large lattices and pairs have the ω of a random direction at y0, and their masses.
     """
-    system = system.between_impulses
+    system = scene.between_impulses
     if system not in _KNOWN:
         with np.errstate(all="ignore"):
             try:
@@ -41,18 +62,26 @@ def natural_scale(system: HamiltonianSystem) -> np.ndarray:
     return _KNOWN[system].copy()
 
 
-def weights(system: HamiltonianSystem) -> np.ndarray:
+def weights(system: Scene) -> np.ndarray:
     """[s, 1/s], (2d,): the factors that make a state [q, p] one of numbers of a size."""
     s = natural_scale(system)
     return np.concatenate([s, 1 / s])
 
 
-def smallest_size(system: HamiltonianSystem, y0: np.ndarray) -> float:
+def distance(system: Scene, change: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Return ‖y − y'‖ of differences of states along an axis, each pᵢ divided by sᵢ²: in units of q."""
+    s = natural_scale(system)
+    shape = [1] * change.ndim
+    shape[axis] = -1
+    return np.linalg.norm(change * np.concatenate([np.ones_like(s), s**-2]).reshape(shape), axis=axis)
+
+
+def smallest_size(scene: Scene, y0: np.ndarray) -> float:
     """A size that neither all q nor all p of an orbit from the states y0 (..., 2d) are less than; never 0.
 
     Of states at 0 it is that of their motion in a step `dt`, 1 where there is none.
     """
-    system = system.between_impulses
+    system = scene.between_impulses
     scale = weights(system)
     size = np.abs(scale * y0).max(initial=0.0)
     if size == 0:
@@ -62,7 +91,7 @@ def smallest_size(system: HamiltonianSystem, y0: np.ndarray) -> float:
     return found if 0 < found < np.inf else 1.0
 
 
-def _of_hessians(system: HamiltonianSystem) -> np.ndarray:
+def _of_hessians(system: Any) -> np.ndarray:
     d, t0 = system.ndof, system.t_span[0]
     try:
         diagonal = np.diagonal(np.asarray(system.hessian(np.zeros(2 * d), t0)))
@@ -79,7 +108,7 @@ def _of_hessians(system: HamiltonianSystem) -> np.ndarray:
     return np.where(good, s[:d], np.sqrt(squares))
 
 
-def _of_large(system: HamiltonianSystem) -> np.ndarray:
+def _of_large(system: Any) -> np.ndarray:
     d = system.ndof
     if not (system.separable and system.quadratic_kinetic and system.has_hessian_vector):
         return np.ones(d)
@@ -90,7 +119,7 @@ def _of_large(system: HamiltonianSystem) -> np.ndarray:
     return np.sqrt((rate or SLOW / system.dt) / inverse_mass)
 
 
-def fastest_rate(system: HamiltonianSystem) -> float | None:
+def fastest_rate(system: Any) -> float | None:
     """The largest |λ| of J∇²H at y0, or the median over the domain; `SLOW`/dt where that is 0, None without states.
 
     Where H depends on t, the largest of a few times within its period, or else the system's interval.
@@ -102,22 +131,53 @@ def fastest_rate(system: HamiltonianSystem) -> float | None:
     return max(_median_rate(system, float(t)) for t in times) or SLOW / system.dt
 
 
-def _hessians(system: HamiltonianSystem, t: float) -> np.ndarray:
-    """The finite Hessians (n, 2d, 2d) at y0, or at states of the domain."""
-    if system.y0 is not None:
-        y = system.y0[None]
-    else:
-        assert system.domain is not None
+def default_step(scene: Scene, y: np.ndarray | None = None) -> float:
+    """`STEP` over the largest rate at states y (..., 2d), by default y0 or those of the domain, to two digits.
+
+    `STEP` itself where nothing moves, or no rate can be told, as of large lattices and pairs.
+    """
+    system = scene.between_impulses
+    rate = 0.0
+    if system.ndof <= MOST_DENSE:
+        with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
+            times = probe_times(*system.t_span) if not system.autonomous else [system.t_span[0]]
+            rate = max(float(_rates(system, float(t), y).max(initial=0.0)) for t in times)
+    return float(f"{STEP / rate:.2g}") if 0 < STEP / max(rate, 1e-300) < 1e100 and np.isfinite(rate) else STEP
+
+
+def _rates(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
+    """The largest |λ| of J∇²H at each of the states, of those where it is finite."""
+    S, d = _hessians(system, t, y), system.ndof
+    return np.abs(np.linalg.eigvals(np.concatenate([S[:, d:], -S[:, :d]], axis=1))).max(-1, initial=0.0)
+
+
+def _hessians(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
+    """The finite Hessians (n, 2d, 2d) at states y, or at y0, or at states of the domain."""
+    if y is None:
+        y = system.y0
+    if y is not None:
+        y = y.reshape(-1, y.shape[-1])
+        y = y[:: max(1, len(y) // MOST_RATES)]
+    elif system.domain is not None:
         y = system.domain.sample(STATES, 0)
+    else:
+        y = np.empty((0, 2 * system.ndof))
     with np.errstate(all="ignore"):
         S = np.asarray(system.hessian(y, t))
     return S[np.isfinite(S).all((-1, -2))]
 
 
-def _median_rate(system: HamiltonianSystem, t: float) -> float:
+def _median_rate(system: Any, t: float) -> float:
     """The median over the states of the largest |λ| of J∇²H; 0 where none is finite."""
-    S, d = _hessians(system, t), system.ndof
-    if not len(S):
-        return 0.0
-    rates = np.abs(np.linalg.eigvals(np.concatenate([S[:, d:], -S[:, :d]], axis=1))).max(-1)
-    return float(np.median(rates))
+    rates = _rates(system, t)
+    return float(np.median(rates)) if len(rates) else 0.0
+
+
+def known_scale(system: Any, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:
+    """The system's `energy_scale`, else |H0| of the states y0 (..., 2d); NaN where H0 is 0 but for rounding: (...)."""
+    if system.energy_scale is not None:
+        return np.full_like(H0, system.energy_scale)
+    with np.errstate(all="ignore"):
+        y = y0.astype(float)
+        terms = np.abs(y * np.asarray(system.gradient(y, None if system.autonomous else t0))).sum(-1)
+        return np.where(np.isfinite(H0) & (np.abs(H0) <= SMALLEST_SCALE * terms), np.nan, np.abs(H0))

@@ -7,7 +7,7 @@ import numbers
 import re
 import reprlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import islice
@@ -45,6 +45,7 @@ from sympflow.hamiltonian.jumps import (
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
+from sympflow.hamiltonian.removable import sinc
 
 LARGEST = sys.float_info.max
 MOST_LEFT_OUT = 100
@@ -387,7 +388,10 @@ class SymbolicHamiltonian(Definition):
         return self._scalar("Ht")(y, t)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
-        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
+        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name.
+
+        Of a `parametric` form it takes `numbers`, values of the parameters.
+        """
         return self._function(name, lambda: expressions, assemble)
 
     def potential(self, q: Array, *t: Array) -> Array:
@@ -472,19 +476,21 @@ class SymbolicHamiltonian(Definition):
         generated: dict[str, Callable[..., list[Any]]] = {}
         values_of_samples: list[tuple[sampled, Callable[..., Any]]] = []
 
-        def function(x: Array, *times: Array) -> Array:
+        def function(x: Array, *times: Array, numbers: Sequence[Any] = ()) -> Array:
             library = "torch" if is_tensor(x) else "numpy"
             if library not in generated:
                 wanted, letters = with_letters([printable(f) for f in expressions()])
                 values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in letters]
-                generated[library] = generate(wanted, (*variables, *moving, *letters.values()), library)
+                generated[library] = generate(
+                    wanted, (*variables, *moving, *self.parameters, *letters.values()), library
+                )
             columns = [x[..., i] for i in range(n)]
             times = times[: len(moving)]
             if library == "torch" and moving:
                 times = _doubles(times, x)
             sampled_values = [self.samples[a.name_of_samples](at(*times), a.order) for a, at in values_of_samples]
             try:
-                values = generated[library](*columns, *times, *sampled_values)
+                values = generated[library](*columns, *times, *numbers, *sampled_values)
             except (NameError, AttributeError, TypeError) as error:
                 raise TypeError(
                     f"`expression` cannot be evaluated with {library} ({error}): write it with functions that "
@@ -521,6 +527,31 @@ def _doubles(times: Sequence[Any], x: Any) -> tuple[Any, ...]:
     import torch
 
     return tuple(torch.as_tensor(t, dtype=torch.float64, device=x.device) for t in times)
+
+
+COORDINATE_LIKE = re.compile(r"[pqv]?[xyzr]\d?|[PQX]\d*|v|[pq]_?\w|[vpq]?_?(theta|phi)\d?")
+"""Names of parameters that are coordinates elsewhere."""
+
+
+def renamed(expression: str | sp.Expr, q: Any, p: Any) -> sp.Expr:
+    """H in q1 … qd, p1 … pd, of an expression in the coordinates of these names, symbols or functions of the time.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If they are not d names each, all different.
+    """
+    rows = [[x] if isinstance(x, str | sp.Basic) else list(x or ()) for x in (q, p)]
+    names = [str(x.func if isinstance(x, sp.Function) else x) for row in rows for x in row]
+    if len(rows[0]) != len(rows[1]) or len(set(names)) < len(names) or not names:
+        raise ValueError(f"`q` and `p` must name d coordinates each, all different; got {q!r} and {p!r}.")
+    if isinstance(expression, str):
+        f = _read_text(expression, names)
+    else:
+        functions = {x: sp.Symbol(str(x.func)) for row in rows for x in row if isinstance(x, sp.Function)}
+        f = of_sympy(expression.xreplace(functions), names)
+    own = [sp.Symbol(f"{letter}{i + 1}", real=True) for letter in "qp" for i in range(len(rows[0]))]
+    return f.xreplace({sp.Symbol(name, real=True): symbol for name, symbol in zip(names, own, strict=True)})
 
 
 def named_time(time: str | sp.Symbol | None, params: Mapping[str, Any]) -> sp.Symbol | None:
@@ -568,6 +599,17 @@ def parse(expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol 
     return _valued(*_read(expression, checked_params(params), time), time)
 
 
+def _read_text(text: str, names: Collection[str]) -> sp.Expr:
+    coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", text) if _is_coordinate(w))
+    try:
+        return read(text, {*names, *_AMBIGUOUS, *coordinates})
+    except Unreadable as error:
+        shown = text if len(text) <= 200 else text[:200] + "..."
+        raise ValueError(
+            f"`expression` cannot be parsed: {shown!r} ({error}). Write it with these, or pass a SymPy expression."
+        ) from None
+
+
 def _read(
     expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol | None
 ) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
@@ -575,14 +617,7 @@ def _read(
     names = {name: sp.Symbol(name, real=True) for name in params}
     meant = {*params, *(() if time is None else (time.name,))}
     if isinstance(expression, str):
-        try:
-            coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", expression) if _is_coordinate(w))
-            H = read(expression, {*meant, *_AMBIGUOUS, *coordinates})
-        except Unreadable as error:
-            shown = expression if len(expression) <= 200 else expression[:200] + "..."
-            raise ValueError(
-                f"`expression` cannot be parsed: {shown!r} ({error}). Write it with these, or pass a SymPy expression."
-            ) from None
+        H = _read_text(expression, meant)
     else:
         try:
             H = sp.sympify(expression, strict=True)
@@ -623,6 +658,11 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
         raise TypeError('`expression` depends on the time t: name it by time="t", for a system that is driven.')
     if unknown:
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
+        if any(COORDINATE_LIKE.fullmatch(name) for name in unknown):
+            meant += (
+                " Coordinates are q and p, or q1 … qd and p1 … pd: other names are given by "
+                "from_sympy(H, q=['x', 'y'], p=['px', 'py'])."
+            )
         raise ValueError(
             f"`expression` holds {', '.join(map(_short, unknown))} without a value: give it in `params`.{meant}"
         )
@@ -737,6 +777,7 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
         raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
     checked: dict[str, Any] = {}
     for name, given in (params or {}).items():
+        name = name.name if isinstance(name, sp.Symbol) else name  # noqa: PLW2901
         if not isinstance(name, str) or _is_coordinate(name) or name == "t":
             raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
         if is_spline(given):
@@ -775,8 +816,8 @@ def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
 
 
 def printable(f: sp.Expr) -> sp.Expr:
-    """A derivative as code needs it: its constants numbers, and the δ of a kink's second derivative left out."""
-    return _with_numeric_constants(without_deltas(f))
+    """A derivative as code needs it: constants as numbers, sinc written out, the δ of a kink's second one left out."""
+    return _with_numeric_constants(without_deltas(f).replace(sinc, lambda *args: sinc(*args).written_out))
 
 
 def without_deltas(f: sp.Expr) -> sp.Expr:
@@ -816,7 +857,8 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     TypeError
         If the library has no function for something in the expressions.
     """
-    code = [_by_products(f) if library == "numpy" else f for f in map(_of_machine_numbers, expressions)]
+    written = _by_products if library == "numpy" else _by_tensor_functions
+    code = [written(_of_machine_numbers(f)) for f in expressions]
     sums = [_in_pieces(f) for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
@@ -855,6 +897,32 @@ def _by_products(f: sp.Expr) -> sp.Expr:
     return f.replace(is_large, product)
 
 
+class tensor_erfc(sp.Function):
+    """erfc, which SymPy does not write for torch."""
+
+    def _torchcode(self, printer: Any) -> str:
+        return f"tensor_erfc({printer._print(self.args[0])})"
+
+
+_OF_TENSORS: dict[Any, Callable[[Any], Any]] = {
+    sp.sec: lambda x: 1 / sp.cos(x),
+    sp.csc: lambda x: 1 / sp.sin(x),
+    sp.cot: lambda x: 1 / sp.tan(x),
+    sp.sech: lambda x: 1 / sp.cosh(x),
+    sp.csch: lambda x: 1 / sp.sinh(x),
+    sp.coth: lambda x: 1 / sp.tanh(x),
+    sp.acot: lambda x: sp.atan(1 / x, evaluate=False),
+    sp.erfc: tensor_erfc,
+}
+"""Functions that SymPy does not write for torch, by those that it does."""
+
+
+def _by_tensor_functions(f: sp.Expr) -> sp.Expr:
+    for function, written in _OF_TENSORS.items():
+        f = f.replace(function, written)
+    return f
+
+
 def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
     half = x if n < 4 else _integer_power(x, n // 2)
     return half * half * x if n % 2 else half * half
@@ -878,11 +946,11 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     """Modules of the functions in the generated code; SciPy is brought in for special functions only."""
     from sympy.printing.numpy import NumPyPrinter
 
-    known = NumPyPrinter().known_functions
+    known = {name for name, code in NumPyPrinter().known_functions.items() if code.startswith("numpy")}
+    if library == "torch":
+        known |= {"erf", "tensor_erfc"}
     names = {type(f).__name__ for expression in code for f in expression.atoms(sp.Function)} - {"integer_power"}
-    special = sorted(
-        n for n in names - known.keys() if n not in ("Max", "Min", "Abs", "Heaviside", "sign", "Piecewise")
-    )
+    special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise"})
     if library == "numpy":
         own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
         return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]
@@ -903,4 +971,12 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     def heaviside(x: Any, value: float) -> Any:
         return torch.heaviside(x, torch.as_tensor(value, dtype=x.dtype, device=x.device))
 
-    return [{"heaviside": heaviside, "max": pairwise(torch.maximum), "min": pairwise(torch.minimum)}, "torch"]
+    return [
+        {
+            "tensor_erfc": torch.special.erfc,
+            "heaviside": heaviside,
+            "max": pairwise(torch.maximum),
+            "min": pairwise(torch.minimum),
+        },
+        "torch",
+    ]

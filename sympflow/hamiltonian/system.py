@@ -93,8 +93,10 @@ class HamiltonianSystem(Hamiltonian):
         Default initial state.
     t_span : (float, float)
         Default interval.
-    dt : float
-        Default step of the fixed-step classical methods.
+    dt : float, optional
+        Default step of the fixed-step classical methods. Without it, `system.dt` is 0.05/ω, to two digits, with the
+        largest frequency or rate ω of the linearised motion at `y0`, or over the domain; 0.05 where there is none. For
+        a system without both of these, `solve` takes ω at the states that it is given.
     energy_scale : float, optional
         What energy errors are relative to; the default is |H(y0)|.
     exact : callable, optional
@@ -148,13 +150,18 @@ class HamiltonianSystem(Hamiltonian):
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float = 0.05,
+        dt: float | None = None,
         energy_scale: float | None = None,
         exact: Callable[[Any], Array] | None = None,
         check: bool = True,
     ) -> None:
         from sympflow.hamiltonian.callables import CallableHamiltonian, DrivenCallables
 
+        for argument, H in (("potential", potential), ("hamiltonian", hamiltonian)):
+            if isinstance(H, str):
+                raise TypeError(
+                    f"`{argument}` must be a function; got the text {H!r}: HamiltonianSystem.from_sympy takes it."
+                )
         number = isinstance(ndof, int | float | np.number) and not isinstance(ndof, bool) and 1 <= ndof <= MOST_DEGREES
         if ndof is None or not number or int(ndof) != ndof:
             raise ValueError(
@@ -185,6 +192,8 @@ class HamiltonianSystem(Hamiltonian):
         cls,
         expression: str | sympy.Expr,
         *,
+        q: Sequence[Any] | None = None,
+        p: Sequence[Any] | None = None,
         params: Mapping[str, Any] | None = None,
         time: str | sympy.Symbol | None = None,
         period: float | None = None,
@@ -193,7 +202,7 @@ class HamiltonianSystem(Hamiltonian):
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float = 0.05,
+        dt: float | None = None,
         energy_scale: float | None = None,
         exact: Callable[[Any], Array] | None = None,
     ) -> HamiltonianSystem:
@@ -206,6 +215,9 @@ class HamiltonianSystem(Hamiltonian):
         expression : str or sympy.Expr
             In a text `pi` is a constant and every other name that is no function a symbol: so are `E` and `I`;
             Euler's number is exp(1).
+        q, p : sequence of str, sympy.Symbol or functions of the time, optional
+            The names that coordinates and momenta have in the expression, such as ``q=["x", "y"], p=["px", "py"]`` or
+            `dynamicsymbols`; in the system they are q1 … qd and p1 … pd.
         params : mapping of str to float, optional
             Values of the other symbols: finite real numbers. A name that is given here is a symbol whatever it means
             otherwise. `system.params` holds them, to be read only. A spline of SciPy, such as `CubicSpline(t, a)` or
@@ -226,8 +238,10 @@ class HamiltonianSystem(Hamiltonian):
             impulses DiracDelta(t − a)·W(q), which are kicks p −= ∇W(q) at the time a; if `damping` is not symmetric,
             has negative rates, or another shape.
         """
-        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params
+        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, checked_params, renamed
 
+        if q is not None or p is not None:
+            expression = renamed(expression, q, p)
         params = checked_params(params)
         symbols = SymbolicHamiltonian(expression, params, time)
         if cls._continuous:
@@ -265,7 +279,7 @@ class HamiltonianSystem(Hamiltonian):
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float = 0.05,
+        dt: float | None = None,
         energy_scale: float | None = None,
         exact: Callable[[Any], Array] | None = None,
         time: None = None,
@@ -336,7 +350,7 @@ class HamiltonianSystem(Hamiltonian):
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 1.0),
-        dt: float = 0.001,
+        dt: float | None = None,
         energy_scale: float | None = None,
         exact: Callable[[Any], Array] | None = None,
         time: None = None,
@@ -482,7 +496,7 @@ class HamiltonianSystem(Hamiltonian):
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float = 0.01,
+        dt: float | None = None,
         energy_scale: float | None = None,
         exact: Callable[[Any], Array] | None = None,
         time: None = None,
@@ -581,7 +595,7 @@ class HamiltonianSystem(Hamiltonian):
         domain: Domain | None,
         y0: ArrayLike | None,
         t_span: tuple[float, float],
-        dt: float,
+        dt: float | None,
         energy_scale: float | None,
         exact: Callable[[Any], Array] | None = None,
     ) -> None:
@@ -589,7 +603,7 @@ class HamiltonianSystem(Hamiltonian):
         if exact is not None and not callable(exact):
             raise TypeError(f"`exact` must be a function of the time; got {type(exact).__name__}.")
         self.exact = exact
-        if not real_number(dt) or not 0 < dt < 1e100:
+        if dt is not None and not (real_number(dt) and 0 < dt < 1e100):
             raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
         try:
             t0, t1 = (float(t) for t in t_span)
@@ -597,7 +611,7 @@ class HamiltonianSystem(Hamiltonian):
             raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.") from error
         if not math.isfinite(t1 - t0):
             raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.")
-        self.t_span, self.dt = (t0, t1), float(dt)
+        self.t_span, self._dt = (t0, t1), None if dt is None else float(dt)
         if energy_scale is not None and not (real_number(energy_scale) and 0 < energy_scale <= sys.float_info.max):
             raise ValueError(f"`energy_scale` must be positive and finite; got {energy_scale!r}.")
         self.energy_scale = energy_scale
@@ -607,6 +621,24 @@ class HamiltonianSystem(Hamiltonian):
         self.domain = None if domain is None else domain_of(domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
+
+    @property
+    def dt(self) -> float:
+        """The default step of the fixed-step classical methods: the one given, or by the fastest motion."""
+        if self._dt is None:
+            from sympflow.hamiltonian.scales import default_step
+
+            self._dt = default_step(self)
+        return self._dt
+
+    @dt.setter
+    def dt(self, dt: float) -> None:
+        self._dt = dt
+
+    @property
+    def step_is_open(self) -> bool:
+        """True if `dt` was not given, and the system has no states from which it could be chosen."""
+        return self._dt is None and self.y0 is None and self.domain is None
 
     def _checked_y0(self, y0: ArrayLike) -> np.ndarray:
         """The default initial state: a copy of floats."""
@@ -620,8 +652,9 @@ class HamiltonianSystem(Hamiltonian):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
-        untested = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
-        vars(self).update({**untested, **{name: value for name, value in state.items() if name != "params"}})
+        earlier = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
+        earlier["_dt"] = state.get("dt")
+        vars(self).update({**earlier, **{name: value for name, value in state.items() if name not in ("params", "dt")}})
 
     @property
     def params(self) -> Mapping[str, float]:
@@ -870,6 +903,7 @@ def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]
         Equal to `system`, so that whatever is kept by system is found by the view too.
     """
     view = copy.copy(system)
+    vars(view).pop("between_impulses", None)  # the view itself, where there are none
     view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]
     view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
     return view

@@ -30,7 +30,7 @@ from sympflow.integrators.contract import (
     finished,
     interrupted,
 )
-from sympflow.integrators.grid import EPS, Grid, distinct
+from sympflow.integrators.grid import Grid, distinct
 from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
 from sympflow.kernels.carry import Carry
 
@@ -56,8 +56,6 @@ __all__ = [
     "run_and_search",
 ]
 
-FEW = 8
-"""Outputs that are placed on the grid by NumPy: a compiled pass is worth its loading for more."""
 FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
 COMPILED = ("compiled", "cuda")
 """The values of `stats["backend"]` of compiled loops."""
@@ -615,10 +613,6 @@ class GridRun:
         """
         problem, grid = self.problem, self.grid
         t = problem.t_eval
-        if self.stepper.compiled and t is not None and len(t) > FEW and not problem.dense_output:
-            from sympflow.kernels.output_loops import place
-
-            return t, *place(t, grid.t0, grid.h, 4 * EPS)
         t, count, remainder = grid.outputs(t, problem.save_every)
         save, position = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
         return t, remainder, save, position
@@ -758,7 +752,7 @@ class GridRun:
         """
         grid = self.grid
         done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
-        outcome.finite = done and (outcome.finite or _all_finite(outcome.y, self.stepper.compiled))
+        outcome.finite = done and (outcome.finite or _all_finite(outcome.y))
         if outcome.finite:
             if finite.ndim:
                 outcome.status = np.zeros(finite.shape, dtype=int)
@@ -840,15 +834,9 @@ class GridSolution:
         return y[..., 0] if np.ndim(t) == 0 else y
 
 
-def _all_finite(y: Array, compiled: bool) -> bool:
-    """True if an array is known to be finite all over, by the means of the run."""
-    if is_tensor(y):
-        return False
-    if not compiled or y.dtype != np.float64 or not (y.flags.c_contiguous or y.flags.f_contiguous):
-        return bool(np.isfinite(y).all())
-    from sympflow.kernels.output_loops import all_finite
-
-    return all_finite(y)
+def _all_finite(y: Array) -> bool:
+    """True if an array is finite all over; of tensors that is found out elsewhere."""
+    return not is_tensor(y) and bool(np.isfinite(y).all())
 
 
 # runs whose steps the method chooses -----------------------------------------------------------------

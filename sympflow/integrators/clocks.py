@@ -78,7 +78,7 @@ class OnClock(Protocol):
         expected: float,
         backend: str,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run in one compiled pass: see `kernels.timed_loops.reach_times`. None where there is none."""
+        """Run in one compiled pass: see `kernels.elapsed_times.reach_times`. None where there is none."""
         ...
 
     @property
@@ -554,7 +554,7 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
     first = 0 if elapsed[0] else int(elapsed.searchsorted(0.0, "right"))
 
     transformed = clock.transformed
-    from sympflow.kernels.timed_loops import lifted_rows
+    from sympflow.kernels.elapsed_times import lifted_rows
 
     start = lifted_rows(system, y0.reshape(-1, y0.shape[-1]), transformed.params["shift"])
     if start is None:

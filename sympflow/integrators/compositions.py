@@ -230,10 +230,19 @@ class KineticPotential(Composition):
         return concatenate([q, p])
 
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
-        if not self._pushes:
-            return None
         y = to_numpy(y)
         n = y.shape[-1]
+        if y.dtype == np.float64 and self.system.symbols is not None and y.size:
+            from sympflow.kernels.stages import step_table
+            from sympflow.kernels.tangents import step_tangents
+
+            lengths = np.broadcast_to(h, y.shape[:-1]).astype(float).ravel()
+            table, rows = step_table(self.scheme), np.ascontiguousarray(y.reshape(-1, n))
+            found = step_tangents(self.system, table, lengths, lengths, rows, self.scheme.monomials)
+            if found is not None:
+                return found[0].reshape(y.shape), found[1].reshape(*y.shape, n)
+        if not self._pushes:
+            return None
         if not self.system.has_hessian_vector:
             self.system.potential_hessian(y[..., : self.system.ndof], t)  # which says so, before anything large is made
         return self.pushed(y, h, np.broadcast_to(np.eye(n, dtype=y.dtype), (*y.shape, n)).copy(), t)

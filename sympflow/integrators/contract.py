@@ -46,8 +46,9 @@ from sympflow.integrators.progress import Progress
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
+    from sympflow.flow.known import KnownFlow
     from sympflow.hamiltonian.fingerprint import Identity
-    from sympflow.kernels.tangent_loops import TangentKernel
+    from sympflow.kernels.tangents import TangentKernel
     from sympflow.schemes import Scheme
     from sympflow.storage.runs import RunStore
 
@@ -268,18 +269,22 @@ class Integrator:
         """Return the trained flow that is used for a system, one in the system's own time; None if there is none."""
         return None
 
+    def known_flow(self, system: HamiltonianSystem) -> KnownFlow | None:
+        """Return what is known of that flow, which compiled runs need and no torch."""
+        return self.flow_for(system)
+
     def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Integrator | None:
         """Return the same method on a driven system with the time and its momentum E; None where it is none there."""
         return None if self.trained else self
 
     def identity_for(self, system: HamiltonianSystem) -> Identity | None:
         """Return the H that the trained flow for a system was made for; None without a flow, or where it is unknown."""
-        flow = self.flow_for(system)
+        flow = self.known_flow(system)
         return None if flow is None else flow.identity
 
     def figures(self, system: HamiltonianSystem) -> Mapping[str, Any]:
         """Return the figures of the trained flow that runs, such as `training_seconds`; {} without a flow."""
-        flow = self.flow_for(system)
+        flow = self.known_flow(system)
         return {} if flow is None else flow.figures
 
     def step_length(self, system: HamiltonianSystem) -> float | None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakSet
 
 import numpy as np
 
@@ -12,6 +15,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome, Problem
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.hamiltonian.poles import Poles
 
 TAIL = 200  # steps before the end of a run, at least, from which the solution is followed
@@ -32,16 +36,24 @@ H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
 
 
+FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
+"""The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
+that share of errors there is told."""
+_TOLD: WeakSet[Any] = WeakSet()
+
+
 class Passage(NamedTuple):
-    """The times between which a trajectory passed a pole, its column, and True if no solution does."""
+    """The times between which a trajectory passed a pole, its name, "" of a start, and True if no solution does."""
 
     begin: float
     end: float
-    column: int
+    place: str
     certain: bool
 
 
-def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stacklevel: int) -> bool:
+def note_poles(
+    outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None, stacklevel: int
+) -> bool:
     """End a run where it passed a place at which H is infinite or no number, and warn where it seems to have done so.
 
     No solution passes such a place, but a step of fixed length sees nothing of what lies between its ends. Compared are
@@ -51,10 +63,16 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
     Between two states with H infinite on the way the status becomes −1. Where the place is a point in more than one
     dimension, no sign changes; there is a warning if a step was long beside its distance and H changed for good.
 
+    `values` are the parameters of the trajectories, where they have some of their own.
+
     Returns True if the run, or a trajectory of it, was ended.
     """
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
-    if poles is None or not n:
+    numbers: Sequence[Any] = ()
+    if problem.letters is not None:
+        assert problem.system.symbols is not None
+        poles, numbers = problem.system.symbols.parametric.poles, [*problem.letters]
+    if poles is None or not poles.watched or not n:
         return False
     starts = to_numpy(problem.y0).reshape(-1, width)
     outputs = to_numpy(outcome.y).reshape(n, -1, width)
@@ -63,31 +81,39 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
     t = np.concatenate([[problem.t0], outcome.t[every][::-1]])
     with np.errstate(all="ignore"):
         try:
-            odd, scale = _look(problem.system, poles, t, y)
+            looked = _look(problem.system, poles.look(y, t[:, None], numbers))
         except TypeError:  # a function that takes no arrays
             return False
-        if not odd.any():
+        if looked is None:
             return False
+        odd, scale = looked
         held = (np.atleast_1d(np.asarray(outcome.status)) >= 0).reshape(-1)
         rows = np.flatnonzero(odd.any(0) & held)
         found: dict[int, Passage] = {}
         for row in rows[np.argsort(~odd[0, rows], kind="stable")][:MOST_NAMED].tolist():
             if odd[0, row]:
-                found[row] = Passage(problem.t0, problem.t0, -1, True)
+                found[row] = Passage(problem.t0, problem.t0, "", True)
+                continue
+            own = (
+                problem
+                if values is None or problem.letters is None
+                else replace(problem, system=values.system_of(row), letters=None)
+            )
+            if own.system.poles is None or not own.system.poles.watched:
                 continue
             ends = t[-1], t[int(np.argmax(odd[:, row]))]
-            passage = _passage(poles, *_steps_of(outcome, integrator, problem, row, ends), scale[row])
+            passage = _passage(own.system.poles, *_steps_of(outcome, integrator, own, row, ends), scale[row])
             if passage is not None:
                 found[row] = passage
     certain = [row for row, passage in found.items() if passage.certain]
     if certain:
-        _end(outcome, integrator, problem, {row: found[row] for row in certain})
+        _end(outcome, integrator, problem, {row: found[row] for row in certain}, values)
     likely = [row for row in found if row not in certain]
     if likely:
-        passage, which = found[likely[0]], _which(problem, likely)
+        passage, which = found[likely[0]], _which(problem, likely, values)
         warnings.warn(
             f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
-            f"over a place at which it is infinite, {poles.name(passage.column)}: the run means nothing after that. "
+            f"over a place at which it is infinite, {passage.place}: the run means nothing after that. "
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
             stacklevel=stacklevel + 1,
@@ -95,20 +121,55 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, stack
     return bool(certain)
 
 
-def _look(system: HamiltonianSystem, poles: Poles, t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """True for states y (n, N, 2d) with signs or H unlike the first ones, and for a start without H: (n, N).
+def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> None:
+    """Warn, once for a system, of a run about a value of q or p near which terms of H cancel until digits are lost."""
+    poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
+    if poles is None or not poles.cancelling or poles in _TOLD:
+        return
+    starts = to_numpy(problem.y0).reshape(-1, width)
+    every = slice(None, None, max(1, n // LOOKED_AT))
+    y = np.concatenate([starts[None], to_numpy(outcome.y).reshape(n, len(starts), width)[every]])
+    for each in poles.cancelling:
+        x = y[..., each.column] - each.at
+        about = np.fmin.reduce(x) <= 0
+        about &= np.fmax.reduce(x) >= 0
+        if not about.any():
+            continue
+        reach = float(np.fmax.reduce(np.abs(x[:, about]), axis=None))
+        steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
+        visited = y[:, about, each.column].ravel()
+        if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, visited) > LOST_DIGITS:
+            continue
+        _TOLD.add(poles)
+        warnings.warn(
+            f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in "
+            "many digits, and at it no number. Write them by sinc, which is sin(x)/x without that, or near it by their "
+            "series, in a Piecewise.",
+            RuntimeWarning,
+            stacklevel=stacklevel + 1,
+        )
+        return
+
+
+def _look(
+    system: HamiltonianSystem, looked: tuple[np.ndarray, np.ndarray, np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """True for states (n, N) with signs or H unlike the first ones, and for a start without H.
 
     Also the largest kinetic energy, or change of the potential one, beside which H is judged: (N,).
+    None if there is no such state.
     """
-    cells, H, T = poles.look(y, t[:, None])
+    cells, H, T = looked
+    if T is not None and (cells == cells[0]).all() and (H.max(0) - H.min(0) <= OFF * np.abs(T).max(0)).all():
+        return None
     odd = (cells != cells[0]).any(-1)
-    scale = np.full(y.shape[1], np.inf)
+    scale = np.full(H.shape[1], np.inf)
     if T is not None:
         V = H - T
         scale = np.fmax.reduce(np.maximum(np.abs(T), np.abs(V - V[0])), axis=0)
         odd |= ~(np.abs(H - H[0]) <= (OFF if system.conservative and system.autonomous else FAR_OFF) * scale)
     odd[0] = ~np.isfinite(H[0])
-    return odd, scale
+    return (odd, scale) if odd.any() else None
 
 
 def _steps_of(
@@ -136,7 +197,7 @@ def _passage(poles: Poles, t: np.ndarray, y: np.ndarray, scale: float) -> Passag
     cells, H, T = poles.look(y, t)
     for k, column in np.argwhere(cells[1:] != cells[:-1])[:MOST_TESTED].tolist():
         if poles.passed(column, t[k : k + 2].tolist(), y[k : k + 2]):
-            return Passage(float(t[k]), float(t[k + 1]), column, True)
+            return Passage(float(t[k]), float(t[k + 1]), poles.name(column), True)
     if T is None:
         return None
     k = np.arange(len(y) - 1)
@@ -151,7 +212,7 @@ def _passage(poles: Poles, t: np.ndarray, y: np.ndarray, scale: float) -> Passag
     if not leapt.any():
         return None
     first, column = np.argwhere(leapt)[0].tolist()
-    return Passage(float(t[k[first]]), float(t[k[first] + 1]), column, False)
+    return Passage(float(t[k[first]]), float(t[k[first] + 1]), poles.name(column), False)
 
 
 def _remedy(integrator: Integrator, problem: Problem) -> str:
@@ -160,25 +221,28 @@ def _remedy(integrator: Integrator, problem: Problem) -> str:
     return "Reduce `dt`, soften H there, or take a method with a clock of its own, such as 'log_leapfrog'"
 
 
-def _which(problem: Problem, rows: list[int]) -> str:
-    """The trajectories of a batch, in words."""
+def _which(problem: Problem, rows: list[int], values: ParameterRows | None) -> str:
+    """The trajectories of a batch, in words: by their places, or parameters."""
+    if values is not None:
+        return f" with {values.shown(rows[0])}"
     if problem.y0.ndim == 1:
         return ""
     first = ", ".join(map(str, np.unravel_index(rows[0], problem.y0.shape[:-1])))
     return f" of trajectory {first}" + (f", the first of {len(rows)}," if len(rows) > 1 else "")
 
 
-def _end(outcome: Outcome, integrator: Integrator, problem: Problem, found: dict[int, Passage]) -> None:
+def _end(
+    outcome: Outcome, integrator: Integrator, problem: Problem, found: dict[int, Passage], values: ParameterRows | None
+) -> None:
     """Set status −1 and the message of trajectories that passed a pole; end them before."""
-    poles, sign = problem.system.poles, 1.0 if problem.t1 >= problem.t0 else -1.0
-    assert poles is not None
+    sign = 1.0 if problem.t1 >= problem.t0 else -1.0
     rows = sorted(found, key=lambda row: (found[row].end - problem.t0) * sign)
-    first, which = found[rows[0]], _which(problem, rows)
-    if first.column < 0:
+    first, which = found[rows[0]], _which(problem, rows, values)
+    if not first.place:
         outcome.message = f"H{which} is infinite, or no number, at `y0`: start elsewhere."
     else:
         outcome.message = (
-            f"Between t = {first.begin:.10g} and {first.end:.10g} the run{which} passed {poles.name(first.column)}, "
+            f"Between t = {first.begin:.10g} and {first.end:.10g} the run{which} passed {first.place}, "
             f"where H is infinite or no number: no solution does. {_remedy(integrator, problem)}, or end `t_span` "
             "earlier."
         )

@@ -17,7 +17,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome
 
 if TYPE_CHECKING:
-    from sympflow.flow.flow_map import FlowMap
+    from sympflow.flow.known import KnownFlow
 
 STATES_COMPARED, MOST_COMPARED = 16, 64
 """Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
@@ -26,7 +26,7 @@ MANY_TIMES = 1000.0
 """Times the certified energy error of a flow beyond which an error outside its domain is warned of."""
 
 
-def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
+def _surely_within(flow: KnownFlow | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:
     """True if all states y (..., 2d) are in the domain of the flow and compiled code can tell."""
     domain = (None if flow is None else flow.domain) or system.domain
     if type(domain) is not EnergySublevel and type(domain) is not Box:
@@ -36,12 +36,12 @@ def _surely_within(flow: FlowMap | None, system: HamiltonianSystem, y: np.ndarra
 
 @cache
 def _compiled() -> Callable[..., bool]:
-    from sympflow.kernels.sublevel_loops import all_within
+    from sympflow.kernels.passes import all_within
 
     return all_within
 
 
-def _domain(flow: FlowMap | None, system: HamiltonianSystem) -> Domain | None:
+def _domain(flow: KnownFlow | None, system: HamiltonianSystem) -> Domain | None:
     return system.domain if flow is None else flow.domain_for(system)
 
 
@@ -81,26 +81,25 @@ NEXT_TO = 1e-3
 """Of the larger of q and p, in comparable units: where the other one is smaller, a run is at rest or has none."""
 
 
-def warn_of_tolerance(outcome: Outcome, system: HamiltonianSystem, tolerance: float, stacklevel: int) -> None:
-    """Warn of a run of which all q, or all p, are below the absolute tolerance, which hides their errors."""
+HIDES = 0.01  # of the largest q, or p: errors of the default tolerance that are as large
+
+
+def smaller_tolerance(outcome: Outcome, system: HamiltonianSystem, tolerance: float) -> float | None:
+    """The absolute tolerance of a run of which all q, or all p, are so small that the default one hides their errors.
+
+    None if none are: they are of an order between, or at rest.
+    """
     y = to_numpy(outcome.y).reshape(-1, 2, system.ndof)
     with np.errstate(all="ignore"):
         sizes = np.abs(y).max(0, initial=0.0)
-        small = (sizes.max(-1) > 0) & (sizes.max(-1) <= tolerance)
+        small = (sizes.max(-1) > 0) & (HIDES * sizes.max(-1) <= tolerance)
     if not small.any():
-        return
+        return None
     scale = weights(system)
     scaled = (sizes * scale.reshape(2, -1)).max(-1)
     at_rest = system.y0 is not None and scaled.max() <= np.finfo(float).eps * np.abs(scale * system.y0).max()
     small &= (scaled > NEXT_TO * scaled.max()) & (not at_rest)
-    if small.any():
-        k = int(np.argmax(small))
-        warnings.warn(
-            f"`atol`, by default {tolerance:g}, is larger than every {'qp'[k]} of the run, at most "
-            f"{sizes[k].max():.3g}, whose errors it hides. Pass an `atol`, such as {sizes[k].max() * 1e-9:.0e}.",
-            RuntimeWarning,
-            stacklevel=stacklevel + 1,
-        )
+    return tolerance * float(sizes.max(-1)[small].min()) if small.any() else None
 
 
 def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stacklevel: int) -> None:
@@ -138,7 +137,7 @@ def warn_of_loss(
 
     Looked at is the last output of a conservative system.
     """
-    flow = integrator.flow_for(system)
+    flow = integrator.known_flow(system)
     certificate = None if flow is None else flow.certified
     if certificate is None or "domain_exit" not in outcome.stats or not (system.conservative and system.autonomous):
         return
@@ -161,7 +160,7 @@ def warn_of_loss(
     )
 
 
-def check_start(flow: FlowMap, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
+def check_start(flow: KnownFlow, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
     """A flow that is taken for its accuracy must start where its accuracy was measured.
 
     Raises
@@ -188,7 +187,7 @@ def check_start(flow: FlowMap, system: HamiltonianSystem, y0: Array, compiled: b
         )
 
 
-def _meaning(flow: FlowMap | None) -> str:
+def _meaning(flow: KnownFlow | None) -> str:
     """The worth of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
     if flow is None or any(flow.evaluations(1, 1, 0, "array").values()):
         return ""
@@ -200,7 +199,7 @@ def _meaning(flow: FlowMap | None) -> str:
 
 def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
     """Note the first output outside the domain, or end the run there."""
-    flow = integrator.flow_for(system)
+    flow = integrator.known_flow(system)
     slack = 0.0 if flow is None else float(flow.figures.get("energy_error_max") or 0.0)
     if outcome.stats.get("backend") == "compiled" and _surely_within(flow, system, outcome.y, slack):
         return

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import copy
 import math
+import sys
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import torch
 
 from sympflow.arguments import as_float, check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy, untransformed
-from sympflow.flow.flow_map import FlowMap
-from sympflow.flow.shipped import choose, forces_saved, named, shipped, shipped_flows
+from sympflow.flow.known import KnownFlow
+from sympflow.flow.shipped import choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
@@ -32,6 +33,9 @@ from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
 from sympflow.kernels.carry import Carry
 
+if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do without
+    from sympflow.flow.flow_map import FlowMap
+
 T = TypeVar("T")
 
 SEARCH, SEARCH_OF_EACH = 50_000, 2_000
@@ -44,14 +48,15 @@ _KNOWN: dict[tuple[Any, ...], Any] = {}
 def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
     """Return the result of `make`, made once in a process for each key: files that ship are read once."""
     if key not in _KNOWN:
-        with untransformed():  # what is kept must not be a tensor of a transform that ends
+        inside = nullcontext() if "torch" not in sys.modules else untransformed()
+        with inside:  # what is kept must not be a tensor of a transform that ends
             _KNOWN[key] = make()
     return _KNOWN[key]
 
 
 _KINDS_OF_SYSTEM: dict[tuple[Any, ...], int] = {}
 _KIND_OF: WeakKeyDictionary[HamiltonianSystem, int] = WeakKeyDictionary()
-_FLOWS_OF: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Any, ...], FlowMap]] = WeakKeyDictionary()
+_FLOWS_OF: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Any, ...], KnownFlow]] = WeakKeyDictionary()
 
 
 def kind_of(system: HamiltonianSystem) -> int:
@@ -61,6 +66,12 @@ def kind_of(system: HamiltonianSystem) -> int:
         found = system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
         kind = _KIND_OF[system] = _KINDS_OF_SYSTEM.setdefault(found, len(_KINDS_OF_SYSTEM))
     return kind
+
+
+def is_flow(flow: Any) -> bool:
+    """True for a trained flow: there is none unless its module has been imported, with torch."""
+    flows = sys.modules.get("sympflow.flow.flow_map")
+    return flows is not None and isinstance(flow, flows.FlowMap)
 
 
 def flow_named(name: str) -> FlowMap:
@@ -92,14 +103,14 @@ class FlowIntegrator(OwnStepper):
             return
         if isinstance(self.flow, str):
             object.__setattr__(self, "flow", flow_named(self.flow))
-        if not isinstance(self.flow, FlowMap) or self.flow.kind != self.name:
+        if not is_flow(self.flow) or self.flow.kind != self.name:
             raise TypeError(
                 f"`flow` must be a trained flow of kind {self.name!r}; got {type(self.flow).__name__}. Load one with "
                 "sympflow.load or train one with sympflow.train."
             )
         self._check_dt(self.flow)
 
-    def _check_dt(self, flow: FlowMap) -> None:
+    def _check_dt(self, flow: KnownFlow) -> None:
         if self.dt is not None and self.dt > flow.dt * (1 + 1e-12):
             raise ValueError(
                 f"`dt` must be at most the flow's Δt = {flow.dt:g}, beyond which ψ̄ was not trained; got {self.dt:g}."
@@ -116,6 +127,9 @@ class FlowIntegrator(OwnStepper):
 
     def flow_for(self, system: HamiltonianSystem) -> FlowMap:
         """Return the flow that is used for a system: the one given, else the one shipped."""
+        return self.known_flow(system).thawed
+
+    def known_flow(self, system: HamiltonianSystem) -> KnownFlow:
         if self.flow is not None:
             return self.flow.bound(system)
         asked = name, tolerance = self.name, self.tolerance
@@ -123,7 +137,8 @@ class FlowIntegrator(OwnStepper):
         if flows is None:
             flows = _FLOWS_OF[system] = {}
         if asked not in flows:
-            flows[asked] = known((name, kind_of(system), tolerance), lambda: shipped(system, name, tolerance))
+            key = (name, kind_of(system), tolerance)
+            flows[asked] = known(key, lambda: choose(system, name, tolerance).known(system))
         return flows[asked]
 
     def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> FlowIntegrator | None:
@@ -133,13 +148,13 @@ class FlowIntegrator(OwnStepper):
     def check(self, system: HamiltonianSystem) -> None:
         if self.flow is not None:
             self.flow.check_system(system)
-        flow = self.flow_for(system)
+        flow = self.known_flow(system)
         self._check_dt(flow)
         if self.dt is not None:
             flow.warn_of_times(self.dt)
 
     def step_length(self, system: HamiltonianSystem) -> float:
-        return float(self.dt if self.dt is not None else self.flow_for(system).dt)
+        return float(self.dt if self.dt is not None else self.known_flow(system).dt)
 
     def flow_like(self, system: HamiltonianSystem, y: Array) -> FlowMap:
         """Return the flow for states such as y: a shipped one in their dtype and on their device, a given one as it is.
@@ -149,6 +164,8 @@ class FlowIntegrator(OwnStepper):
         TypeError, ValueError
             If the given flow has another dtype or device.
         """
+        import torch
+
         flow = self.flow_for(system)
         if not is_tensor(y) and y.dtype == np.float64 and flow.dtype == torch.float64 and flow.device.type == "cpu":
             return flow
@@ -166,12 +183,12 @@ class FlowIntegrator(OwnStepper):
             )
         raise ValueError(f"`y0` is on {tensor.device}, but the flow is on {flow.device}: move one of them.")
 
-    def kernel(self, flow: FlowMap, problem: Problem) -> Any:
+    def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
         """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
         return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend)
 
     def own_stepper(self, problem: Problem) -> FlowStepper | CompiledFlowStepper:
-        flow = self.flow_for(problem.system)
+        flow = self.known_flow(problem.system)
         flow.warn_of_drive(problem.t0, problem.t1 - problem.t0)
         if type(problem.y0) is np.ndarray and problem.y0.dtype == np.float64:  # a kernel tells the flow's own dtype
             kernel = self.kernel(flow, problem)
@@ -186,7 +203,7 @@ class FlowIntegrator(OwnStepper):
     def run(self, problem: Problem) -> Outcome:
         run = GridRun(self, problem)
         if self.tolerance is not None:
-            check_start(self.flow_for(problem.system), problem.system, problem.y0, run.stepper.compiled)
+            check_start(self.known_flow(problem.system), problem.system, problem.y0, run.stepper.compiled)
         return run.outcome()
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
@@ -196,7 +213,13 @@ class FlowIntegrator(OwnStepper):
         return _apply(self.flow_like(system, y).inverse, y, h, t)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        self.flow_for(system)  # files cannot be read inside a function transform
+        flow, x = self.flow_for(system), to_numpy(y)  # files cannot be read inside a function transform
+        kernel = compiled_loops(lambda: flow.kernel_for(system), x, "auto") if x.size else None
+        if kernel is not None:
+            lengths = np.broadcast_to(h, x.shape[:-1]).astype(float).ravel()
+            found = kernel.tangents(lengths, np.ascontiguousarray(x.reshape(-1, x.shape[-1])))
+            if found is not None:
+                return found[0].reshape(x.shape), found[1].reshape(*x.shape, x.shape[-1])
         return super().tangent(system, t, y, h)
 
 
@@ -212,6 +235,8 @@ class FlowStepper(Stepper):
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
     ) -> tuple[Array, np.ndarray]:
+        import torch
+
         if not is_tensor(y0):
             inner = _as_tensors(carry)
             with torch.no_grad():
@@ -246,13 +271,15 @@ def _as_tensors(carry: Carry | None) -> Carry | None:
     """A carry of arrays as one of tensors."""
     if carry is None or carry.running is None:
         return None if carry is None else Carry()
+    import torch
+
     return Carry(carry.steps, torch.from_numpy(carry.running))
 
 
 class CompiledFlowStepper(KernelStepper):
     """A run of a flow in its compiled loops."""
 
-    def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: FlowMap, kernel: Any) -> None:
+    def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: KnownFlow, kernel: Any) -> None:
         super().__init__(integrator, problem, kernel)
         self.flow = flow
 
@@ -275,6 +302,8 @@ def _apply(function: Any, y: Array, h: float | Array, t: Any) -> Array:
     """function(h, y, t) of tensors, for tensors or arrays."""
     if is_tensor(y):
         return function(h, y, t)
+    import torch
+
     with torch.no_grad():
         length = torch.from_numpy(np.array(h)) if np.ndim(h) else float(h)
         return to_numpy(function(length, torch.from_numpy(np.ascontiguousarray(y)), t))
@@ -373,7 +402,7 @@ class SympFlowIntegrator(FlowIntegrator):
             raise ValueError("`compensated` sums are not for a flow in another time: leave it out.")
         return LogSympFlow(flow=self.flow, shift=origin.shift, dt=self.dt)
 
-    def kernel(self, flow: FlowMap, problem: Problem) -> Any:
+    def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
         if not self.compensated:
             return super().kernel(flow, problem)
         kernel = compiled_loops(lambda: flow.kernel_for(problem.system, True), problem.y0, problem.backend)
@@ -472,7 +501,7 @@ class LogSympFlow(FixedStep):
         flow = self.flow
         if flow is None:
             return
-        if not isinstance(flow, FlowMap) or flow.kind != "sympflow":
+        if not is_flow(flow) or flow.kind != "sympflow":
             raise TypeError(
                 f"`flow` must be a SympFlow of the transformed system, or the name of one; got {type(flow).__name__}."
             )

@@ -120,10 +120,10 @@ class Grid:
                 raise ValueError(f"`t` must lie in [{low:g}, {high:g}], the interval that was solved.")
         x = (t - self.t0) / self.h
         nearest = np.rint(x)
-        rounding = 4 * EPS * (np.abs(nearest) + (np.abs(t) + abs(self.t0)) / abs(self.h))
-        on_grid = np.abs(x - nearest) <= rounding
-        if on_grid.all():
+        off, counts = np.abs(x - nearest), np.abs(nearest)
+        if (off <= 4 * EPS * counts).all():  # as in most runs: nearer than is allowed
             return nearest.astype(np.int64), np.zeros(len(t))
+        on_grid = off <= 4 * EPS * (counts + (np.abs(t) + abs(self.t0)) / abs(self.h))
         count = np.where(on_grid, nearest, np.floor(x)).astype(np.int64)
         return count, np.where(on_grid, 0.0, t - (self.t0 + count * self.h))
 
@@ -188,9 +188,9 @@ class Outputs:
 
 def distinct(count: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """The distinct ones of sorted counts, and where among them each is; None where all are distinct."""
-    if len(count) < 2:
+    if len(count) < 2 or (count[1:] > count[:-1]).all():
         return count, None
     new = np.empty(len(count), dtype=bool)
     new[0] = True
     np.not_equal(count[1:], count[:-1], out=new[1:])
-    return (count, None) if new.all() else (count[new], np.cumsum(new) - 1)
+    return count[new], np.cumsum(new) - 1

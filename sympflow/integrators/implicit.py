@@ -19,7 +19,7 @@ from sympflow.integrators.contract import Failure
 
 if TYPE_CHECKING:
     from sympflow.kernels.carry import Carry
-    from sympflow.kernels.implicit_loops import ImplicitKernel
+    from sympflow.kernels.one_steps import OneStepKernel
 
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
 _SYMPLECTIC = (
@@ -134,7 +134,7 @@ class _Counts:
 class CompiledGauss(_Counts, KernelStepper):
     """A run of a Gauss method in compiled loops."""
 
-    def __init__(self, gauss: Gauss, problem: Problem, kernel: ImplicitKernel) -> None:
+    def __init__(self, gauss: Gauss, problem: Problem, kernel: OneStepKernel) -> None:
         super().__init__(gauss, problem, kernel)
         self.gauss = gauss
 

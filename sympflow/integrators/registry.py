@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -25,8 +26,42 @@ GROUP = "sympflow.integrators"
 """The entry-point group in which a distribution announces its integrators: `name = "package.module:Class"`."""
 
 _INSTEAD = {
+    "args": "values of parameters are in H, or given by `params`",
+    **dict.fromkeys(("q0", "p0", "x0", "v0"), "the initial state is `y0`, [q, p] in one array"),
+    **dict.fromkeys(("rtol", "atol"), "it has fixed steps: give `dt`, or `tol`, for which the step is chosen"),
     "max_step": "`dt` is the step, and `event_step` samples events within it",
     **dict.fromkeys(("h", "step", "step_size"), "the step of fixed-step methods is `dt`"),
+}
+SYNONYMS = {
+    **dict.fromkeys(("velocity_verlet", "stormer_verlet", "störmer_verlet", "kdk"), "verlet"),
+    **dict.fromkeys(("position_verlet", "drift_kick_drift", "dkd"), "leapfrog"),
+    **dict.fromkeys(("forest_ruth", "triple_jump"), "yoshida4"),
+    **dict.fromkeys(("rkf45", "ode45", "runge_kutta"), "rk45"),
+    **dict.fromkeys(("midpoint_implicit", "gauss2"), "implicit_midpoint"),
+    "gauss4": "gauss_legendre4",
+    "gauss6": "gauss_legendre6",
+    "gauss8": "gauss_legendre8",
+}
+"""Other names of methods."""
+_STIFF = "It is for stiff dissipative systems, and not symplectic: take 'gauss_legendre6', which is implicit too."
+ABSENT = {
+    **dict.fromkeys(("radau", "bdf", "lsoda", "radau5", "cvode"), _STIFF),
+    "whfast": "It splits off Kepler's motion: for planets take 'srkn11b' or 'log_kahan_li8'.",
+    "ias15": "For close encounters take 'dop853' with `rtol`, or 'log_kahan_li8'.",
+    "yoshida": "Did you mean 'yoshida4' or 'yoshida6'? 'kahan_li8' has smaller errors.",
+    "ruth3": "Did you mean 'yoshida4'? A better one of few stages is 'omelyan4'.",
+    "ruth4": "Did you mean 'yoshida4'?",
+    "symplectic_euler": "Did you mean 'verlet', of order 2 at the same cost?",
+    "rk8": "Did you mean 'dop853'?",
+}
+"""Remedies for names of methods that are not there."""
+KINDS = {
+    "symplectic, T = ½ pᵀM⁻¹p, force gradients": ("srkn11b", "chin4a", "omelyan4"),
+    "symplectic, separable H": ("verlet", "blanes_moan4", "kahan_li8"),
+    "symplectic, any H": ("gauss_legendre6", "implicit_midpoint", "tao8"),
+    "symplectic, steps that become shorter": ("log_leapfrog", "log_kahan_li8"),
+    "trained": ("sympflow", "mlp"),
+    "Runge–Kutta": ("rk4", "rk45", "dop853"),
 }
 _registered: dict[str, type[Integrator]] = {}
 _loaded: dict[type[Integrator], EntryPoint] = {}
@@ -70,9 +105,25 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         return _registered[method]
     if method in _plugins():
         return _load(_plugins()[method])
-    close = difflib.get_close_matches(method.lower(), available(), n=1)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"`method` {method!r} is unknown.{hint} Choose one of {', '.join(available())}.")
+    name = re.sub(r"[\W_]+", "_", method.strip()).lower()
+    if name != method and name in available():
+        return get(name)
+    if name in SYNONYMS:
+        return get(SYNONYMS[name])
+    raise ValueError(f"`method` {method!r} is unknown. {_instead(name)}{_kinds()}")
+
+
+def _instead(name: str) -> str:
+    """What to take in place of a method that is not there."""
+    if name in ABSENT:
+        return f"{ABSENT[name]} "
+    close = difflib.get_close_matches(name, [*available(), *SYNONYMS], n=1)
+    return f"Did you mean {close[0]!r}? " if close else ""
+
+
+def _kinds() -> str:
+    rows = "".join(f"\n  {kind:42}{', '.join(map(repr, names))}" for kind, names in KINDS.items())
+    return f"There are, among others:{rows}\nAll are listed by sympflow.available()."
 
 
 @cache

@@ -34,6 +34,24 @@ class ExplicitStep(ByVectorField):
             K.append(system.vector_field(y + h * weighted(row, K) if K else y, at))
         return y + h * weighted(self.B, K)
 
+    @staticmethod
+    def compiled(system: HamiltonianSystem, name: str, *arguments: Any) -> Any:
+        """Return a function of `kernels.explicit_loops` called for a symbolic system.
+
+        Raises
+        ------
+        ValueError
+            If the system cannot be compiled, with the reason.
+        """
+        if system.symbols is None:
+            raise ValueError(
+                "`system` cannot be compiled: its vector field is not symbolic. Use HamiltonianSystem.from_sympy, or "
+                "use backend='array'."
+            )
+        from sympflow.kernels import explicit_loops  # SymPy, which other systems do without
+
+        return getattr(explicit_loops, name)(system, *arguments)
+
     def _stage_times(self, system: HamiltonianSystem, t: Any, h: Any) -> list[Any]:
         """The times t + c_i h of the stages, of a driven system; None for each of another."""
         rows = self.A[: len(self.B)]

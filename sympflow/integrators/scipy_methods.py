@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -77,12 +78,16 @@ class _Scipy(RungeKutta):
             return int(self.max_steps)
         return MOST_STEPS if math.isfinite(t1) else min(MOST_OPEN_STEPS, max(MAX_SAVED_VALUES // size, 1))
 
-    def _start(self, system: HamiltonianSystem, t0: float, t1: float, y0: np.ndarray) -> Any:
+    def _start(self, system: HamiltonianSystem, t0: float, t1: float, y0: np.ndarray, backend: str = "auto") -> Any:
         """The SciPy solver at t0, or None if the vector field or the first step is not finite there."""
         first = None if self.first_step is None else min(self.first_step, abs(t1 - t0))
+        field: Any = system
+        if backend != "array":
+            with suppress(ValueError):  # of a system without a compiled form
+                field = self.compiled(system, "compiled_field")
         with np.errstate(all="ignore"):
             longest = min(self.max_step, system.shortest_piece)
-            solver = self.solver(system, t0, y0, t1, longest, self.rtol, self.atol, first_step=first)
+            solver = self.solver(field, t0, y0, t1, longest, self.rtol, self.atol, first_step=first)
         return solver if np.isfinite(solver.f).all() and 0 < solver.h_abs < math.inf else None
 
     def _no_start(self, system: HamiltonianSystem, t0: float, y0: np.ndarray) -> str:
@@ -138,7 +143,7 @@ class _Scipy(RungeKutta):
             "backend": "scipy",
         }
         times, states, interpolants = [t0], [y0], []
-        solver = self._start(problem.system, t0, t1, y0.astype(float)) if t1 != t0 else None
+        solver = self._start(problem.system, t0, t1, y0.astype(float), problem.backend) if t1 != t0 else None
         failure = None
         if t1 != t0 and solver is None:
             failure = self._no_start(problem.system, t0, y0)
@@ -199,6 +204,7 @@ class _Scipy(RungeKutta):
         solvers = [self._start(system, *t_span, y) if t_span[0] != t_span[1] else None for y in starts]
         t = np.full(len(starts), t_span[0], dtype=float)
         y, n_steps, most = starts.copy(), 0, self.most_steps(t_span[1], y0.shape[-1])
+        made: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         while any(solver is not None and solver.status == "running" for solver in solvers):
             h, y_next = np.zeros(len(starts)), y.copy()
             for i, solver in enumerate(solvers):
@@ -212,8 +218,21 @@ class _Scipy(RungeKutta):
                 h[i], y_next[i] = solver.t - t[i], solver.y
                 if hopeless(n_steps + 1, t_span[0], solver.t, t_span[1], most):
                     solvers[i] = None
-            yield t.reshape(1, *batch).copy(), y.reshape(1, *y0.shape), h.reshape(1, *batch)
+            made.append((t.reshape(batch), y.reshape(y0.shape), h.reshape(batch)))
+            if len(made) * y.size >= TOGETHER:
+                yield _together(made)
+                made = []
             t, y, n_steps = t + h, y_next, n_steps + 1
+        if made:
+            yield _together(made)
+
+
+TOGETHER = 4096  # numbers of states of the steps that are told at once
+
+
+def _together(steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    times, states, lengths = (np.stack(column) for column in zip(*steps, strict=True))
+    return times, states, lengths
 
 
 class _Lazily:

@@ -25,7 +25,7 @@ from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations
 if TYPE_CHECKING:
     from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
-    from sympflow.kernels.tangent_loops import TangentKernel
+    from sympflow.kernels.tangents import TangentKernel
 
 
 END = 1e-9
@@ -242,7 +242,7 @@ class Splitting(OwnStepper):
             return None
         if compiled_loops(lambda: self.inner.composed(transformed).kernel(False), start, backend) is None:
             return None
-        from sympflow.kernels.timed_loops import reach_times
+        from sympflow.kernels.elapsed_times import reach_times
 
         return reach_times(transformed, self.scheme, h, start, times, stride, expected)
 
@@ -358,7 +358,7 @@ class Splitting(OwnStepper):
                 f"`method` {self.name!r} has compiled deviation vectors on the splitting 'kinetic' and the clock "
                 "'physical' only, without compensated sums: use backend='auto'."
             )
-        from sympflow.kernels.tangent_loops import tangent_kernel
+        from sympflow.kernels.tangents import tangent_kernel
 
         return tangent_kernel(system, scheme, vectors)
 

@@ -181,8 +181,8 @@ class StoredRun:
 
     def _finished(self, piece: Outcome) -> Outcome:
         """Close the store of a run that is over; `piece` is its last window."""
-        store, place = self.store, self._reached()
-        if self.problem.y0.ndim > 1:
+        problem, store, place = self.problem, self.store, self._reached()
+        if problem.y0.ndim > 1:
             piece.t, piece.y = np.zeros(1), np.where(self.failed[..., None], np.nan, 0.0)[None]
             self.run.report_failures(piece, place.finite, place.steps)
         stats = {**place.counts["stats"], **piece.stats}
@@ -190,6 +190,13 @@ class StoredRun:
         if "domain_exit" in store.noted:
             stats["domain_exit"] = store.noted["domain_exit"]
             message += store.noted["warning"]
+        if "passed" in store.noted:
+            at = np.array(store.noted["failed_at"], dtype=float)
+            before = np.asarray(stats.get("failed_at", np.nan), dtype=float)
+            at = np.fmin(at, before) if problem.t1 > problem.t0 else np.fmax(at, before)
+            passed = np.where(np.isnan(at), piece.status, -1)
+            piece.status, stats["failed_at"] = (passed, at) if at.ndim else (int(passed), float(at))
+            message = store.noted["passed"] + " What the store holds after that means nothing."
         place.counts["stats"] = stats
         store.finish(place, piece.status, message)
         return Outcome(*self._nothing, piece.status, message, stats, finite=True)

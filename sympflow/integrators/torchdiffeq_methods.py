@@ -28,7 +28,7 @@ from sympflow.arrays import (
     transformed,
 )
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Recorder
+from sympflow.integrators.base import FixedStep, KernelStepper, Recorder, Stepper, compiled_loops
 from sympflow.integrators.contract import ENDED, ByVectorField, Integrator, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
@@ -558,7 +558,7 @@ def __getattr__(name: str) -> type[Integrator]:
 
 @dataclass(frozen=True)
 class FixedGrid(ExplicitStep, FixedStep):
-    """A fixed-step Runge–Kutta method of torchdiffeq.
+    """A fixed-step Runge–Kutta method of torchdiffeq; compiled for arrays where H is symbolic.
 
     Parameters
     ----------
@@ -566,7 +566,18 @@ class FixedGrid(ExplicitStep, FixedStep):
         Step length; the default is `system.dt`.
     """
 
+    compiles: ClassVar[bool] = True
     tableau: ClassVar[Tableau]
+
+    def stepper(self, problem: Problem) -> Stepper:
+        told: list[str] = []
+        kernel = compiled_loops(
+            lambda: self.compiled(problem.system, "explicit_kernel", self.tableau),
+            problem.y0,
+            problem.backend,
+            told=told,
+        )
+        return Stepper(self, problem, told) if kernel is None else KernelStepper(self, problem, kernel)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact.

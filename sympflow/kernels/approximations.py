@@ -30,11 +30,9 @@ UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
 
 
 def position_ranges(symbols: SymbolicHamiltonian, domain: Domain) -> Ranges:
-    """The intervals of the positions in a domain; none for a V of which kicks make no use of them."""
+    """The interval of the position in a domain of one degree of freedom; none for a V that makes no use of it."""
     assert symbols.V is not None
-    if symbols.V.is_polynomial(*symbols.q) or symbols.V.has(*UNTOUCHED):
-        return ()
-    if symbols.ndof > 1 and not any(len(f.args) == 1 for f in symbols.V.atoms(sp.Function)):
+    if symbols.ndof > 1 or symbols.V.is_polynomial(*symbols.q) or symbols.V.has(*UNTOUCHED):
         return ()
     q = domain.sample(STATES, 0)[:, : symbols.ndof]
     margin = MARGIN * (q.max(0) - q.min(0))

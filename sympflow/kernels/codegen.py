@@ -12,7 +12,6 @@ from sympy.printing.pycode import PythonCodePrinter
 from sympflow.hamiltonian.driving import sampled
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
-from sympflow.kernels.variations import Variations
 
 __all__ = [
     "algebra_source",
@@ -26,7 +25,6 @@ __all__ = [
     "sampled_name",
     "statements",
     "tuple_algebra",
-    "variations_source",
     "vectorised",
 ]
 
@@ -154,18 +152,7 @@ def algebra_source(symbols: SymbolicHamiltonian) -> str:
     return "\n\n\n".join(parts) + "\n"
 
 
-def variations_source(variations: Variations) -> str:
-    """The drift of an orbit and its deviation vectors; their kick is scheduled.
-
-    Raises
-    ------
-    ValueError
-        As `algebra_source`.
-    """
-    return _drift(variations, list(variations.velocity))
-
-
-def _drift(symbols: SymbolicHamiltonian | Variations, velocity: list[sp.Expr]) -> str:
+def _drift(symbols: SymbolicHamiltonian, velocity: list[sp.Expr]) -> str:
     numbers = "numbers, " if symbols.parameters else ""
     results = [f"a*{{{i}}}" for i in range(symbols.ndof)]
     return _function(symbols, "drift", f"p, a, {numbers}work", velocity, results)
@@ -266,14 +253,14 @@ def as_factor(number: sp.Expr) -> str:
     return f"({printed(number)})" if number.free_symbols else repr(float(number))
 
 
-def parameter_lines(symbols: SymbolicHamiltonian | Variations, lines: Sequence[str]) -> list[str]:
+def parameter_lines(symbols: SymbolicHamiltonian, lines: Sequence[str]) -> list[str]:
     """Assignments of the parameters that occur in lines of code; their values are the last ones of `numbers`."""
     words, n = set(re.findall(r"\w+", " ".join(lines))), len(symbols.parameters)
     return [f"{s} = numbers[-{n - i}]" for i, s in enumerate(symbols.parameters) if s.name in words]
 
 
 def _function(
-    symbols: SymbolicHamiltonian | Variations,
+    symbols: SymbolicHamiltonian,
     name: str,
     arguments: str,
     expressions: list[sp.Expr],

@@ -18,11 +18,11 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.codegen import algebra_source, tuple_algebra
-from sympflow.kernels.loop_functions import plain_kicks_source, takes_values
+from sympflow.kernels.loop_functions import plain_kicks_source
 from sympflow.kernels.modules import load_module, template
 from sympflow.kernels.protocol import Carry, Run, Steps
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
-from sympflow.kernels.stages import kicks_of, numbers_source, run_table, stages_source
+from sympflow.kernels.stages import kicks_of, numbers_source, run_table, stages_source, takes_values
 from sympflow.kernels.terms import is_large
 from sympflow.schemes import Scheme
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,14 +14,13 @@ from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, Map
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.implicit_loops import implicit_kernel
-from sympflow.kernels.loop_functions import LoopFunctions
-from sympflow.kernels.parts_loops import parts_loops
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
-from sympflow.kernels.timed_loops import reach_times
 from sympflow.schemes import CURVATURE, Scheme
+
+if TYPE_CHECKING:
+    from sympflow.kernels.splitting_loops import Functions
 
 __all__ = [
     "ClockedFlowKernel",
@@ -183,6 +182,21 @@ class PrimedFlowKernel(Kernel):
                 out[rows] = self._stepped(np.abs(h[rows]), y[rows], back, times[rows])
         return Steps(out)
 
+    def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """ψ̄_h of each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d): see `Kernel`."""
+        from sympflow.kernels.tangents import step_tangents
+
+        tables, out, A = self._tables, y.copy(), np.broadcast_to(np.eye(y.shape[1]), (*y.shape, y.shape[1])).copy()
+        for back, rows in ((False, h > 0), (True, h < 0)):
+            if rows.any():
+                t = np.abs(h[rows])
+                table = tables.kept(("polynomials", back), partial(tables.polynomials, back))
+                found = step_tangents(self.system, table, tables.variable(t), t, y[rows], tables.monomials)
+                if found is None:
+                    return None
+                out[rows], A[rows] = found
+        return out, A
+
     def _stepped(self, h: np.ndarray, y: np.ndarray, back: bool, t: ArrayLike) -> np.ndarray:
         tables, loops = self._tables, self._splitting
 
@@ -200,7 +214,7 @@ class PrimedFlowKernel(Kernel):
             return self._splitting.damped_kernel(scheme, partial(_stepped_by, step))
         return self._splitting.kernel(scheme, self._compensated, self._ranges)
 
-    def _functions(self) -> LoopFunctions:
+    def _functions(self) -> Functions:
         """The compiled functions for the kicks of the flow."""
         tables = self._tables
         return self._splitting.functions(tables.level, self._compensated, tables.monomials, ranges=self._ranges)
@@ -269,6 +283,8 @@ class SplitFlowKernel(Kernel):
     saves_finite = True
 
     def __init__(self, maps: MapSource, parts: ExactParts, dt: float) -> None:
+        from sympflow.kernels.parts_loops import parts_loops
+
         self.parts, self._maps, self._dt = parts, maps, dt
         self._loops = parts_loops(parts)
         self._kernel = self._loops.kernel(lambda h: maps.maps(float(h)))
@@ -382,10 +398,12 @@ class ClockedFlowKernel(Kernel):
         expected: float,
         numbers: tuple[float, ...] | None = None,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The states of rows of `y0` (N, 2d) at elapsed times: see `timed_loops.reach_times`.
+        """The states of rows of `y0` (N, 2d) at elapsed times: see `elapsed_times.reach_times`.
 
         `numbers` are those of the clock, if they have been asked for.
         """
+        from sympflow.kernels.elapsed_times import reach_times
+
         numbers = self._numbers() if numbers is None else numbers
         return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)
 
@@ -405,6 +423,8 @@ class CollocatedFlowKernel(Kernel):
     saves_finite = False
 
     def __init__(self, system: HamiltonianSystem, tableau: Tableau, steps: int) -> None:
+        from sympflow.kernels.implicit_loops import implicit_kernel
+
         self._kernel, self._steps = implicit_kernel(system, tableau), steps
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:

@@ -17,7 +17,6 @@ from sympflow.kernels.approximations import UNTOUCHED, Letters, OnInterval, Rang
 from sympflow.kernels.codegen import as_factor, parameter_lines, printed, vectorised
 from sympflow.kernels.scheduling import ADD, FUSED, PRODUCTS, Schedule, nested
 from sympflow.kernels.stages import kicks_of
-from sympflow.kernels.variations import Variations
 
 __all__ = ["kick_cycles", "kicks_source", "shapes"]
 
@@ -62,7 +61,6 @@ def kicks_source(
     symbols: SymbolicHamiltonian,
     level: int,
     monomials: Monomials = (),
-    vectors: int = 0,
     varied: bool = False,
     ranges: Ranges = (),
     joined: bool = False,
@@ -74,9 +72,6 @@ def kicks_source(
     ``fill_coefficients(numbers, row)`` computes. ``kicked_lane(q, p, numbers)`` has the fewest operations, for many
     trajectories at once. ``drifted(q, p, a)`` is the drift of a single one. Where H has parameters, `numbers` end with
     their values, and ``drifted(q, p, numbers, a)`` takes them too.
-
-    With deviation vectors q and p hold these after those of the orbit (`Variations`), and a kick moves them by its
-    exact linearisation, of which the entries are computed once for all of them, together with the kick of the orbit.
 
     Where lanes are `varied`, each with its own values of the parameters, the kick of a lane takes what depends on these
     and on no state from a table: ``fill_own(numbers, own, lane)`` computes `N_OWN` numbers for a lane, and
@@ -94,11 +89,11 @@ def kicks_source(
     ValueError
         If a function in H has no counterpart in compiled code.
     """
-    key = symbols.H, symbols.parameters, level, monomials, vectors, ranges, joined
+    key = symbols.H, symbols.parameters, level, monomials, ranges, joined
     if key not in _SOURCES:
         if len(_SOURCES) >= MOST_KEPT:
             del _SOURCES[next(iter(_SOURCES))]
-        _SOURCES[key] = _source(Variations(symbols, vectors) if vectors else symbols, level, monomials, ranges, joined)
+        _SOURCES[key] = _source(symbols, level, monomials, ranges, joined)
     source, own = _SOURCES[key]
     return f"{source}\n\n{own}" if varied else source
 
@@ -131,12 +126,12 @@ def kick_cycles(symbols: SymbolicHamiltonian, level: int, ranges: Ranges = (), j
     return min(kick.cycles for kick in tried)
 
 
-_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, int, Ranges, bool], tuple[str, str]] = {}
+_SOURCES: dict[tuple[sp.Expr, tuple[sp.Symbol, ...], int, Monomials, Ranges, bool], tuple[str, str]] = {}
 """Sources, and those of varied lanes, by H: systems are often made again, and the search takes a tenth of a second."""
 
 
 def _source(
-    symbols: SymbolicHamiltonian | Variations, level: int, monomials: Monomials, ranges: Ranges, joined: bool
+    symbols: SymbolicHamiltonian, level: int, monomials: Monomials, ranges: Ranges, joined: bool
 ) -> tuple[str, str]:
     functions: list[str] = []
     fill: list[str] = []
@@ -181,7 +176,7 @@ def _source(
     return source, _own_source(symbols, kinds[0].name, kinds[0].numbers, many)
 
 
-def _own_source(symbols: SymbolicHamiltonian | Variations, name: str, numbers: Sequence[str], kick: _Kick) -> str:
+def _own_source(symbols: SymbolicHamiltonian, name: str, numbers: Sequence[str], kick: _Kick) -> str:
     """The functions of varied lanes, of a level that has the kick of this name and numbers alone."""
     body = [*kick.lines, *kick.results]
     letters = [s.name for s in symbols.parameters]
@@ -201,7 +196,7 @@ def _own_source(symbols: SymbolicHamiltonian | Variations, name: str, numbers: S
     return f"N_OWN = {len(own)}\n\n\n{filling}\n\n\n{kicked}\n"
 
 
-def _drift_source(symbols: SymbolicHamiltonian | Variations) -> str:
+def _drift_source(symbols: SymbolicHamiltonian) -> str:
     """``drifted(q, p, a)``, q + a M⁻¹p or q + a∇T, the products with a, for which no state waits, made first."""
     M, d = symbols.inverse_mass, symbols.ndof
     numbers = "numbers, " if symbols.parameters else ""
@@ -230,7 +225,7 @@ def _mentions(code: str, name: str) -> bool:
 
 
 def _function(
-    symbols: SymbolicHamiltonian | Variations, name: str, arguments: str, lines: Sequence[str], *results: Sequence[str]
+    symbols: SymbolicHamiltonian, name: str, arguments: str, lines: Sequence[str], *results: Sequence[str]
 ) -> str:
     """A compiled function that returns a tuple, or several."""
     unpacked = [f"{', '.join(s.name for s in v)}, = {x}" for v, x in ((symbols.q, "q"), (symbols.p, "p"))]
@@ -239,7 +234,7 @@ def _function(
 
 
 def _scheduled(
-    symbols: SymbolicHamiltonian | Variations,
+    symbols: SymbolicHamiltonian,
     shape: Sequence[sp.Expr],
     prefix: str,
     common: bool = True,
@@ -257,26 +252,14 @@ def _scheduled(
     states = {*symbols.q, *symbols.p, *letters}
     for letter, function in letters.items():
         schedule.define(letter, function)
-    d = len(shape)
-    slopes = _linearised(shape, symbols) if isinstance(symbols, Variations) else {}
-    shape = [_numbered(f, states, numbers) for f in (*shape, *slopes.values())]
+    shape = [_numbered(f, states, numbers) for f in shape]
     for coefficient, symbol in numbers.items():  # as one: what is common to several would else be taken out of them
         schedule.define(symbol, coefficient)
     if common:
         shared, shape = sp.cse(shape, symbols=sp.numbered_symbols("common_", real=True), list=True, order="none")
         for symbol, expression in shared:
             schedule.define(symbol, expression)
-    results = [schedule.value(f)[1] for f in shape[:d]]
-    if isinstance(symbols, Variations):
-        entries = dict(zip(slopes, shape[d:], strict=True))
-        for w_q, w_p in symbols.pairs():
-            for i, s in enumerate(w_p):
-                terms = [
-                    sp.Mul(entries[min(i, j), max(i, j)], w_q[j], evaluate=False)
-                    for j in range(d)
-                    if (min(i, j), max(i, j)) in entries
-                ]
-                results.append(schedule.value(sp.Add(s, *terms, evaluate=False))[1])
+    results = [schedule.value(f)[1] for f in shape]
     operations = schedule.operations + _moving(symbols)
     if joined:
         lines = [*schedule.lines]
@@ -288,9 +271,7 @@ def _scheduled(
     return _Kick(schedule.early, schedule.lines, results, cycles, operations, condition)
 
 
-def _joined(
-    symbols: SymbolicHamiltonian | Variations, schedule: Schedule, momenta: Sequence[str]
-) -> tuple[list[str], list[str]]:
+def _joined(symbols: SymbolicHamiltonian, schedule: Schedule, momenta: Sequence[str]) -> tuple[list[str], list[str]]:
     """The lines of q + a M⁻¹p after those of p in a schedule, and their results."""
     M, n = symbols.inverse_mass, len(schedule.lines)
     assert M is not None
@@ -304,20 +285,10 @@ def _joined(
     return [*factors, *schedule.lines[n:]], moved
 
 
-def _linearised(shape: Sequence[sp.Expr], symbols: Variations) -> dict[tuple[int, int], sp.Expr]:
-    """The entries of the upper triangle of ∂p/∂q after a kick that are not zero: a kick is a gradient."""
-    q = symbols.symbols.q
-    entries = {(i, j): sp.diff(f, q[j]) for i, f in enumerate(shape) for j in range(i, len(q))}
-    return {place: printable(f) for place, f in entries.items() if f != 0}
-
-
-def _tried(
-    symbols: SymbolicHamiltonian | Variations, terms: int, prefix: str, monomials: Monomials, joined: bool
-) -> list[_Kick]:
-    own = symbols.symbols if isinstance(symbols, Variations) else symbols
+def _tried(symbols: SymbolicHamiltonian, terms: int, prefix: str, monomials: Monomials, joined: bool) -> list[_Kick]:
     return [
         _scheduled(symbols, shape, prefix, common, joined=joined)
-        for shape in shapes(own, terms, monomials)
+        for shape in shapes(symbols, terms, monomials)
         for common in (True, False)
     ]
 
@@ -506,7 +477,7 @@ def _sum_of(products: Sequence[Sequence[sp.Expr]]) -> sp.Expr:
     return sp.Add(*[sp.Mul(*factors, evaluate=False) for factors in terms], evaluate=False)
 
 
-def _moving(symbols: SymbolicHamiltonian | Variations) -> int:
+def _moving(symbols: SymbolicHamiltonian) -> int:
     """The products of a drift."""
     return sum(sp.diff(symbols.T, p).has(s) or s == p for p in symbols.p for s in symbols.p)
 

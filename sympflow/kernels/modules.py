@@ -1,4 +1,4 @@
-"""Generated source as importable modules, kept in a per-user folder so that Numba's disk cache applies; threads."""
+"""Generated source as importable modules, kept in a per-user folder so that Numba's disk cache applies."""
 
 from __future__ import annotations
 
@@ -10,54 +10,35 @@ import shutil
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar, copy_context
-from functools import cache, partial
+from functools import cache
 from importlib.resources import files
-from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
-import numpy as np
 from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
-from numpy.typing import ArrayLike, DTypeLike
 
 __all__ = [
-    "NEVER",
     "OPTIONS",
-    "at_most",
     "cache_folder",
     "compiling_alone",
     "constants_source",
     "elementary",
-    "given",
     "imports_source",
     "load_algebra",
-    "load_around",
     "load_module",
-    "run_one",
-    "run_rows",
     "template",
-    "threads_for",
 ]
-
-T = TypeVar("T")
 
 OPTIONS = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 """Options of the compiler: 1/0 is inf, a·b + c may be fused; nothing else about rounding or NaN is relaxed."""
 
 _INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}  # options of functions that only others call
 _CALLED = {"rollout", "rollout_rows"}  # functions that others call, and Python as well
-_BLOCK = 64  # a thread takes a multiple of so many rows
-LONG = 100_000_000  # units of work from which a run can be interrupted
-NEVER = np.zeros(1, dtype=np.int64)
-"""The `stop` of runs that are not stopped."""
-_WORTH_A_THREAD = 500_000  # units of work, about a nanosecond each, below which another thread does not pay
 
 
 def template(name: str) -> str:
@@ -77,12 +58,6 @@ def cache_folder() -> Path:
         if folder := os.environ.get(variable):
             return Path(folder) / "sympflow"
     return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "sympflow"
-
-
-def given(x: ArrayLike, dtype: DTypeLike = np.float64) -> np.ndarray:
-    """An array as compiled functions are given it: contiguous, and not read-only, for which Numba compiles another."""
-    array = np.ascontiguousarray(x, dtype=dtype)
-    return array if array.flags.writeable else array.copy()
 
 
 def constants_source(cache: bool = True, **constants: Any) -> str:
@@ -118,14 +93,6 @@ def load_module(source: str, shared: Sequence[str] = ()) -> ModuleType:
     """
     with _loading:
         return _loaded(source, tuple(shared))
-
-
-def load_around(source: str, shared: Sequence[str] = (), **given: Any) -> ModuleType:
-    """`load_module` of a source around compiled functions of the user, which it knows as `given`; kept on no disk."""
-    module = ModuleType("sympflow_kernel_around")
-    vars(module).update(given)
-    exec(imports_source(shared) + source, vars(module))
-    return _callable_part(module)
 
 
 @cache
@@ -270,59 +237,3 @@ def _write_once(folder: Path, name: str, source: str) -> Path:
 
 _loading = threading.RLock()
 """Held while modules are made: another thread would see one of which some names are there."""
-_most_threads: ContextVar[int | None] = ContextVar("most_threads", default=None)
-
-
-@contextmanager
-def at_most(threads: int) -> Iterator[None]:
-    """Run what is inside, in this thread, on at most so many threads: for callers that have workers of their own."""
-    token = _most_threads.set(threads)
-    try:
-        yield
-    finally:
-        _most_threads.reset(token)
-
-
-def run_one(call: Callable[[np.ndarray], T], work: float) -> T:
-    """``call(stop)``, whose work takes about so many nanoseconds or more; it must end soon once ``stop[0]`` is set.
-
-    Compiled code in the main thread holds Ctrl-C off until it returns. So what takes long runs in another thread, and
-    this one waits.
-    """
-    if work < LONG:
-        return call(NEVER)
-    return _run_in_threads([call])[0]
-
-
-def threads_for(n_pieces: int, work: float, threads: int | None) -> int:
-    """The number of threads for so many pieces and nanoseconds of work: that given, or as many as pay."""
-    threads = _most_threads.get() if threads is None else threads
-    if threads is None:
-        threads = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
-        threads = min(threads, 1 + int(work // _WORTH_A_THREAD))
-    return max(1, min(threads, n_pieces))
-
-
-def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_row: float, threads: int | None) -> None:
-    """Call ``rows(slice, stop)`` over 0 … n_rows, on several threads if the work is worth it.
-
-    `rows` releases the GIL; for `stop` see `run_one`.
-    """
-    n_blocks = -(-n_rows // _BLOCK)
-    threads = threads_for(n_blocks, n_rows * work_per_row, threads)
-    if threads == 1:
-        run_one(partial(rows, slice(0, n_rows)), n_rows * work_per_row)
-        return
-    bounds = [_BLOCK * (n_blocks * k // threads) for k in range(threads)] + [n_rows]
-    _run_in_threads([partial(rows, slice(*ends)) for ends in pairwise(bounds)])
-
-
-def _run_in_threads(calls: Sequence[Callable[[np.ndarray], T]]) -> list[T]:
-    stop = np.zeros(1, dtype=np.int64)
-    with ThreadPoolExecutor(len(calls)) as pool:
-        futures = [pool.submit(copy_context().run, call, stop) for call in calls]  # with the limit of `at_most`
-        try:
-            return [future.result() for future in futures]
-        except BaseException:  # of the user's, most likely: the threads need not go on
-            stop[0] = 1
-            raise

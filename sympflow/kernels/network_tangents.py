@@ -1,23 +1,39 @@
-"""Compiled derivatives of SympFlows with MLP potentials by their weights, for Gauss–Newton fits."""
+"""Compiled derivatives of SympFlows with MLP potentials by their weights, for Gauss–Newton fits.
+
+With directions e_j of x and the velocity ẋ at the rate 1 of t, dots for derivatives along these,
+
+    a₁ = K x + k t + b₁,  z = σ(a),  a' = W z + b,                V = w · z_n,    r = σ'(a) Wᵀ r',
+    z_j = σ' a_j,  ż = σ' ȧ,  ż_j = σ'' a_j ȧ + σ' ȧ_j,           ∂_jV = w · z_j,  d/dt ∂_jV = w · ż_j.
+
+The reverse sweep of w · ż_j meets r for ż_j, ṙ for z_j, A for ż and C for z; that of w · z_j meets r for z_j and A for
+z. A state is moved by differences between t and 0. The derivatives P of what is fitted by the state after a layer, and
+M by its velocity, are pulled back from layer to layer.
+
+Points are the lanes of registers, all else is loops over memory.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from types import ModuleType
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sympflow.kernels.modules import OPTIONS, load_module, run_rows, template
+from sympflow.compiler.control import INT, POINTER, Code, Module, Rows, Type, Value
+from sympflow.compiler.functions import fma
+from sympflow.compiler.machine import host
+from sympflow.kernels.activations import bent
+from sympflow.kernels.rollouts import filled
+from sympflow.kernels.runs import finished
+from sympflow.kernels.threads import run_rows
 
-__all__ = ["BENDING", "NetworkTangents", "TrainedNetwork"]
+__all__ = ["NetworkTangents", "TrainedNetwork"]
 
-BENDING = ("tanh", "sin", "sigmoid", "softplus", "logcosh", "swish")
-"""The activations that have three derivatives in compiled code: see the text `activation_bends`."""
-
-LANES = 32  # points side by side, which divide those that a thread takes
+LANES = 16  # points side by side, which divide those that a thread takes
+REGISTER = Type("double", LANES)
 
 
 @dataclass(frozen=True)
@@ -51,23 +67,26 @@ class NetworkTangents:
         d.
     is_kick : sequence of bool
     networks : sequence of TrainedNetwork
-        Of the layers, in their order, as are their parameters; all alike, with an activation of `BENDING`.
+        Of the layers, in their order, as are their parameters; all alike, with an activation of `SLOPES`.
     """
 
     def __init__(self, ndof: int, is_kick: Sequence[bool], networks: Sequence[TrainedNetwork]) -> None:
         self.ndof = ndof
-        self._is_kick, self._units = np.array(is_kick), np.concatenate([n.units for n in networks])
+        self._is_kick = np.array(is_kick, dtype=np.int64)
+        self._units = np.concatenate([n.units for n in networks])
         first = networks[0]
-        self._activation, self._plan = first.activation, _plan(ndof, first.inputs, first.widths)
+        self._sizes = _Sizes(ndof, first.inputs, max(first.widths), len(first.widths))
+        self._places, self._activation = self._sizes.places(first.widths), first.activation
         self._kept: dict[tuple[bool, int], np.ndarray] = {}
 
     def values(
         self, parameters: np.ndarray, t: np.ndarray, x: np.ndarray, constants: np.ndarray, velocity: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         """ψ̄_t(x) and, if asked for, d/dt ψ̄_t(x), of states (N, 2d) at times (N,), constants being (inputs − d, N)."""
-        y, dy = np.empty(x.shape), np.empty(x.shape if velocity else (0, 0))
-        self._run(velocity, "map_points", len(t), 1, parameters, t, x, constants, (y, dy))
-        return y, dy
+        y = np.empty((2 * self.ndof * (1 + velocity), max(len(t), LANES)))
+        self._run("values", velocity, 1, parameters, t, x, constants, [y])
+        y, dy = y[: 2 * self.ndof, : len(t)], y[2 * self.ndof :, : len(t)]
+        return np.ascontiguousarray(y.T), np.ascontiguousarray(dy.T) if velocity else np.empty((0, 0))
 
     def jacobian(
         self,
@@ -92,54 +111,426 @@ class NetworkTangents:
         by_start : ndarray, shape (2d, 2d, N), optional
             Filled with the derivatives of the functions by x, without those of constants.
         """
-        velocity = by_velocity is not None
-        key, shape = (velocity, len(t)), (len(parameters), 2 * self.ndof, len(t))
+        velocity, m, N = by_velocity is not None, 2 * self.ndof, len(t)
+        key, shape = (velocity, N), (len(parameters), m, max(N, LANES))
         if key not in self._kept:
             self._kept = {k: J for k, J in self._kept.items() if k[0] != velocity} | {key: np.empty(shape)}
         J = self._kept[key]
-        factors = by_state, by_velocity if velocity else np.zeros(2 * self.ndof)
-        rest = self._units, *factors, J, np.empty((0, 0, 0)) if by_start is None else by_start
-        self._run(velocity, "differentiate", len(t), 10 * self.ndof, parameters, t, x, constants, rest)
-        return J
+        start = np.empty((m, m, shape[2]) if by_start is not None else 0)
+        by = np.zeros(m) if by_velocity is None else np.ascontiguousarray(by_velocity)
+        factors = [filled(by_state.transpose(1, 2, 0), LANES), by, self._units, self._places, J, start]
+        flags = len(self._places), int(by_start is not None)
+        self._run("jacobian", velocity, 10 * self.ndof, parameters, t, x, constants, factors, *flags)
+        if by_start is not None:
+            by_start[:] = start[..., :N]
+        return J[..., :N]
 
     def _run(
         self,
-        velocity: bool,
         name: str,
-        n_points: int,
+        velocity: bool,
         factor: int,
         parameters: np.ndarray,
         t: np.ndarray,
         x: np.ndarray,
         constants: np.ndarray,
-        rest: tuple[Any, ...],
+        rest: Sequence[np.ndarray],
+        *flags: int,
     ) -> None:
-        """Call a function of the text on all blocks of points, on several threads where it pays."""
-        function: Callable[..., None] = getattr(_loops(self._activation, velocity), name)
-        weights = parameters * self._units
+        """Call a function on all blocks of points, on several threads where it pays."""
+        n_layers, n = len(self._is_kick), len(parameters)
+        weights = np.zeros((n_layers, self._sizes.size))
+        weights[:, self._places] = (parameters * self._units).reshape(n_layers, -1)
+        points = [weights, self._is_kick, *(filled(a, LANES) for a in (t, x.T, constants)), *rest]
+        addresses = [a.ctypes.data for a in points]
+        function = _compiled(name, self._sizes, self._activation, velocity)
 
-        def rows(points: slice, stop: np.ndarray) -> None:
-            blocks = points.start // LANES, -(-points.stop // LANES)
-            function(weights, self._plan, self._is_kick, t, x, constants, *blocks, *rest)
+        def rows(i: slice, stop: np.ndarray) -> None:
+            work = np.zeros(LANES * (self._sizes.work + (n_layers + 1) * self._sizes.state))
+            blocks = i.start // LANES, -(-i.stop // LANES)
+            function(*addresses, work.ctypes.data, n_layers, max(len(t), LANES), *blocks, *flags)
 
-        run_rows(rows, n_points, factor * len(weights), None)
+        run_rows(rows, len(t), factor * n, None)
 
 
-def _plan(ndof: int, inputs: int, widths: tuple[int, ...]) -> tuple[Any, ...]:
-    """The plan of networks as the text takes it."""
-    h = np.array(widths)
-    time = inputs * widths[0]
-    out = time + widths[0]
-    biases = out + widths[-1] + np.cumsum([0, *widths[:-1]])
-    matrices = biases[-1] + widths[-1] + np.cumsum([0, *(h[1:] * h[:-1])])
-    return ndof, inputs, h, biases, matrices[:-1], time, out, int(matrices[-1])
+class _Sizes(NamedTuple):
+    """The sizes of networks, whose layers are as wide as the widest one: weights that they have not are 0.
+
+    The weights of a network are K (h, inputs), k, w (h,), b (n, h), W (n − 1, h, h), one after another.
+    """
+
+    ndof: int
+    inputs: int
+    h: int
+    n: int
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Where K, k, w, b and W begin, and where they end."""
+        h = self.h
+        sizes = self.inputs * h, h, h, self.n * h, (self.n - 1) * h * h
+        return tuple(int(x) for x in np.cumsum([0, *sizes]))
+
+    @property
+    def size(self) -> int:
+        return self.starts[-1]
+
+    @property
+    def state(self) -> int:
+        """Numbers of q, p, q̇ and ṗ, with the constants of a step behind each."""
+        return 4 * self.inputs
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """Numbers of what is kept of a sweep, of a direction, of the derivatives of what is fitted."""
+        levels, h, d = self.n * self.h, self.h, self.ndof
+        sweep = ("z", "s", "u", "v", "dz", "da", "R", "r", "dR", "dr")
+        along = ("aj", "daj", "zj", "dzj")
+        rest = {"A": h, "C": h, "RA": h, "RC": h, "P": 4 * d * d, "M": 4 * d * d}
+        rest |= {"G": d * self.size, "dG": d * self.size, "H": d * d, "dH": d * d}
+        return dict.fromkeys((*sweep, *along), levels) | rest
+
+    @property
+    def work(self) -> int:
+        return sum(self.parts.values())
+
+    def places(self, widths: Sequence[int]) -> np.ndarray:
+        """Where each parameter of networks of these widths stands among the weights."""
+        h, (K, k, w, b, W, _) = self.h, self.starts
+        rows = [K + np.arange(widths[0] * self.inputs), k + np.arange(widths[0]), w + np.arange(widths[-1])]
+        rows += [b + level * h + np.arange(width) for level, width in enumerate(widths)]
+        for level, (below, above) in enumerate(pairwise(widths)):
+            rows.append((W + (level * h + np.arange(above)[:, None]) * h + np.arange(below)).ravel())
+        return np.concatenate(rows)
+
+
+class _Sweeps:
+    """The code of one network: its values, and their derivatives along directions and by the weights.
+
+    Parameters
+    ----------
+    code : Code
+    sizes : _Sizes
+    activation : str
+    velocity : bool
+    theta, work : Value
+        Addresses of the weights, and of memory.
+    """
+
+    def __init__(self, code: Code, sizes: _Sizes, activation: str, velocity: bool, theta: Value, work: Value) -> None:
+        self.code, self.sizes, self.velocity, self.theta = code, sizes, velocity, theta
+        self.activation = bent(activation, 3 if velocity else 2)
+        self.K, self.k, self.w, self.b, self.W, _ = sizes.starts
+        self.rows, at = {}, 0
+        for name, size in sizes.parts.items():
+            self.rows[name] = Rows(code.at(work, at * LANES), REGISTER)
+            at += size
+
+    def weight(self, i: Any) -> Value:
+        return self.code.splat(self.code.load(self.theta, i), LANES)
+
+    def product(self, count: int, weight: Callable[[Any], Value], start: Sequence[Value], *rows: Any) -> list[Value]:
+        """start + Σ_m weight(m) row(m) of each of the rows."""
+
+        def more(m: Value, totals: Sequence[Value]) -> list[Value]:
+            w = weight(m)
+            return [fma(w, row(m), total) for row, total in zip(rows, totals, strict=True)]
+
+        return self.code.loop(count, start[: len(rows)], more)
+
+    def sweep(self, x: Rows, dx: Rows, t: Value, rate: Value) -> None:
+        """z, σ', σ'', σ''', ż, ȧ, and back R = Wᵀr', r, Ṙ = Wᵀṙ', ṙ of all levels, at times t."""
+        code, h, n, inputs, velocity = self.code, self.sizes.h, self.sizes.n, self.sizes.inputs, self.velocity
+        z, s, u, v, dz, da, R, r, dR, dr = (
+            self.rows[name] for name in ("z", "s", "u", "v", "dz", "da", "R", "r", "dR", "dr")
+        )
+        zero = code.constant(0.0, REGISTER)
+
+        def activated(at: Value, a: Value, change: Value | None = None) -> None:
+            z[at], s[at], u[at], *twist = self.activation(a)
+            if change is not None:
+                v[at], da[at], dz[at] = twist[0], change, s[at] * change
+
+        def weighted(at: Value, total: Value, change: Value) -> None:
+            R[at], r[at] = total, total * s[at]
+            if velocity:
+                dR[at], dr[at] = change, fma(total * u[at], da[at], change * s[at])
+
+        with code.over(h) as i:
+            k = self.weight(i + self.k)
+            start = [fma(k, t, self.weight(i + self.b)), k * code.splat(rate, LANES)]
+            given = [x.__getitem__, dx.__getitem__][: 1 + velocity]
+            activated(i, *self.product(inputs, lambda m: self.weight(i * inputs + m), start, *given))
+        with code.over(n - 1) as level, code.over(h) as i:
+            row, below = (level * h + i) * h + self.W, level * h
+            start = [self.weight((level + 1) * h + i + self.b), zero]
+            given = [lambda m: z[below + m], lambda m: dz[below + m]][: 1 + velocity]
+            activated((level + 1) * h + i, *self.product(h, lambda m: self.weight(row + m), start, *given))
+        with code.over(h) as i:
+            weighted(i + (n - 1) * h, self.weight(i + self.w), zero)
+        with code.over(n - 1) as down:
+            level = (n - 2) - down
+            with code.over(h) as m:
+                column, above = level * (h * h) + m + self.W, (level + 1) * h
+                given = [lambda i: r[above + i], lambda i: dr[above + i]][: 1 + velocity]
+                total = self.product(h, lambda i: self.weight(column + i * h), [zero, zero], *given)
+                weighted(level * h + m, total[0], total[-1])
+
+    def add_moved(self, r: Rows, sign: Value, target: Rows) -> None:
+        """target += sign · Kᵀ r."""
+        code, h, inputs = self.code, self.sizes.h, self.sizes.inputs
+        with code.over(self.sizes.ndof) as j:
+            zero = code.constant(0.0, REGISTER)
+            total = self.product(h, lambda i: self.weight(i * inputs + j), [zero], r.__getitem__)
+            target.add(j, (sign, total[0]))
+
+    def add_sensitivities(
+        self, x: Rows, dx: Rows, t: Value, rate: Value, sign: Value, j: Value, G: Rows, dG: Rows
+    ) -> None:
+        """Add sign times the derivatives of ∂_jV and d/dt ∂_jV by the weights to G and dG, by x to H and dH."""
+        code, sizes, velocity, rows = self.code, self.sizes, self.velocity, self.rows
+        h, n, inputs, d = sizes.h, sizes.n, sizes.inputs, sizes.ndof
+        z, s, u, v, dz, da = (rows[name] for name in ("z", "s", "u", "v", "dz", "da"))
+        R, r, dR, dr = (rows[name] for name in ("R", "r", "dR", "dr"))
+        aj, daj, zj, dzj = (rows[name] for name in ("aj", "daj", "zj", "dzj"))
+        A, C, RA, RC = (rows[name] for name in ("A", "C", "RA", "RC"))
+        zero = code.constant(0.0, REGISTER)
+
+        def along(at: Value, a: Value, change: Value) -> None:
+            aj[at], zj[at] = a, s[at] * a
+            if velocity:
+                daj[at], dzj[at] = change, fma(u[at] * a, da[at], s[at] * change)
+
+        with code.over(h) as i:
+            along(i, self.weight(i * inputs + j), zero)
+            RA[i] = RC[i] = zero
+        with code.over(n - 1) as level, code.over(h) as i:
+            row, below = (level * h + i) * h + self.W, level * h
+            given = [lambda m: zj[below + m], lambda m: dzj[below + m]][: 1 + velocity]
+            total = self.product(h, lambda m: self.weight(row + m), [zero, zero], *given)
+            along((level + 1) * h + i, total[0], total[-1])
+        with code.over(n) as down:
+            level = (n - 1) - down
+            with code.over(h) as i:
+                at = level * h + i
+                bend = u[at] * aj[at]
+                A[i] = a = fma(R[at], bend, RA[i] * s[at])
+                G.add(at + self.b, (sign, a))
+                if velocity:
+                    twist = fma(v[at] * aj[at], da[at], u[at] * daj[at])
+                    c = fma(RA[i] * u[at], da[at], RC[i] * s[at])
+                    C[i] = c = fma(R[at], twist, fma(dR[at], bend, c))
+                    dG.add(at + self.b, (sign, c))
+            with code.given(level > 0):
+                below = (level - 1) * h
+                with code.over(h) as i:
+                    at = level * h + i
+                    row, r_i, A_i = (below + i) * h + self.W, sign * r[at], sign * A[i]
+                    dr_i, C_i = (sign * dr[at], sign * C[i]) if velocity else (zero, zero)
+                    with code.over(h) as m:
+                        z_m, zj_m = z[below + m], zj[below + m]
+                        G.add(row + m, (r_i, zj_m), (A_i, z_m))
+                        if velocity:
+                            back = (r_i, dzj[below + m]), (A_i, dz[below + m]), (dr_i, zj_m), (C_i, z_m)
+                            dG.add(row + m, *back)
+                with code.over(h) as m:
+                    column = below * h + m + self.W
+                    given = [A.__getitem__, C.__getitem__][: 1 + velocity]
+                    total = self.product(h, lambda i: self.weight(column + i * h), [zero, zero], *given)
+                    RA[m], RC[m] = total[0], total[-1]
+        with code.over(h) as i:
+            A_i, C_i = sign * A[i], sign * C[i] if velocity else zero
+            with code.over(inputs) as m:
+                G.add(i * inputs + m, (A_i, x[m]))
+                if velocity:
+                    dG.add(i * inputs + m, (C_i, x[m]), (A_i, dx[m]))
+            G.add(i * inputs + j, (sign, r[i]))
+            G.add(i + self.k, (A_i, t))
+            G.add(i + self.w, (sign, zj[i + (n - 1) * h]))
+            if velocity:
+                dG.add(i * inputs + j, (sign, dr[i]))
+                dG.add(i + self.k, (C_i, t), (A_i, code.splat(rate, LANES)))
+                dG.add(i + self.w, (sign, dzj[i + (n - 1) * h]))
+        self.add_moved(A, sign, rows["H"].part(j * d))
+        if velocity:
+            self.add_moved(C, sign, rows["dH"].part(j * d))
+
+
+class _Points:
+    """The code of blocks of points: their way through all layers, and back.
+
+    Parameters
+    ----------
+    code : Code
+        Of a function of the addresses of weights, kinds of layers, times, states, constants, then `more`, then those of
+        memory; of the numbers of layers and of points, the first and the last block, then `flags`.
+    sizes, activation, velocity
+    more : int
+        How many addresses.
+    """
+
+    def __init__(self, code: Code, sizes: _Sizes, activation: str, velocity: bool, more: int) -> None:
+        self.code, self.sizes, self.velocity = code, sizes, velocity
+        self.theta, self.kicks, self.t, self.x, self.constants = code.arguments[:5]
+        self.more, self.work = code.arguments[5 : 5 + more], code.arguments[5 + more]
+        self.n_layers, self.n_points, self.first, self.last, *self.flags = code.arguments[6 + more :]
+        self.states = Rows(code.at(self.work, sizes.work * LANES), REGISTER)
+        self._given = sizes, activation, velocity
+
+    def sweeps(self, code: Code, theta: Value, work: Value) -> _Sweeps:
+        return _Sweeps(code, *self._given, theta, work)
+
+    def swept(self, theta: Value, x: Rows, dx: Rows, t: Value, rate: Value) -> _Sweeps:
+        """Call the sweep, which stands in the module once."""
+
+        def body(theta: Value, x: Value, dx: Value, t: Value, rate: Value, work: Value) -> None:
+            code = theta.code
+            self.sweeps(code, theta, work).sweep(Rows(x, REGISTER), Rows(dx, REGISTER), t, rate)
+
+        self.code.outlined("sweep", [theta, x.place, dx.place, t, rate, self.work], body)
+        return self.sweeps(self.code, theta, self.work)
+
+    def column(self, place: Value, i: Any, begin: Value) -> Value:
+        """The numbers of a row of an array (…, N) at the points from `begin` on."""
+        return self.code.load(place, i * self.n_points + begin, REGISTER)
+
+    def blocks(self) -> Any:
+        return self.code.over(self.last - self.first)
+
+    def begin(self, block: Value) -> Value:
+        """The first point of a block: the last one ends with the last point."""
+        return self.code.apply("min", ((self.first + block) * LANES, self.n_points - LANES))
+
+    def layer(self, i: Value) -> tuple[Value, Value, Value]:
+        """Its weights, whether it is a kick, and its sign."""
+        code = self.code
+        kick = code.apply("eq", (code.load(self.kicks, i, INT), 1))
+        sign = code.select(kick, code.constant(-1.0), code.constant(1.0))
+        return code.at(self.theta, i * self.sizes.size), kick, sign
+
+    def sides(self) -> Any:
+        """The columns t and 0."""
+        return self.code.over(2)
+
+    def side(self, k: Value) -> tuple[Value, Value]:
+        """The rate of time in a column, and its sign."""
+        code = self.code
+        of_time = code.apply("eq", (k, 0))
+        one = code.constant(1.0)
+        return code.select(of_time, one, code.constant(0.0)), code.select(of_time, one, code.constant(-1.0))
+
+    def forward(self, begin: Value) -> Value:
+        """The states q, p, q̇, ṗ before each layer and after the last one, and the times."""
+        code, sizes, d, inputs = self.code, self.sizes, self.sizes.ndof, self.sizes.inputs
+        t = self.column(self.t, 0, begin)
+        for half in range(2):
+            with code.over(d) as m:
+                self.states[m + half * inputs] = self.column(self.x, m + half * d, begin)
+                self.states[m + (2 + half) * inputs] = 0.0
+            with code.over(inputs - d) as m:
+                self.states[m + (half * inputs + d)] = self.column(self.constants, m, begin)
+                self.states[m + ((2 + half) * inputs + d)] = 0.0
+        with code.over(self.n_layers) as i:
+            theta, kick, sign = self.layer(i)
+            before, after = self.states.part(i * sizes.state), self.states.part((i + 1) * sizes.state)
+            with code.over(sizes.state) as m:
+                after[m] = before[m]
+            x, target = code.select(kick, 0 * i, 0 * i + inputs), code.select(kick, 0 * i + inputs, 0 * i)
+            with self.sides() as k:
+                rate, share = self.side(k)
+                times = t * code.splat(rate, LANES)
+                sweeps = self.swept(theta, before.part(x), before.part(x + 2 * inputs), times, rate)
+                change = code.splat(sign * share, LANES)
+                sweeps.add_moved(sweeps.rows["r"], change, after.part(target))
+                if self.velocity:
+                    sweeps.add_moved(sweeps.rows["dr"], change, after.part(target + 2 * inputs))
+        return t
+
+    def values(self) -> None:
+        """Rows (2d or 4d, N) of ψ̄_t(x) and d/dt ψ̄_t(x)."""
+        code, d, inputs = self.code, self.sizes.ndof, self.sizes.inputs
+        (out,) = self.more
+        with self.blocks() as block:
+            begin = self.begin(block)
+            self.forward(begin)
+            end = self.states.part(self.n_layers * self.sizes.state)
+            for part in range(4 if self.velocity else 2):
+                with code.over(d) as m:
+                    code.store(end[m + part * inputs], out, (m + part * d) * self.n_points + begin)
+
+    def jacobian(self) -> None:
+        """See `NetworkTangents.jacobian`."""
+        code, sizes, d, inputs, size = self.code, self.sizes, self.sizes.ndof, self.sizes.inputs, self.sizes.size
+        by_state, by_velocity, units, places, J, by_start = self.more
+        n_own, starts = self.flags
+        rows = self.sweeps(code, self.theta, self.work).rows
+        P, M, G, dG, H, dH = (rows[name] for name in ("P", "M", "G", "dG", "H", "dH"))
+        zero = code.constant(0.0, REGISTER)
+        with self.blocks() as block:
+            begin = self.begin(block)
+            t = self.forward(begin)
+            with code.over(2 * d) as row:
+                with code.over(2 * d) as m:
+                    P[row * (2 * d) + m] = self.column(by_state, row * (2 * d) + m, begin)
+                    M[row * (2 * d) + m] = zero
+                M[row * (2 * d + 1)] = code.splat(code.load(by_velocity, row), LANES)
+            with code.over(self.n_layers) as down:
+                i = self.n_layers - 1 - down
+                theta, kick, sign = self.layer(i)
+                before = self.states.part(i * sizes.state)
+                x = code.select(kick, 0 * i, 0 * i + inputs)
+                old, new = code.select(kick, 0 * i + d, 0 * i), code.select(kick, 0 * i, 0 * i + d)
+                with code.over(d * size) as m:
+                    G[m] = zero
+                    if self.velocity:
+                        dG[m] = zero
+                with code.over(d * d) as m:
+                    H[m] = dH[m] = zero
+                with self.sides() as k:
+                    rate, share = self.side(k)
+                    times = t * code.splat(rate, LANES)
+                    given = before.part(x), before.part(x + 2 * inputs), times, rate
+                    sweeps = self.swept(theta, *given)
+                    with code.over(d) as j:
+                        part = G.part(j * size), dG.part(j * size)
+                        sweeps.add_sensitivities(*given, code.splat(share, LANES), j, *part)
+                with code.over(n_own) as parameter:
+                    place, number = code.load(places, parameter, INT), i * n_own + parameter
+                    unit = code.splat(sign * code.load(units, number), LANES)
+                    with code.over(2 * d) as row:
+
+                        def more(j: Value, total: Sequence[Value]) -> list[Value]:
+                            at = row * (2 * d) + old + j
+                            found = fma(P[at], G[j * size + place], total[0])
+                            return [fma(M[at], dG[j * size + place], found) if self.velocity else found]
+
+                        (total,) = code.loop(d, [zero], more)
+                        code.store(unit * total, J, (number * (2 * d) + row) * self.n_points + begin)
+                change = code.splat(sign, LANES)
+                with code.over(2 * d) as row, code.over(d) as m:
+
+                    def back(j: Value, totals: Sequence[Value]) -> list[Value]:
+                        at = row * (2 * d) + old + j
+                        found = [fma(P[at], H[j * d + m], totals[0])]
+                        if self.velocity:
+                            found[0] = fma(M[at], dH[j * d + m], found[0])
+                            found.append(fma(M[at], H[j * d + m], totals[1]))
+                        return found
+
+                    at = row * (2 * d) + new + m
+                    totals = code.loop(d, [zero, zero][: 1 + self.velocity], back)
+                    P.add(at, (change, totals[0]))
+                    if self.velocity:
+                        M.add(at, (change, totals[1]))
+            with code.over(starts) as _, code.over(4 * d * d) as m:
+                code.store(P[m], by_start, m * self.n_points + begin)
 
 
 @cache
-def _loops(activation: str, velocity: bool) -> ModuleType:
-    constants = (
-        f"import math\n\nfrom numba import njit\n\nOPTIONS = {OPTIONS | {'cache': True}}\n"
-        f"LANES = {LANES}\nVELOCITY = {velocity}"
-    )
-    before = map(template, ("elementary", "activation_bends"))
-    return load_module("\n\n\n".join([constants, *before, f"activation = {activation}", template("network_tangents")]))
+def _compiled(name: str, sizes: _Sizes, activation: str, velocity: bool) -> Callable[..., None]:
+    """The function `values` or `jacobian`."""
+    more, flags = {"values": (1, 0), "jacobian": (6, 2)}[name]
+    types = [*[POINTER] * (6 + more), *[INT] * (4 + flags)]
+    code = Module(host().fused).function(name, types)
+    getattr(_Points(code, sizes, activation, velocity, more), name)()
+    return finished(code, types)

@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
 from sympflow.kernels.loop_functions import states_source
-from sympflow.kernels.modules import NEVER, given, load_algebra
-from sympflow.kernels.output_loops import row_products
+from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
+from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import NOTHING, Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
+from sympflow.kernels.threads import NEVER, given
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.carry import Carry
-from sympflow.kernels.modules import given, run_one, run_rows
+from sympflow.kernels.threads import given, run_one, run_rows
 
 __all__ = ["Carry", "Kernel", "Run", "Steps", "run_state", "run_states"]
 
@@ -176,6 +176,10 @@ class Kernel(Protocol):
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         ...
 
+    def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """The `step` from each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d); None where they are not compiled."""
+        return None
+
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int] | None:
         """Count the evaluations of the system's functions in a run; None where the method itself counts them."""
         return None
@@ -191,6 +195,6 @@ class Kernel(Protocol):
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """The states of rows of `y0` (N, 2d) at elapsed times, of steps that are equal in another time.
 
-        See `timed_loops.reach_times`. None where there is no such pass.
+        See `elapsed_times.reach_times`. None where there is no such pass.
         """
         return None

@@ -13,24 +13,53 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value, Variable
+from sympflow.compiler.control import BOOL, INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import compiled, host
 
-__all__ = ["Numbers", "Stage", "map_function", "run_function", "step_function"]
+__all__ = [
+    "ColumnStage",
+    "Lanes",
+    "Memory",
+    "Numbers",
+    "Room",
+    "finished",
+    "groups",
+    "map_function",
+    "run_function",
+    "step_function",
+    "there",
+]
 
+FAST_MEMORY = 16_384  # bytes of the states of a chunk after the other, and of their ends
+MOST_CHUNKS = 32
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
-Numbers = Callable[[int], Any]
-"""The number of an index, of one column."""
+Numbers = Callable[..., Any]
+"""``numbers(i, lone=False)``: number i of one column, in all lanes; `lone`, as a scalar if the lanes share it."""
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 """``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
 `step` tells after how many whole steps the stage is executed."""
+MemoryStage = Callable[["Room", Numbers, Value, Value], None]
+"""The same of a state in memory, which it changes in place."""
+Over = Callable[[Callable[..., None], Numbers, Value, Value], None]
+"""``over(each, numbers, kind, step)``: a stage of many states, ``each(body)`` executes ``body(values)`` for each of
+them; what is the same for all is computed before."""
 
 
 def run_function(
-    n_values: int, n_out: int, size: int, stage: Stage, width: int = 1, own: bool = False
+    n_values: int,
+    n_out: int,
+    size: int,
+    stage: Stage | MemoryStage,
+    width: int = 1,
+    own: bool = False,
+    memory: Callable[..., Memory] | None = None,
+    look: Callable[[Any], Any] | None = None,
+    every: int = BLOCK,
+    closing: bool = True,
+    over: Over | None = None,
 ) -> Callable[..., None]:
-    """Compile the runs of trajectories, `width` of them side by side.
+    """Compile the runs of trajectories, `width` of them side by side, and of these as many as the fast memory holds.
 
     Parameters
     ----------
@@ -42,12 +71,23 @@ def run_function(
     width : int
     own : bool
         True if each trajectory has a table of its own.
+    memory : callable, optional
+        How states are in memory: then their sizes are arguments of the function, not `n_values` and `n_out`.
+    look : callable, optional
+        ``look(values)``, the values of the running state after each `every` steps of the run, changed so that the
+        outputs are the same but for what it knows of; of states in memory ``look(room)`` in place.
+    every : int
+        Steps between two looks, for a state that is not finite too.
+    closing : bool
+        False if `closes` is always 0.
+    over : callable, optional
+        The stage of many states, where these are to be in memory: as pays where a stage is long.
 
     Returns
     -------
     callable
         Of addresses and integers (table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite,
-        running, keeps, stop).
+        running, keeps, stop), of states in memory then `MEMORY`.
 
         The table holds columns, in each of these `size` numbers or, for tables of their own, `size` times `width`, a
         table for every `width` trajectories. `rows` (n_rows, n_values) are the states to begin with, those of the run
@@ -58,80 +98,120 @@ def run_function(
     """
     module = Module(host().fused)
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
+    types += MEMORY if memory else []
     code = module.function("run", types)
     table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite, running, keeps, stop = (
-        code.arguments
+        code.arguments[:15]
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
-    lanes = Lanes(code, n_values, width)
-    with code.over(lanes.groups(n_rows)) as group:
-        begin = group * width
-        place = code.at(table, group * (link + 2) * (size * width)) if own else table
-        column = _column(code, place, kinds, size, width if own else 1, width, stage)
-        state = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
-        n, saved, longest = code.variable(first), code.variable(zero), code.variable(code.constant(BLOCK, INT))
+    state: _Registers | _Chunks | Memory
+    if width > 1 and memory is None and over is not None:
+        state = _Chunks(code, n_values, n_out, width, own, over)
+    else:
+        state = _state(code, n_values, n_out, width, memory, code.arguments[15:], before=width == 1)
+    chunks = state.chunks if isinstance(state, _Chunks) else 1
+    with code.over(groups(code, n_rows, width * chunks)) as group:
+        begin = group * (width * chunks)
+        length = (link + 2) * (size * width)
+        place = code.at(table, group * length * chunks) if own else table
+        column = ColumnStage(code, place, kinds, size, width if own else 1, width, stage, length if own else None)
+        state.open(rows, begin, n_rows)
+        n, saved, longest = code.variable(first), code.variable(zero), code.variable(state.block(every))
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
-        alive = code.variable(code.constant(1, Type("i1", width)))
+        alive = code.variable(code.constant(1, Type("i1", 1 if isinstance(state, _Chunks) else width)))
         going = code.variable(first < n_steps)
         with code.during(lambda: going.value):
             k = code.apply("min", (longest.value, n_steps - n.value))
+            if look is not None:
+                k = code.apply("min", (k, every - code.op("srem", INT, n.value, code.constant(every, INT))))
             left = saved.value < n_saved
             following = code.load(save, code.select(left, saved.value, zero), INT) - n.value
             k = code.select(left, code.apply("min", (k, following)), k)
-            before, j_before, step_before = [x.value for x in state], j.value, step.value
+            j_before, step_before = j.value, step.value
+            state.remember()
             with code.over(k * link):
                 at = j.value
-                _set(state, column(at, [x.value for x in state], step.value))
+                state.change(column, at, step.value)
                 j.value = code.select(code.apply("eq", (at, link)), one, at + 1)
                 step.value = code.select(code.apply("eq", (j.value, link)), step.value + 1, step.value)
-            end = [code.variable(x.value) for x in state]
-            with code.over(closes):
-                _set(end, column(link + 1, [x.value for x in end], step.value))
-            alive.value = alive.value & _finite(code, [x.value for x in end])
+            state.end()
+            if closing:
+                with code.over(closes):
+                    state.change(column, link + 1, step.value, end=True)
+            alive.value = alive.value & state.finite()
             good = code.any(alive.value)
             going.value = good & code.apply("eq", (code.load(stop, 0, INT, shared=True), zero))
             with code.given(good):
                 n.value = n.value + k
                 going.value = going.value & (n.value < n_steps)
                 with code.during(partial(_due, code, save, n_saved, saved, n)):
-                    lanes.store([x.value for x in end[:n_out]], out, begin, n_rows, n_saved, saved.value)
+                    state.store(out, begin, n_rows, n_saved, saved.value)
                     saved.value = saved.value + 1
+                if look is not None:
+                    whole = code.op("srem", INT, n.value, code.constant(every, INT))
+                    with code.given(code.apply("eq", (whole, 0))):
+                        state.look(look)
             if width == 1:  # again, step by step
                 with code.given(~good & (one < k)):
-                    _set(state, before)
+                    state.restore()
                     j.value, step.value, longest.value = j_before, step_before, one
                     alive.value, going.value = code.constant(1, Type("i1")), code.constant(1, Type("i1"))
         if width == 1:
             code.store(n.value, finite, begin)
+        elif isinstance(state, _Chunks):
+            state.mark(n.value, finite, begin, n_rows)
         else:
-            lanes.mark(alive.value, n.value, finite, begin, n_rows)
+            _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
-            lanes.store([x.value for x in state], running, begin, n_rows, one, zero)
-    return _finished(code, types)
+            state.keep(running, begin, n_rows)
+    return finished(code, types)
 
 
-def map_function(n_values: int, n_out: int, size: int, stage: Stage, width: int = 1) -> Callable[..., None]:
+def map_function(
+    n_values: int,
+    n_out: int,
+    size: int,
+    stage: Stage | MemoryStage,
+    width: int = 1,
+    memory: Callable[..., Memory] | None = None,
+    timed: bool = False,
+) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table.
+
+    Parameters
+    ----------
+    timed : bool
+        True if stages are given the steps of each lane, else those of the first one for all.
 
     Returns
     -------
     callable
-        Of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out): row i is mapped after ``steps[i % n_steps]``
-        whole steps, in lanes the same for all of them; `out` may be `rows`.
+        Of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out), of states in memory then `MEMORY`: row i is
+        mapped after ``steps[i % n_steps]`` whole steps; `out` may be `rows`.
     """
-    types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER]
+    types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("map", types)
-    table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments
-    lanes = Lanes(code, n_out, width)
-    column = _column(code, table, kinds, size, 1, width, stage)
-    with code.over(lanes.groups(n_rows)) as group:
+    table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
+    state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
+    column = ColumnStage(code, table, kinds, size, 1, width, stage)
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
-        state = _opened(code, lanes.loaded(rows, begin, n_rows), n_values)
-        step = code.load(steps, code.op("srem", INT, begin, n_steps), INT)
+        state.open(rows, begin, n_rows, n_out)
+        step = _steps_of_lanes(code, steps, n_steps, begin, width if timed else 1)
         with code.over(n_columns) as j:
-            _set(state, column(j, [x.value for x in state], step))
-        lanes.store([x.value for x in state[:n_out]], out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return _finished(code, types)
+            state.change(column, j, step)
+        state.end()
+        state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
+    return finished(code, types)
+
+
+def _steps_of_lanes(code: Code, steps: Value, n_steps: Value, begin: Value, width: int) -> Value:
+    if width == 1:
+        return code.load(steps, code.op("srem", INT, begin, n_steps), INT)
+    found = code.memory(1, Type("i64", width))
+    with code.over(code.constant(width, INT)) as lane:
+        code.store(code.load(steps, code.op("srem", INT, begin + lane, n_steps), INT), found, lane)
+    return code.load(found, 0, Type("i64", width))
 
 
 def step_function(
@@ -140,8 +220,9 @@ def step_function(
     powers: Sequence[int],
     own: int,
     numbers: Callable[..., Sequence[Any]],
-    stage: Stage,
+    stage: Stage | MemoryStage,
     width: int = 1,
+    memory: Callable[..., Memory] | None = None,
 ) -> Callable[..., None]:
     """Compile single steps from rows, each of its own length.
 
@@ -152,23 +233,24 @@ def step_function(
     own : int
         Numbers that follow each state in its row and replace the last ones given.
     numbers : callable
-        From the given numbers to those that a stage reads.
+        From the time at which a step begins and the given numbers to those that a stage reads.
 
     Returns
     -------
     callable
-        Of (coefficients, n_columns, n_powers, x, h, t, rows, n_rows, out): the given numbers of a column of row i are
-        polynomials Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
+        Of (coefficients, n_columns, n_powers, x, h, t, rows, n_rows, out), of states in memory then `MEMORY`: the given
+        numbers of a column of row i are polynomials Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
     """
-    types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER]
+    types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("steps", types)
-    table, n_columns, n_powers, x, h, _, rows, n_rows, out = code.arguments
-    lanes, alone = Lanes(code, n_out + own, width), Lanes(code, 1, width)
-    with code.over(lanes.groups(n_rows)) as group:
+    table, n_columns, n_powers, x, h, t, rows, n_rows, out = code.arguments[:9]
+    state = _state(code, n_values, n_out, width, memory, code.arguments[9:])
+    alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
+    with code.over(groups(code, n_rows, width)) as group:
         begin = group * width
-        (at,), (length,) = alone.loaded(x, begin, n_rows), alone.loaded(h, begin, n_rows)
-        values = lanes.loaded(rows, begin, n_rows)
-        state = _opened(code, values[:n_out], n_values)
+        at, length, time = (alone.loaded(given, begin, n_rows)[0] for given in (x, h, t))
+        state.open(rows, begin, n_rows, n_out, own)
+        values = [] if behind is None else behind.loaded(rows, begin, n_rows, state.n_out + own, state.n_out)
         with code.over(n_columns) as j:
             given = []
             for r in range(len(powers)):
@@ -178,10 +260,311 @@ def step_function(
                     total.value = total.value * at + code.splat(code.load(start, n_powers - 1 - k), width)
                 given.append(total.value)
             grown = [value * length**power if power else value for value, power in zip(given, powers, strict=True)]
-            entries = numbers(*grown[: len(grown) - own], *values[n_out:])
-            _set(state, stage([s.value for s in state], entries.__getitem__, j, j))
-        lanes.store([s.value for s in state[:n_out]], out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return _finished(code, types)
+            entries = numbers(time, *grown[: len(grown) - own], *values)
+            state.change(lambda j, x, step, entries=entries: stage(x, entries.__getitem__, j, step), j, j)
+        state.end()
+        state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
+    return finished(code, types)
+
+
+MEMORY = [INT, INT, POINTER, POINTER]
+"""Further arguments where states are in memory: the numbers of a state, and how many of them are the output; room for
+three states, and after these for what stages need, times the width; an array of the addresses of what they read."""
+
+
+class Room:
+    """A state in memory, of any size: its number i of all trajectories side by side lies at i times the width.
+
+    Attributes
+    ----------
+    state, work : Value
+        Addresses: of the numbers of the state, and of room for others.
+    size : Value
+        How many numbers it has.
+    places : Value
+        The address of the array of addresses.
+    width : int
+    """
+
+    def __init__(self, code: Code, width: int, state: Value, work: Value, size: Value, data: Value) -> None:
+        self.code, self.width, self.state, self.work, self.size, self.places = code, width, state, work, size, data
+        self.type = Type("double", width)
+
+    def data(self, i: int) -> Value:
+        """The address of array i of those that a stage reads."""
+        return self.code.load(self.places, i, POINTER)
+
+    def load(self, i: Any, place: Value | None = None) -> Value:
+        """The number i of the state, or of others from a place on."""
+        return self.code.load(self.state if place is None else place, i * self.width, self.type)
+
+    def store(self, x: Any, i: Any, place: Value | None = None) -> None:
+        x = self.code.operand(x, self.type)
+        self.code.store(x, self.state if place is None else place, i * self.width)
+
+    def add(self, x: Any, i: Any, place: Value | None = None) -> None:
+        self.store(self.load(i, place) + x, i, place)
+
+    def part(self, i: Any, place: Value | None = None) -> Value:
+        """The address of number i."""
+        return self.code.at(self.state if place is None else place, i * self.width)
+
+
+class _Registers:
+    """The state of a run as values, which the machine keeps in registers, and its end, a copy that is closed."""
+
+    def __init__(self, code: Code, n_values: int, n_out: int, width: int) -> None:
+        self.code, self.n_values, self.n_out = code, n_values, code.constant(n_out, INT)
+        self._count, self._lanes = n_out, Lanes(code, n_values, width)
+        self._state: list[Variable] = []
+        self._end: list[Variable] = []
+        self._before: list[Value] = []
+
+    def block(self, every: int) -> Value:
+        """Steps between two looks."""
+        return self.code.constant(every, INT)
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        """Read a state, of which the first numbers are given and the others are 0."""
+        given = self.n_values if given is None else given
+        lanes = self._lanes if given + own == self.n_values else Lanes(self.code, given + own, self._lanes.width)
+        x = lanes.loaded(rows, begin, n_rows)[:given]
+        zero = self.code.constant(0.0, x[0].type)
+        self._state = [self.code.variable(value) for value in [*x, *[zero] * (self.n_values - len(x))]]
+
+    def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
+        state = self._end if end else self._state
+        _set(state, column(j, [x.value for x in state], step))
+
+    def look(self, look: Callable[[Any], Any]) -> None:
+        _set(self._state, look([x.value for x in self._state]))
+
+    def remember(self) -> None:
+        self._before = [x.value for x in self._state]
+
+    def restore(self) -> None:
+        _set(self._state, self._before)
+
+    def end(self) -> None:
+        self._end = [self.code.variable(x.value) for x in self._state]
+
+    def finite(self) -> Value:
+        """True where all values of the end are finite: times 0 they are 0."""
+        first, *rest = [x.value for x in self._end]
+        total = first * 0.0
+        for value in rest:
+            total = self.code.fma(value, self.code.constant(0.0, value.type), total)
+        return self.code.apply("eq", (total, 0.0))
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        """Write the end to the row `at` of `stride` rows that each trajectory has in `out`."""
+        self._lanes.store([x.value for x in self._end[: self._count]], out, begin, n_rows, stride, at)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
+        self._lanes.store([x.value for x in self._state], running, begin, n_rows, one, zero)
+
+
+class _Chunks:
+    """The same of many trajectories: in memory, from which a stage takes one chunk after the other into registers.
+
+    A chunk need not wait for the one before, whose chain of operations goes on meanwhile.
+    """
+
+    def __init__(self, code: Code, n_values: int, n_out: int, width: int, own: bool, over: Over) -> None:
+        self.code, self.width, self.type, self._n, self._n_out = code, width, Type("double", width), n_values, n_out
+        self._over = None if own else over
+        self.chunks = min(max(FAST_MEMORY // (16 * n_values * width), 1), MOST_CHUNKS)
+        self._state, self._end = (code.memory(n_values * self.chunks, self.type) for _ in range(2))
+        self._watch = code.memory(self.chunks, self.type)
+        self._used = code.constant(0, INT)
+
+    def block(self, every: int) -> Value:
+        return self.code.constant(every, INT)
+
+    def open(self, rows: Value, begin: Value, n_rows: Value) -> None:
+        code, n = self.code, self._n
+        left = groups(code, n_rows - begin, self.width)
+        self._used = code.apply("min", (left, code.constant(self.chunks, INT)))
+        with code.over(self._used) as c:
+            code.store(code.constant(0.0, self.type), self._watch, c * self.width)
+            with code.over(code.constant(self.width, INT)) as lane:
+                row = code.apply("min", (begin + c * self.width + lane, n_rows - 1))
+                start, place = code.at(rows, row * n), code.at(self._state, c * (n * self.width) + lane)
+                with code.over(code.constant(n, INT)) as i:
+                    code.store(code.load(start, i), place, i * self.width)
+
+    def _each(self, place: Value, body: Callable[[list[Value], Value], Sequence[Value]]) -> None:
+        code, n, width = self.code, self._n, self.width
+        with code.over(self._used) as c:
+            start = code.at(place, c * (n * width))
+            for i, x in enumerate(body([code.load(start, i * width, self.type) for i in range(n)], c)):
+                code.store(x, start, i * width)
+
+    def change(self, column: ColumnStage, j: Value, step: Value, end: bool = False) -> None:
+        place = self._end if end else self._state
+        if self._over is None:
+            self._each(place, lambda x, c: column(j, x, step, c))
+        else:
+            each = lambda body: self._each(place, lambda x, _: body(x))  # noqa: E731
+            self._over(each, column.numbers(j), column.kind(j), step)
+
+    def look(self, look: Callable[[Any], Any]) -> None:
+        self._each(self._state, lambda x, _: look(x))
+
+    def remember(self) -> None:
+        """A single trajectory alone goes back."""
+
+    restore = remember
+
+    def end(self) -> None:
+        with self.code.over(self._used * self._n) as i:
+            x = self.code.load(self._state, i * self.width, self.type)
+            self.code.store(x, self._end, i * self.width)
+
+    def finite(self) -> Value:
+        """True if a trajectory was finite up to now."""
+        code, zero = self.code, self.code.constant(0.0, self.type)
+        alive = code.variable(code.constant(0, BOOL))
+        with code.over(self._used) as c:
+            total, start = (
+                code.load(self._watch, c * self.width, self.type),
+                code.at(self._end, c * (self._n * self.width)),
+            )
+            for i in range(self._n):
+                total = code.fma(code.load(start, i * self.width, self.type), zero, total)
+            code.store(total, self._watch, c * self.width)
+            alive.value = alive.value | code.any(code.apply("eq", (total, 0.0)))
+        return alive.value
+
+    def mark(self, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
+        """Write n for the trajectories that are alive, else −1."""
+        code = self.code
+        with code.over(self.there(begin, n_rows)) as i:
+            alive = code.apply("eq", (code.load(self._watch, i), 0.0))
+            code.store(code.select(alive, n, code.constant(-1, INT)), finite, begin + i)
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self._write(self._end, self._n_out, out, begin, n_rows, stride, at)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
+        self._write(self._state, self._n, running, begin, n_rows, one, zero)
+
+    def there(self, begin: Value, n_rows: Value) -> Value:
+        return self.code.apply("min", (self._used * self.width, n_rows - begin))
+
+    def _write(self, place: Value, n: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        code, width = self.code, self.width
+        with code.over(self.there(begin, n_rows)) as row:
+            c = code.op("sdiv", INT, row, code.constant(width, INT))
+            source = code.at(place, c * ((self._n - 1) * width) + row)
+            start = code.at(out, ((begin + row) * stride + at) * n)
+            with code.over(code.constant(n, INT)) as i:
+                code.store(code.load(source, i * width), start, i)
+
+
+class Memory:
+    """The same in memory: the state, its end, and the state before a block of steps.
+
+    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`.
+    """
+
+    def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
+        self.code, self.width, self._remembers = code, width, before
+        self.n_values, self.n_out, work, data = arguments
+        rooms = [code.at(work, self.n_values * (i * width)) for i in range(4)]
+        self._running, self._end, self._before = (
+            Room(code, width, x, rooms[3], self.n_values, data) for x in rooms[:3]
+        )
+
+    def block(self, every: int) -> Value:
+        return self.code.constant(every, INT)
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        n = self.n_values if given is None else self.n_out
+        with self.code.over(self.code.constant(self.width, INT)) as lane:
+            start = self.code.at(rows, self.code.apply("min", (begin + lane, n_rows - 1)) * (n + own))
+            with self.code.over(n) as i:
+                self.code.store(self.code.load(start, i), self._running.state, i * self.width + lane)
+        if given is not None:
+            with self.code.over(self.n_values - n) as i:
+                self._running.store(0.0, n + i)
+
+    def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
+        column(j, self._end if end else self._running, step)
+
+    def look(self, look: Callable[[Any], Any]) -> None:
+        look(self._running)
+
+    def remember(self) -> None:
+        if self._remembers:
+            self._copy(self._running, self._before)
+
+    def restore(self) -> None:
+        self._copy(self._before, self._running)
+
+    def end(self) -> None:
+        self._copy(self._running, self._end)
+
+    def _copy(self, source: Room, target: Room) -> None:
+        with self.code.over(self.n_values) as i:
+            target.store(source.load(i), i)
+
+    def finite(self) -> Value:
+        zero = self.code.constant(0.0, self._end.type)
+        total = self.code.variable(zero)
+        with self.code.over(self.n_values) as i:
+            total.value = self.code.fma(self._end.load(i), zero, total.value)
+        return self.code.apply("eq", (total.value, 0.0))
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self._write(self._end, self.n_out, out, begin, n_rows, stride, at)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
+        self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
+
+    def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        with self.code.over(there(self.code, self.width, begin, n_rows)) as lane:
+            start = self.code.at(out, ((begin + lane) * stride + at) * n)
+            with self.code.over(n) as i:
+                self.code.store(self.code.load(room.state, i * self.width + lane), start, i)
+
+
+def _state(
+    code: Code,
+    n_values: int,
+    n_out: int,
+    width: int,
+    memory: Callable[..., Memory] | None,
+    arguments: Sequence[Value],
+    before: bool = False,
+) -> _Registers | Memory:
+    if memory is None:
+        return _Registers(code, n_values, n_out, width)
+    return memory(code, width, arguments, before)
+
+
+def groups(code: Code, n_rows: Value, width: int) -> Value:
+    """How often `width` rows are begun side by side."""
+    if width == 1:
+        return n_rows
+    return code.op("sdiv", INT, n_rows + (width - 1), code.constant(width, INT))
+
+
+def there(code: Code, width: int, begin: Value, n_rows: Value) -> Value:
+    """How many rows there are of `width` from `begin` on."""
+    return code.apply("min", (code.constant(width, INT), n_rows - begin))
+
+
+def _mark(code: Code, alive: Value, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
+    """Write n for the trajectories that are alive, else −1."""
+    width = alive.type.width
+    marks = code.memory(1, Type("i64", width))
+    code.store(code.select(alive, code.splat(n, width), code.constant(-1, Type("i64", width))), marks)
+    with code.over(there(code, width, begin, n_rows)) as lane:
+        code.store(code.load(marks, lane, INT), finite, begin + lane)
 
 
 class Lanes:
@@ -192,18 +575,17 @@ class Lanes:
         self.type = Type("double", width)
         self._buffer = None if width == 1 else code.memory(self.n_values, self.type)
 
-    def groups(self, n_rows: Value) -> Value:
-        if self.width == 1:
-            return n_rows
-        return self.code.op("sdiv", INT, n_rows + (self.width - 1), self.code.constant(self.width, INT))
-
-    def loaded(self, rows: Value, begin: Value, n_rows: Value) -> list[Value]:
+    def loaded(
+        self, rows: Value, begin: Value, n_rows: Value, stride: Value | None = None, at: Value | None = None
+    ) -> list[Value]:
+        """The values of rows, or of parts of rows of `stride` numbers, from `at` on."""
         code, n = self.code, self.n_values
+        length, first = n if stride is None else stride, code.constant(0, INT) if at is None else at
         if self._buffer is None:
-            start = code.at(rows, begin * n)
+            start = code.at(rows, begin * length + first)
             return [code.load(start, i) for i in range(n)]
         with code.over(code.constant(self.width, INT)) as lane:
-            start = code.at(rows, code.apply("min", (begin + lane, n_rows - 1)) * n)
+            start = code.at(rows, code.apply("min", (begin + lane, n_rows - 1)) * length + first)
             with code.over(code.constant(n, INT)) as i:
                 code.store(code.load(start, i), self._buffer, i * self.width + lane)
         return [code.load(self._buffer, i * self.width, self.type) for i in range(n)]
@@ -218,58 +600,53 @@ class Lanes:
             return
         for i, value in enumerate(x):
             code.store(value, self._buffer, i * self.width)
-        with code.over(self._there(begin, n_rows)) as lane:
+        with code.over(there(code, self.width, begin, n_rows)) as lane:
             start = code.at(out, ((begin + lane) * stride + at) * n)
             for i in range(n):
                 code.store(code.load(self._buffer, lane + i * self.width), start, i)
 
-    def mark(self, alive: Value, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
-        """Write n for the trajectories that are alive, else −1."""
-        code = self.code
-        marks = code.memory(1, Type("i64", self.width))
-        code.store(code.select(alive, code.splat(n, self.width), code.constant(-1, Type("i64", self.width))), marks)
-        with code.over(self._there(begin, n_rows)) as lane:
-            code.store(code.load(marks, lane, INT), finite, begin + lane)
 
-    def _there(self, begin: Value, n_rows: Value) -> Value:
-        return self.code.apply("min", (self.code.constant(self.width, INT), n_rows - begin))
+class ColumnStage:
+    """The stage of a column, the numbers of which are those of all lanes, or one for each in tables of a length."""
 
+    def __init__(
+        self,
+        code: Code,
+        table: Value,
+        kinds: Value,
+        size: int,
+        lanes: int,
+        width: int,
+        stage: Stage | MemoryStage,
+        length: Value | None = None,
+    ) -> None:
+        self.code, self._table, self._kinds, self._size, self._lanes = code, table, kinds, size, lanes
+        self._width, self._stage, self._length = width, stage, length
 
-def _column(
-    code: Code, table: Value, kinds: Value, size: int, lanes: int, width: int, stage: Stage
-) -> Callable[[Value, list[Value], Value], list[Value]]:
-    """The stage of a column, the numbers of which are those of all lanes, or one for each."""
+    def numbers(self, j: Value, chunk: Value | None = None) -> Numbers:
+        code, lanes = self.code, self._lanes
+        table = self._table
+        if chunk is not None and self._length is not None:
+            table = code.at(table, chunk * self._length)
+        start = code.at(table, j * (self._size * lanes))
 
-    def at(j: Value, values: list[Value], step: Value) -> list[Value]:
-        start = code.at(table, j * (size * lanes))
-
-        def number(i: int) -> Value:
+        def number(i: int, lone: bool = False) -> Value:
             if lanes > 1:
                 return code.load(start, i * lanes, Type("double", lanes))
-            return code.splat(code.load(start, i), width)
+            return code.splat(code.load(start, i), 1 if lone else self._width)
 
-        return stage(values, number, code.load(kinds, j, INT), step)
+        return number
 
-    return at
+    def kind(self, j: Value) -> Value:
+        return self.code.load(self._kinds, j, INT)
 
-
-def _opened(code: Code, x: Sequence[Value], n_values: int) -> list[Variable]:
-    """Variables of a state, whose values after those given are 0."""
-    zero = code.constant(0.0, x[0].type)
-    return [code.variable(value) for value in [*x, *[zero] * (n_values - len(x))]]
+    def __call__(self, j: Value, values: Any, step: Value, chunk: Value | None = None) -> Any:
+        return self._stage(values, self.numbers(j, chunk), self.kind(j), step)
 
 
 def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:
     for variable, value in zip(variables, values, strict=True):
         variable.value = value
-
-
-def _finite(code: Code, x: Sequence[Value]) -> Value:
-    """True where all values are finite: times 0 they are 0."""
-    total = x[0] * 0.0
-    for value in x[1:]:
-        total = code.fma(value, code.constant(0.0, value.type), total)
-    return code.apply("eq", (total, 0.0))
 
 
 def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) -> Value:
@@ -282,6 +659,7 @@ def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) 
 _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
 
 
-def _finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+def finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+    """End the code of a function, and compile it."""
     code.give()
     return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *[_C[t.scalar] for t in types]))

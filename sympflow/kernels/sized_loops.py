@@ -15,15 +15,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from sympflow.kernels.modules import NEVER, given, threads_for
 from sympflow.kernels.protocol import NOTHING
+from sympflow.kernels.threads import NEVER, given, threads_for
 
 __all__ = ["SizedLoops", "Team"]
 
 T = TypeVar("T")
-GONE = 2
-"""Number of a meeting that says that a thread has ended too soon: see the text `barrier`."""
-
 BLOCK, MOMENT = 64, 500_000_000
 """Most steps between two looks for a non-finite state and for an interrupt, of a system in pieces, and about how many
 nanoseconds they take."""
@@ -282,23 +279,3 @@ class Team:
         pieces(bounds[0], bounds[1])
         for other in others:
             other.result()
-
-    def together(self, part: Callable[[int], T], meeting: np.ndarray) -> T:
-        """``part(k)`` of each thread k at the same time, which meet as the text `barrier` says; that of this one."""
-
-        def guarded(k: int) -> T:
-            try:
-                return part(k)
-            except BaseException:
-                meeting[GONE] = 1  # the others would wait for ever
-                raise
-
-        try:
-            others = [] if self._pool is None else [self._pool.submit(guarded, k) for k in range(1, self.threads)]
-            mine = part(0)
-            for other in others:
-                other.result()
-        except BaseException:
-            meeting[GONE] = 1
-            raise
-        return mine

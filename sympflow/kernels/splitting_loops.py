@@ -13,24 +13,20 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.loop_functions import (
-    LoopFunctions,
-    array_loops,
-    damped_drift,
-    driven_loops,
-    family_loops,
-    local_loops,
-    symbolic_loops,
-    takes_values,
-)
-from sympflow.kernels.modules import given
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
-from sympflow.kernels.stages import StageTable, run_table, step_table
+from sympflow.kernels.stages import StageTable, damped_drift, run_table, step_table
+from sympflow.kernels.threads import given
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.kernels.approximations import Ranges
+    from sympflow.kernels.loop_functions import LoopFunctions
+    from sympflow.kernels.rollouts import Rollouts
+    from sympflow.kernels.splittings import Splitting
+    from sympflow.kernels.stage_times import Driving
+
+    Functions = LoopFunctions | Rollouts
 
 
 def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
@@ -84,51 +80,71 @@ class SplittingLoops:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
-        self._has_ranges = self.closes = self.traced = False
-        self._symbols = system.symbols
-        self._codes: dict[tuple[int, bool, Monomials], LoopFunctions] = {}
+        self._has_ranges = self.closes = self.traced = self._large = False
+        self._symbols: Any = system.symbols
+        self._form: Any = system.symbols
+        self._driving: Driving | None = None
+        self._written: Callable[..., Splitting] | None = None
+        self._compile: Callable[..., Functions]
+        self._codes: dict[Any, Functions] = {}
+        self._longs: dict[int, bool] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not system.separable:
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if system.symbols is not None:
-            from sympflow.hamiltonian.recorded import can_be_recorded  # SymPy, which Numba functions do without
-            from sympflow.kernels.codegen import algebra_source
+            from sympflow.hamiltonian.recorded import check_recorded  # SymPy, which Numba functions do without
             from sympflow.kernels.terms import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
-            if is_large(system.symbols):
-                self._compile = partial(family_loops, system, damped_drift(system, True))
-            elif self.driven:
+            self._large = is_large(system.symbols)
+            damped_drift(system, self._large)
+            if self.driven:
                 from sympflow.kernels.stage_times import driven_form
 
-                driving = driven_form(system.symbols.parametric)
-                self.values = driving.form.values
-                self._compile = partial(driven_loops, driving, damped_drift(system, False))
+                self._driving = driven_form(system.symbols if self._large else system.symbols.parametric)
+                if self._large and self._driving.means:
+                    raise ValueError(
+                        "`system` has many terms and a kinetic energy that depends on t: use backend='array'."
+                    )
+                self._driving.check()
+                self._form = self._driving.form
+                self.values, self.traced = self._form.values, True
+                self.abreast = LANES
             else:
-                self.values = system.symbols.parametric.values
-                damped = damped_drift(system, False)
-                self._compile = partial(symbolic_loops, system.symbols, algebra_source(system.symbols), damped)
-                self._has_ranges = True
-                self.traced = all(map(can_be_recorded, (system.symbols.V, system.symbols.T)))
                 V = system.symbols.V
+                check_recorded(V)
+                check_recorded(system.symbols.T)
+                self.values = system.symbols.parametric.values
+                self._has_ranges, self.traced = not self._large, True
                 self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial(*system.symbols.q) else LANES
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
-            damped = damped_drift(system, True)
-            self._compile = partial(
-                array_loops, system.ndof, gradient, hessian_vector, system.inverse_mass, self.driven, damped
-            )
+            damped_drift(system, True)
+            from sympflow.kernels.array_splittings import function_code
+
+            given = gradient, hessian_vector, system.inverse_mass, self.driven
+            ndim = None if system.damping is None else system.damping.ndim
+            self._compile = partial(function_code, system.ndof, *given, ndim)
         elif system.local is not None:
             if system.damping is not None and system.damping.ndim:
                 raise ValueError(
                     f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
                     "backend='array'."
                 )
-            self.closes = True
+            if system.local.loops == "pairs":
+                from sympflow.kernels.pairs import few, pair_code
+
+                self._written, self.values = few(system.local)
+                self._compile = partial(pair_code, system.local, system.friction is not None)
+            else:
+                from sympflow.kernels.loop_functions import local_loops
+
+                self.closes = True
+                self._compile = partial(local_loops, system)
             self._has_force_gradient = system.quadratic_kinetic
-            self._compile = partial(local_loops, system)
+            self.traced = self._written is not None
         else:
             raise ValueError(
                 "`system` cannot be compiled: it is given by plain functions. Define it with "
@@ -136,7 +152,7 @@ class SplittingLoops:
             )
         self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops
         self._has_curvature = system.symbols is not None or system.local is not None
-        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], LoopFunctions] = {}
+        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], Functions] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, with the ranges, for which the system would be asked."""
@@ -168,10 +184,9 @@ class SplittingLoops:
         kernel._functions()
         return kernel
 
-    def takes_values(self, level: int, ranges: Ranges | None = None) -> bool:
+    def takes_values(self, level: int, ranges: Ranges | None = None, varied: bool = False) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
-        traced = self.traced and not ranges
-        return bool(self.values) and (traced or (self.friction is None and takes_values(level)))
+        return bool(self.values) and not ranges and (varied or not self._long(level))
 
     def functions(
         self,
@@ -180,11 +195,10 @@ class SplittingLoops:
         monomials: Monomials = (),
         varied: bool = False,
         ranges: Ranges | None = None,
-    ) -> LoopFunctions:
+    ) -> Functions:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
-        Where `ranges` of positions are given, which may be none, kicks and drifts are joined, and faster in these
-        ranges, see `kicks_source`: equal but for rounding.
+        Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
 
         Raises
         ------
@@ -201,27 +215,57 @@ class SplittingLoops:
             if level > FORCE_GRADIENT and not self._has_curvature:
                 what = "curvature terms" if level == CURVATURE else "polynomials"
                 raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
-            more: dict[str, Any] = {"varied": True} if varied else {}
-            more |= {} if ranges is None else {"ranges": ranges}
-            self._variants[variant] = (
-                self._traced(level, compensated, monomials)
-                if self.traced and not ranges
-                else self._compile(level, compensated, monomials, **more)
-            )
+            self._variants[variant] = self._made(*variant)
         return self._variants[variant]
 
-    def _traced(self, level: int, compensated: bool, monomials: Monomials) -> LoopFunctions:
-        """The functions over traced numbers, which serve batches with own values too."""
-        from sympflow.kernels.splittings import Splitting, SplittingCode
+    def _made(
+        self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges | None
+    ) -> Functions:
+        if not self.traced:
+            more: dict[str, Any] = {"varied": True} if varied else {}
+            return self._compile(level, compensated, monomials, **more)
+        return self._traced(level, compensated, monomials, varied, ranges or ())
 
-        key = level, compensated, monomials
+    def _long(self, level: int) -> bool:
+        """True of stages that are loops over the terms of H."""
+        if not self._large or not self.traced:
+            return False
+        from sympflow.kernels.terms import is_long
+
+        if level not in self._longs:
+            self._longs[level] = is_long(self._form, level)
+        return self._longs[level]
+
+    def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges) -> Functions:
+        """The functions over traced numbers, which serve batches with own values too."""
+        from sympflow.kernels.splittings import SplittingCode, shared
+
+        key = level, compensated, monomials, ranges
+        if not varied and self._long(level):
+            from sympflow.kernels.array_splittings import term_code
+
+            return term_code(self.splitting(level, monomials, compensated, parametric=False))
         if key not in self._codes:
-            assert self._symbols is not None
-            ndim = None if self.friction is None else self.friction.damping.ndim
-            code = SplittingCode(Splitting(self._symbols.parametric, level, monomials, compensated, ndim))
-            processed = code.rollout_processed, code.rollout_processed_batch
-            self._codes[key] = LoopFunctions(code.rollout, code.rollout_batch, *processed, code.step_rows)
+            splitting = self.splitting(level, monomials, compensated, ranges)
+            self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
         return self._codes[key]
+
+    def splitting(
+        self,
+        level: int,
+        monomials: Monomials = (),
+        compensated: bool = False,
+        ranges: Ranges = (),
+        parametric: bool = True,
+    ) -> Splitting:
+        """The kicks and drifts of a level, of a system whose loops are made of traced numbers."""
+        from sympflow.kernels.splittings import Splitting
+
+        ndim, driving = None if self.friction is None else self.friction.damping.ndim, self._driving
+        if self._written is not None:
+            return self._written(level, monomials, compensated, ndim)
+        symbols = self._form.parametric if parametric and driving is None and not ranges else self._form
+        return Splitting(symbols, level, monomials, compensated, ndim, driving, ranges)
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""
@@ -363,7 +407,7 @@ class SplittingKernel(Kernel):
         """The states of a batch (N, 2d) as the loops read them; a run that goes on reads no states from them."""
         return given(y)
 
-    def _functions(self) -> LoopFunctions:
+    def _functions(self) -> Functions:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, ranges=self._ranges)
 
 
@@ -422,7 +466,7 @@ class VariedKernel(SplittingKernel):
             values[:] = self._values
         return self._latest
 
-    def _functions(self) -> LoopFunctions:
+    def _functions(self) -> Functions:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)
 
 
@@ -451,11 +495,6 @@ class DampedKernel(SplittingKernel):
 @lru_cache(maxsize=256)
 def _damped_stages(scheme: Scheme, h: float, friction: Friction) -> StageTable:
     return _with_friction(run_table(scheme, h), friction)
-
-
-def damped_table(scheme: Scheme, h: float, friction: Friction) -> np.ndarray:
-    """The table of a run with the rows of `DampedDrift`."""
-    return _damped_stages(scheme, h, friction).packed
 
 
 def _with_friction(table: StageTable, friction: Friction) -> StageTable:

@@ -7,7 +7,6 @@ of many in lanes, maps, single steps.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,24 +15,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import Value
+from sympflow.compiler.control import Type, Value
 from sympflow.compiler.functions import times
 from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
-from sympflow.kernels.runs import Numbers, map_function, run_function, step_function
+from sympflow.kernels.approximations import OnInterval, Ranges, on_interval
+from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
-from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.kernels.stage_times import Driving
 
-__all__ = ["SplittingCode"]
+__all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange", "shared"]
 
-LANES = 16
-"""Trajectories side by side: of two registers or four, so that one need not wait for the other."""
 MOST_TABLES = 64  # that are kept
-AT_ONCE = 4096  # trajectories with tables of their own
+LONG = 64  # operations of a stage, beyond which products of sums may better be left
+CLOCK = 3  # numbers of the time in a column
 EARLY = -4  # when momenta are known before the positions, in cycles
 
 
@@ -51,6 +52,10 @@ class Splitting:
         True if states have the errors of compensated sums.
     friction : int, optional
         Dimensions of Γ.
+    driving : Driving, optional
+        Of `symbols` with letters for what depends on the time.
+    ranges
+        Intervals of one position in which kicks are polynomials, equal but for rounding; its values are then in V.
     """
 
     symbols: SymbolicHamiltonian
@@ -58,6 +63,22 @@ class Splitting:
     monomials: Monomials = ()
     compensated: bool = False
     friction: int | None = None
+    driving: Driving | None = None
+    ranges: Ranges = ()
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Same for systems that share their code: those that differ in the values of parameters alone."""
+        of_system = self.symbols.H, self.symbols.parameters, self.symbols.q, self.symbols.p
+        driving = None if self.driving is None else self.driving.key
+        return *of_system, self.level, self.monomials, self.compensated, self.friction, driving, self.ranges
+
+    @property
+    def polynomial(self) -> bool:
+        """True if stages are sums and products alone."""
+        symbols = self.symbols
+        V, T = symbols.V, symbols.T
+        return bool(V is not None and T is not None and V.is_polynomial(*symbols.q) and T.is_polynomial(*symbols.p))
 
     @property
     def kick_numbers(self) -> tuple[str, ...]:
@@ -71,19 +92,33 @@ class Splitting:
         of_friction = [f"{name}_{i}" for name in ("mean", "decay") for i in range(damped)]
         return ["a", *self.kick_numbers, *of_friction, *(s.name for s in self.symbols.parameters)]
 
-    def kinds(self) -> list[Arranged]:
-        """The stages with kicks of one number, of two, …; a polynomial has all of its numbers."""
-        if self.level == POLYNOMIAL:
-            return [self._arranged(1)]
-        return [self._arranged(terms) for terms in range(1, 2 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0))]
+    @property
+    def terms(self) -> list[int]:
+        """Terms of the kicks of each kind of stage: one, two, …; a polynomial has all of its own."""
+        return [1, 2, 3][: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0)]
+
+    def kinds(self) -> Sequence[Arranged | WithinRange]:
+        """The stages, those with the fewest terms first."""
+        return [self._within_range(terms) if self.ranges else self._arranged(terms) for terms in self.terms]
+
+    def _within_range(self, terms: int) -> Arranged | WithinRange:
+        """The stage as a polynomial in its range, if there is one."""
+        near = on_interval(_of_kick(self.symbols, terms), self.symbols.q[0], *self.ranges[0])
+        if near is None:
+            return self._arranged(terms)
+        arranged = NearShape(self, terms, near).arranged()[1]
+        return WithinRange(arranged, self._arranged(terms), near.low, near.high)
 
     def _arranged(self, terms: int) -> Arranged:
-        """The stage as a program, the shape with the shortest chain and the fewest operations of two."""
-        shapes = [_Shape(self, terms, expand).arranged() for expand in ((True, False) if terms > 1 else (True,))]
-        return min(shapes, key=lambda shape: shape[0])[1]
+        """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
+        cost, shape = Shape(self, terms, True).arranged()
+        if terms > 1 and len(shape.body) > LONG:
+            other_cost, other = Shape(self, terms, False).arranged()
+            return shape if cost <= other_cost else other
+        return shape
 
 
-class _Shape:
+class Shape:
     """One way to write a stage: products of sums multiplied out, or left."""
 
     def __init__(self, splitting: Splitting, terms: int, expand: bool) -> None:
@@ -104,19 +139,22 @@ class _Shape:
     def arranged(self) -> tuple[int, Arranged]:
         """The cost of the stage, and its programs."""
         made, d = self.made, self.d
-        changes = self._changes()
         errors: list[Any] = []
         if self.splitting.compensated:
-            momenta, errors_p = self._compensated(self.p, [made.written(x) for x in changes], self.errors[d:])
+            changes = [made.written(x) for x in self._changes()]
+            momenta, errors_p = self._compensated(self.p, changes, self.errors[d:])
             moves = [made.written(x) for x in self._velocity(momenta, self.number["a"])]
             positions, errors_q = self._compensated(self.q, moves, self.errors[:d])
             errors = [*errors_q, *errors_p]
         else:
-            momenta = [made.written(p + x) for p, x in zip(self.p, changes, strict=True)]
-            positions, momenta = self._drifted(momenta)
+            positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
         arranged = made.finish(outputs)
         return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
+
+    def _kicked(self) -> list[Any]:
+        """The momenta after a kick, numbers of the body."""
+        return [self.made.written(p + x) for p, x in zip(self.p, self._changes(), strict=True)]
 
     def _changes(self) -> list[Any]:
         """The change of p by a kick."""
@@ -134,8 +172,12 @@ class _Shape:
             again, u = [_dot(row, self._by_mass(product)) for row in hessian], v
             bent = [_dot([_dot(row, u) for row in rows], u) for rows in third]
             changes = [x - times(more[1], y + 0.5 * z) for x, y, z in zip(changes, again, bent, strict=True)]
-        for e, powers in zip(more if self.splitting.monomials else (), self.splitting.monomials, strict=True):
-            changes = [x - e * _slope_of_monomial(powers, i, self.q) for i, x in enumerate(changes)]
+        return self._with_monomials(changes)
+
+    def _with_monomials(self, changes: list[Any]) -> list[Any]:
+        letters, monomials = self.splitting.kick_numbers[1:], self.splitting.monomials
+        for e, powers in zip(letters if monomials else (), monomials, strict=True):
+            changes = [x - self.number[e] * _slope_of_monomial(powers, i, self.q) for i, x in enumerate(changes)]
         return changes
 
     def _by_mass(self, v: Sequence[Any]) -> list[Any]:
@@ -198,6 +240,74 @@ class _Shape:
         return sums, left
 
 
+class NearShape(Shape):
+    """A stage of one position whose kick is a polynomial on an interval, with coefficients in the table."""
+
+    def __init__(self, splitting: Splitting, terms: int, near: OnInterval) -> None:
+        super().__init__(splitting, terms, True)
+        self._near = near
+
+    def _changes(self) -> list[Any]:
+        made, near = self.made, self._near
+        factors = [self.number[name] for name in self.splitting.kick_numbers[: self.terms]]
+        x = self.q[0] if near.center == 0 else made.letter(made.written(self.q[0] - near.center))
+        total = made.number(0.0)
+        for k, column in enumerate(near.coefficients.T.tolist()):
+            for sign, factor, c in zip((-1.0, 1.0, -1.0), factors, column, strict=False):
+                total = total + (sign * c) * factor * x**k
+        return self._with_monomials([total])
+
+
+class WithinRange:
+    """A stage in two ways: as a polynomial for positions in a range, exact for others; the same for all lanes.
+
+    Attributes
+    ----------
+    table : callable
+        From the constants of a run to the numbers that both read.
+    """
+
+    def __init__(self, near: Arranged, exact: Arranged, low: float, high: float) -> None:
+        self._near, self._exact, self._low, self._high = near, exact, low, high
+        self.table = _Both(near.table, exact.table)
+
+    def body(self, q: Value, *rest: Value) -> list[Value]:
+        """The state after the stage."""
+        n, code = len(self._near.body.inputs) - len(self._near.table.outputs) - 1, q.code
+        state, column = (q, *rest[:n]), rest[n:]
+        here = len(self._near.table.outputs)
+        inside = (self._low <= q) & (q <= self._high)
+        near = self._near.body(*state, *column[:here])
+
+        def exact() -> list[Value]:
+            values = self._exact.body(*state, *column[here:])
+            return [code.select(inside, x, y) for x, y in zip(near, values, strict=True)]
+
+        return code.when(code.any(~inside), exact, lambda: near, rare=True)
+
+
+class _Both:
+    """Two programs of the same inputs, with the outputs of both."""
+
+    def __init__(self, *programs: Program) -> None:
+        self._programs = programs
+        self.outputs = [x for program in programs for x in program.outputs]
+
+    def __call__(self, *values: Any) -> list[Any]:
+        return [x for program in self._programs for x in program(*values)]
+
+
+def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
+    """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
+    V, M = symbols.V, symbols.inverse_mass
+    assert V is not None
+    slope = V.diff(symbols.q[0])
+    if terms == 1 or M is None:
+        return [slope]
+    product = slope.diff(symbols.q[0]) * M[0, 0] * slope
+    return [slope, product, (slope * M[0, 0] * product / 2).diff(symbols.q[0])][:terms]
+
+
 def _slopes(symbols: SymbolicHamiltonian, terms: int) -> Program:
     """∇V, and its second and third derivatives, as many orders as there are terms; rows of the tensors one by one."""
     given = (*symbols.q, *symbols.parameters)
@@ -228,8 +338,22 @@ def _slope_of_monomial(powers: Sequence[int], i: int, q: Sequence[Any]) -> Any:
     return value
 
 
-class SplittingCode:
-    """The compiled functions of splitting schemes on one symbolic system: see `LoopFunctions`.
+MOST_CODES = 64  # that are kept, of systems with other structures
+_CODES: dict[Any, Any] = {}
+
+
+def shared(key: Any, make: Callable[[], Any]) -> Any:
+    """Return the code of a key, made once while it is kept: systems are often made again."""
+    found = _CODES.get(key)
+    if found is None:
+        while len(_CODES) >= MOST_CODES:
+            _CODES.pop(next(iter(_CODES)), None)
+        found = _CODES[key] = make()
+    return found
+
+
+class SplittingCode(Rollouts):
+    """The compiled functions of splitting schemes on one symbolic system.
 
     Parameters
     ----------
@@ -238,71 +362,112 @@ class SplittingCode:
 
     def __init__(self, splitting: Splitting) -> None:
         self._splitting = splitting
-        self._lock = threading.RLock()
-        self._functions: dict[Any, Callable[..., None]] = {}
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         symbols = splitting.symbols
-        self._n_out = 2 * symbols.ndof
-        self._n_values = self._n_out * (1 + splitting.compensated)
-        self._own = len(symbols.parameters)
+        super().__init__(2 * symbols.ndof * (1 + splitting.compensated), 2 * symbols.ndof)
+        self.timed = splitting.driving is not None
+        self.chunked = self.timed or not splitting.polynomial
+        self.lanes = 8 if self.chunked else 16  # chunks need not wait for each other, registers side by side do
+        self._own = len(symbols.values if self.timed else symbols.parameters)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SplittingCode, (self._splitting,)
 
     @cached_property
-    def _kinds(self) -> list[Arranged]:
+    def _kinds(self) -> Sequence[Arranged | WithinRange]:
         return self._splitting.kinds()
 
     @cached_property
-    def _size(self) -> int:
+    def size(self) -> int:
         """Numbers of a column that the code reads."""
+        if self.timed:
+            letters = len(self._splitting.symbols.parameters) - self._own
+            return len(self._splitting.numbers) - letters + CLOCK
         return max(len(kind.table.outputs) for kind in self._kinds)
 
-    def _stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+    def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """A kick and a drift, of the kind that a column has."""
         if len(self._kinds) == 1:
-            return self._executed(0, values, numbers)
+            return self._executed(0, values, self._column(0, values[0].type, numbers, step))
         code = values[0].code
         results = [code.variable(x) for x in values]
         for k in range(len(self._kinds)):
             with code.given(code.apply("eq", (kind, k))):
-                for result, x in zip(results, self._executed(k, values, numbers), strict=True):
+                column = self._column(k, values[0].type, numbers, step)
+                for result, x in zip(results, self._executed(k, values, column), strict=True):
                     result.value = x
         return [x.value for x in results]
 
-    def _executed(self, k: int, values: list[Value], numbers: Numbers) -> list[Value]:
-        table, body = self._kinds[k]
-        return body(*values, *[numbers(i) for i in range(len(table.outputs))])
+    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
+        code, type = step.code, numbers(0).type
+        for k in range(len(self._kinds)):
+            with code.given(code.apply("eq", (kind, k))):
+                column = self._column(k, type, numbers, step)
+                each(lambda values, k=k, column=column: self._executed(k, values, column))
 
-    def _function(self, name: str, width: int) -> Callable[..., None]:
-        """The function of a name: "run", "run own", "map", "step" or "step own"."""
-        found = self._functions.get((name, width))
-        if found is None:
-            with self._lock:
-                found = self._functions[name, width] = self._made(name, width)
-        return found
+    def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
+        return self._kinds[k].body(*values, *column)
 
-    def _made(self, name: str, width: int) -> Callable[..., None]:
+    def _column(self, k: int, type: Type, numbers: Numbers, step: Value) -> list[Value]:
+        """The numbers that a stage of a kind reads."""
+        table = self._kinds[k].table
+        if not self.timed:
+            return [numbers(i) for i in range(len(table.outputs))]
+        code, given = step.code, [numbers(i, lone=True) for i in range(self.size)]
+        before, first, length = given[self._clock]
+        time = first + (code.convert("sitofp", step, "double") * length + before)
+        return [code.operand(x, type) for x in table(*self._lettered(time, given))]
+
+    @cached_property
+    def _clock(self) -> slice:
+        """The places of the numbers of the time in a column: when the kick is, when step 0 begins, how long one is."""
+        end = self.size - self._own
+        return slice(end - CLOCK, end)
+
+    def _lettered(self, time: Value, given: Sequence[Value]) -> list[Any]:
+        """The numbers of a column of a driven system, of those that are given, with its letters at a time."""
+        driving, clock = self._splitting.driving, self._clock
+        assert driving is not None
+        fixed = given[clock.stop :]
+        return [*given[: clock.start], *fixed, *driving.values_at(time, given[0], fixed)]
+
+    @property
+    def given_numbers(self) -> int:
+        """How many numbers of a column are given, from which those are computed that the code reads."""
+        return len(self._splitting.numbers)
+
+    def executed(self, given: Sequence[Any], values: list[Value]) -> list[Value]:
+        """The values after a stage of the last kind, by the numbers that are given."""
+        last = self._kinds[-1]
+        return last.body(*values, *last.table(*given))
+
+    def made(self, name: str, width: int) -> Callable[..., None]:
+        """Compile the function of a name: "step" and "step own" too."""
         what, _, own = name.partition(" ")
-        if what == "map":
-            return map_function(self._n_values, self._n_out, self._size, self._stage, width)
-        if what == "run":
-            return run_function(self._n_values, self._n_out, self._size, self._stage, width, bool(own))
+        if what != "step":
+            return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
-        powers = [1, *kick.powers, *(0 for _ in range(self._own))]
-        last = len(self._kinds) - 1
+        powers = [1, *kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self._own]
+        last, table = len(self._kinds) - 1, self._kinds[-1].table
+
+        def column(time: Value, *given: Value) -> list[Any]:
+            if not self.timed:
+                return table(*given)
+            at = time + given[self._clock][0]
+            return [time.code.operand(x, time.type) for x in table(*self._lettered(at, given))]
 
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-            return self._executed(last, values, numbers)
+            return self._executed(last, values, [numbers(i) for i in range(len(table.outputs))])
 
-        return step_function(
-            self._n_values, self._n_out, powers, self._own if own else 0, self._kinds[last].table, stage, width
-        )
+        own_numbers = self._own if own else 0
+        return step_function(self.n_values, self.n_out, powers, own_numbers, column, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
 
-    def _prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The numbers (m, size) that the code reads, of a table (n, m) of given ones, and the kinds (m,) of columns."""
+        if self.timed:
+            return np.ascontiguousarray(table.T), self._kinds_of(table)
         key = table.tobytes()
         found = self._tables.get(key)
         if found is None:
@@ -320,7 +485,9 @@ class SplittingCode:
 
     def _entries(self, table: Any, kinds: np.ndarray, shape: tuple[int, ...] = ()) -> np.ndarray:
         """The numbers (m, size, *shape) of rows, each (m,) or (m, *shape)."""
-        entries = np.zeros((len(kinds), self._size, *shape))
+        if self.timed:
+            return np.stack([np.broadcast_to(row, (len(kinds), *shape)) for row in table], axis=1)
+        entries = np.zeros((len(kinds), self.size, *shape))
         for k, kind in enumerate(self._kinds):
             with np.errstate(all="ignore"):
                 rows = kind.table(*table)
@@ -328,177 +495,19 @@ class SplittingCode:
                 entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
         return entries
 
-    def _own_tables(self, table: np.ndarray, values: np.ndarray, kinds: np.ndarray, width: int) -> np.ndarray:
-        """Tables of trajectories with their own values (N, n) of the parameters, `width` of them side by side."""
-        n = len(table) - self._own
+    def own_columns(self, table: np.ndarray, values: np.ndarray, width: int) -> Columns:
+        """The columns of trajectories with their own values (N, n) of the parameters."""
+        kinds, n = self._kinds_of(table), len(table) - self._own
         rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
         entries = self._entries(rows, kinds, (len(values),))
         groups = -(-len(values) // width)
         full = np.concatenate([entries, np.repeat(entries[..., -1:], groups * width - len(values), axis=-1)], axis=-1)
-        return np.ascontiguousarray(full.reshape(*full.shape[:2], groups, width).transpose(2, 0, 1, 3))
-
-    # the functions of `LoopFunctions` -----------------------------------------------------------------------------
-
-    def rollout(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool = True,
-    ) -> int:
-        """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``."""
-        finite = np.empty(1, dtype=np.int64)
-        self._run(table, y0[None], n_steps, save, out[None], finite, stop, first, running[None], closed, 1)
-        return int(finite[0])
-
-    def rollout_batch(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool = True,
-    ) -> None:
-        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it."""
-        rest = n_steps, save, stop, first, closed
-        if len(y0) == 1 or y0.shape[1] > self._n_out:
-            size = AT_ONCE if y0.shape[1] > self._n_out else 1
-            for k in range(0, len(y0), size):
-                rows = slice(k, k + size)
-                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], *rest)
-            return
-        self._some(table, y0, out, n_finite, running, *rest)
-
-    def _some(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        running: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        closed: bool,
-    ) -> None:
-        """Rows side by side; those that end before the last step once more, by themselves, to find that end."""
-        before = running.copy() if first > 0 else running
-        rest = stop, first
-        width = LANES if len(y0) > 1 else 1
-        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width)
-        for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
-            one = slice(i, i + 1)
-            if len(before):
-                running[i] = before[i]
-            self._run(table, y0[one], n_steps, save, out[one], n_finite[one], *rest, running[one], closed, 1)
-
-    def _run(
-        self,
-        table: np.ndarray,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool,
-        width: int,
-    ) -> None:
-        states = y0[:, : self._n_out]
-        if y0.shape[1] > self._n_out:
-            kinds = self._kinds_of(table)
-            entries = self._own_tables(table, y0[:, self._n_out :], kinds, width)
-            run = self._function("run own", width)
-        else:
-            entries, kinds = self._prepared(table)
-            run = self._function("run", width)
-        begun = int(np.searchsorted(save, 0, side="right")) if len(save) and save[0] <= 0 else 0
-        if begun:
-            out[:, :begun] = states[:, None]
-        later, outputs = save[begun:], out
-        if begun or not out.flags.c_contiguous:
-            outputs = np.empty((len(y0), len(later), self._n_out))
-        if first > 0:
-            start = np.ascontiguousarray(running)
-        elif self._n_values > self._n_out:
-            start = np.concatenate([states, np.zeros_like(states)], axis=1)
-        else:
-            start = np.ascontiguousarray(states)
-        keeps = running.shape[-1] > 0
-        left = np.empty((len(y0), self._n_values)) if keeps else running
-        arrays = entries, kinds, start, later, outputs, n_finite, left, stop
-        table_at, kinds_at, start_at, save_at, out_at, finite_at, left_at, stop_at = (x.ctypes.data for x in arrays)
-        lengths = len(kinds) - 2, int(closed)
-        run(
-            *(table_at, kinds_at, *lengths, start_at, len(y0), first, n_steps, save_at, len(later), out_at),
-            *(finite_at, left_at, int(keeps), stop_at),
-        )
-        if outputs is not out:
-            out[:, begun:] = outputs
-        if keeps:
-            running[:] = left
-        if width == 1:
-            for i in np.flatnonzero(n_finite < n_steps):
-                out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
-                if keeps:
-                    running[i] = np.nan
-
-    def rollout_processed(
-        self, before: np.ndarray, run: np.ndarray, after: np.ndarray, y0: np.ndarray, *rest: Any
-    ) -> int:
-        """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
-        n_steps, save, out, stop, first, running = rest
-        finite = np.empty(1, dtype=np.int64)
-        rows = n_steps, save, out[None], finite, stop, first, running[None]
-        self.rollout_processed_batch(before, run, after, y0[None], *rows)
-        return int(finite[0])
-
-    def rollout_processed_batch(
-        self, before: np.ndarray, run: np.ndarray, after: np.ndarray, y0: np.ndarray, *rest: Any
-    ) -> None:
-        """The same of every row of `y0` (N, 2d)."""
-        n_steps, save, out, n_finite, stop, first, running = rest
-        start = y0
-        if first == 0:
-            start = np.empty_like(y0)
-            self._map(before, y0, start)
-        self.rollout_batch(run, start, n_steps, save, out, n_finite, stop, first, running, False)
-        self._map(after, out.reshape(-1, self._n_out), out.reshape(-1, self._n_out))
-        out[:, : np.searchsorted(save, 0, side="right")] = y0[:, None]
-        good = np.isfinite(out).all(-1)
-        for i in np.flatnonzero(~good.all(-1)):
-            row = int(np.argmin(good[i]))
-            if save[row] <= n_finite[i]:
-                out[i, row:], n_finite[i] = np.nan, save[row] - 1
-
-    def _map(self, table: np.ndarray, y: np.ndarray, out: np.ndarray) -> None:
-        if not len(y):
-            return
-        entries, kinds = self._prepared(table)
-        function = self._function("map", 1 if len(y) == 1 else LANES)
-        arrays = entries, kinds, y, out
-        table_at, kinds_at, rows_at, out_at = (x.ctypes.data for x in arrays)
-        function(table_at, kinds_at, len(kinds), kinds_at, 1, rows_at, len(y), out_at)
+        return np.ascontiguousarray(full.reshape(*full.shape[:2], groups, width).transpose(2, 0, 1, 3)), kinds
 
     def step_rows(
         self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
     ) -> None:
         """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
-        own = " own" if y.shape[1] > self._n_out else ""
-        step = self._function("step" + own, 1 if len(y) == 1 else LANES)
-        table = np.ascontiguousarray(table)
-        table_at, x_at, h_at, t_at, rows_at, out_at = (a.ctypes.data for a in (table, x, h, t, y, out))
-        step(table_at, table.shape[1], table.shape[2], x_at, h_at, t_at, rows_at, len(y), out_at)
+        own = " own" if y.shape[1] > self.n_out else ""
+        table, width = np.ascontiguousarray(table), 1 if len(y) == 1 else self.lanes
+        self.call("step" + own, width, table, table.shape[1], table.shape[2], x, h, t, y, len(y), out)

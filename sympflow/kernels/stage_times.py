@@ -11,13 +11,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled
+from sympflow.compiler.control import Value
+from sympflow.compiler.functions import apply, where
+from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled, with_letters
+from sympflow.hamiltonian.recorded import check_recorded, evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.codegen import printed, sampled_name, statements
+from sympflow.kernels.samples import check_samples, sampled_value
 from sympflow.kernels.stages import Kick, numbers_of_kicks, time_lines
 
 __all__ = ["Driving", "driven_form", "in_code", "letters_of_time", "sampled_sources"]
@@ -50,6 +55,37 @@ class Driving:
     letters: Mapping[sp.Symbol, sp.Expr]
     means: Mapping[sp.Symbol, tuple[sp.Expr, sp.Expr]]
     samples: Mapping[str, Samples]
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Same for systems that share their code: names of samples have their digests."""
+        return self.time, *self.letters.items(), *self.means.items()
+
+    def values_at(self, time: Value, length: Value, fixed: Sequence[Value]) -> list[Any]:
+        """The letters at a time, and their means over a length from there, in compiled code."""
+        known = {self.time: time, DURATION: length, **dict(zip(self.form.parameters, fixed, strict=False))}
+        expressions = [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
+        of_time = evaluator(known)
+        for each in {a for f in expressions for a in f.atoms(sampled)}:
+            known[each] = sampled_value(self.samples[each.name_of_samples], each.order, of_time(each.at))
+        value = evaluator(known)
+        values = [value(f) for f in self.letters.values()]
+        for f, integral in self.means.values():
+            values.append(where(apply("eq", length, 0.0), value(f), value(integral) / length))
+        return values
+
+    def check(self) -> None:
+        """Refuse what has no compiled form.
+
+        Raises
+        ------
+        ValueError
+        """
+        letters = [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
+        for f in (self.form.V, self.form.T, *with_letters(letters)[0]):
+            check_recorded(f)
+        for samples in self.samples.values():
+            check_samples(samples)
 
     def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
         """``numbers_of(table, j, k)`` and ``numbers_at(table, j, x, h, t)``: see `stages.TimedNumbers`."""

@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.system import HamiltonianSystem
+
 __all__ = [
     "DampedDrift",
     "Kick",
     "StageTable",
-    "TimeAlone",
     "TimedNumbers",
+    "damped_drift",
     "kicks_of",
     "lanes_source",
     "numbers_of_kicks",
@@ -26,8 +29,8 @@ __all__ = [
     "stages_source",
     "step_constants",
     "step_table",
+    "takes_values",
     "time_lines",
-    "two_stages_source",
     "with_last_stage",
 ]
 
@@ -84,11 +87,12 @@ class StageTable:
         return rows
 
     def timed_rows(self, values: tuple[float, ...], h: float, t0: float) -> np.ndarray:
-        """`rows`, then the times of the kicks, that of step 0 and the step of the time, of a driven system."""
+        """`rows`, before the values the times of the kicks, that of step 0 and the step of the time."""
         of_kicks = np.cumsum(self.drifts, axis=0) - self.drifts if self.times is None else self.times
         clock = np.zeros((2, *of_kicks.shape))
         (clock if clock.ndim == 2 else clock[..., 0])[:] = np.array([t0, self.direction * h])[:, None]
-        return np.concatenate([self.rows(values), of_kicks[None], clock])
+        rows, n = self.rows(values), len(self.packed)
+        return np.concatenate([rows[:n], of_kicks[None], clock, rows[n:]])
 
     @cached_property
     def _with_values(self) -> dict[tuple[float, ...], np.ndarray]:
@@ -212,6 +216,14 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
     return replace(after, **columns, times=np.concatenate([run.times[-1:], of_kicks[merged:]]))
 
 
+def takes_values(level: int) -> bool:
+    """True of kicks whose code is the same for all values of parameters.
+
+    In those with force gradients sums such as g ω⁴ − b ω² would round in another way than with numbers in the code.
+    """
+    return level not in (FORCE_GRADIENT, CURVATURE)
+
+
 # kinds of kick as code --------------------------------------------------------------------------------------------
 
 
@@ -289,14 +301,11 @@ class DampedDrift:
     ndof : int
     in_place : bool
         True if states are arrays, changed in place, as in the text `array_states`.
-    copies : int
-        States of `ndof` that a state is made of, one after the other: an orbit, and its deviation vectors.
     """
 
     ndim: int
     ndof: int
     in_place: bool
-    copies: int = 1
 
     @property
     def size(self) -> int:
@@ -330,11 +339,10 @@ def damped(p, a):
     return p"""
 
         def times(offset: int) -> str:
-            places = [(c * d, i) for c in range(self.copies) for i in range(d)]
             if self.ndim == 2:
-                sums = (" + ".join(f"a[{offset + d * i + k}]*p[{c + k}]" for k in range(d)) for c, i in places)
+                sums = (" + ".join(f"a[{offset + d * i + k}]*p[{k}]" for k in range(d)) for i in range(d))
             else:
-                sums = (f"a[{offset + (i if self.ndim else 0)}]*p[{c + i}]" for c, i in places)
+                sums = (f"a[{offset + (i if self.ndim else 0)}]*p[{i}]" for i in range(d))
             return "(" + "".join(f"{each}, " for each in sums) + ")"
 
         return f"""@njit(**OPTIONS, forceinline=True)
@@ -357,6 +365,22 @@ def damped(p, a):
             return [move.format(p="p", a="a[0]"), "p = damped(p, a)"]
         spread = "spread(p, a, work)" if self.in_place else "spread(p, a, None)"
         return [move.format(p=spread, a="1.0"), "p = damped(p, a)"]
+
+
+MOST_COUPLED = 6
+"""Degrees of freedom of a damping matrix in compiled loops, where the two maps of each drift are 2d² numbers."""
+
+
+def damped_drift(system: HamiltonianSystem, in_place: bool) -> DampedDrift | None:
+    """The drift of a system with friction as code; None without."""
+    if system.damping is None:
+        return None
+    if system.damping.ndim == 2 and (in_place or system.ndof > MOST_COUPLED):
+        raise ValueError(
+            f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "
+            f"{MOST_COUPLED} degrees of freedom: use backend='array'."
+        )
+    return DampedDrift(system.damping.ndim, system.ndof, in_place)
 
 
 _DRIFT_OF = """@njit(**OPTIONS, forceinline=True)
@@ -398,24 +422,6 @@ class LaneNumbers(Protocol):
     def later_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
         """``timed_numbers(table, j)``, and ``numbers_after(common, k)`` of these, the numbers of kick j of step k."""
         ...
-
-
-class TimeAlone:
-    """The numbers of kicks, and after them the time, of a system whose functions take that."""
-
-    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        numbers, values = numbers_of_kicks(kinds)
-        run, one = time_lines(n_rows)
-        return f"""@njit(**OPTIONS)
-def numbers_of(table, j, k=0):
-    {run}
-    return ({", ".join([*numbers, "time"])})
-
-
-@njit(**OPTIONS)
-def numbers_at(table, j, x, h, t):
-    {one}
-    return ({", ".join([*values, "time"])})"""
 
 
 def time_lines(row: int) -> tuple[str, str]:
@@ -504,20 +510,6 @@ def stages_source(
 def _rows_before_values(kinds: Sequence[Kick], friction: DampedDrift | None) -> int:
     """The rows of a table before those of the values of a system's parameters."""
     return 1 + len(kinds[0].numbers) + (0 if friction is None else 2 * friction.size)
-
-
-def two_stages_source(kinds: Sequence[Kick], friction: DampedDrift | None = None, n_parameters: int = 0) -> str:
-    """``two_stages_lanes``, as ``stage_lanes`` twice; of one kind of kick in one pass, where kicks are scheduled."""
-    head = """@njit(**OPTIONS, inline="always")
-def two_stages_lanes(Y, error, width, numbers_1, a_1, numbers_2, a_2):
-    """
-    if len(kinds) > 1:
-        return head + "\n    ".join(f"stage_lanes(Y, error, width, numbers_{i}, a_{i})" for i in (1, 2))
-    lines = []
-    for i in (1, 2):
-        kicked = kinds[0].application(True, lane=True)
-        lines += [f"numbers, a = numbers_{i}, a_{i}", *kicked, *_drifted_lane(friction, n_parameters)]
-    return head + "\n    ".join(_over_lanes(lines))
 
 
 def _drifted_lane(friction: DampedDrift | None, n_parameters: int) -> list[str]:

@@ -1,37 +1,42 @@
 """Compiled errors of a splitting step at labels, and their derivatives by the numbers of its table.
 
-The kicks are generated from the derivatives of V up to the fourth. The force gradient, the curvature term and their
-slopes are sums of products of these, written out without the factors that are 0; so the source is short whatever V is.
-A driven system has the time as one more position, with the work of the drive as its momentum.
+Labels go through the step side by side, as the lanes of registers. On the way a tape keeps the forces of each kick and
+their slope, and the velocities of each drift; on the way back each error has a cotangent, whose product with the tape
+is its derivative by the numbers of the stage. So the derivatives cost one way back for each of the few errors of a
+label, however many numbers there are. Forces and slopes are derivatives of the recorded potential; a driven system has
+the time as one more position, with the work of the drive as its momentum.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
-import sympy as sp
 
+from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
+from sympflow.compiler.functions import fma
+from sympflow.compiler.machine import address, host
+from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.codegen import as_factor, statements, vectorised
-from sympflow.kernels.modules import load_algebra
+from sympflow.kernels.rollouts import aligned, filled
+from sympflow.kernels.runs import finished
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["LabelErrors", "TableLoops", "table_loops"]
 
-Entry = str | None
-"""The name or the text of a number; None for 0."""
-
-MOST_LINES = 600  # of a kick, beyond which compiling takes too long
-MOST_SHARED = 120  # of one with curvature terms that serves where there are none
-LANES = 64  # as in the text `table_rows`
+MOST_OPERATIONS = 2000  # of a kick, beyond which compiling takes too long
+LANES = 16
+REGISTER = Type("double", LANES)
 ROUNDING = 1e-14  # of rows that are in proportion
-BLOCKS = 256  # of lanes, some milliseconds, between two looks at the clock
+NONE = np.empty(0)
+BLOCKS = 2048  # of lanes, some milliseconds, between two looks at the clock
 
 
 class TableLoops:
@@ -49,12 +54,8 @@ class TableLoops:
 
     Attributes
     ----------
-    n_numbers : int
-        Those that the loops take, which may have more terms in kicks than are asked for.
-    places : ndarray of int
-        Where the numbers that are asked for stand among these, in the order of the stages.
     drifts : ndarray of int
-        Where those of drifts stand.
+        Where the numbers of drifts stand among those of all stages.
 
     Raises
     ------
@@ -72,17 +73,14 @@ class TableLoops:
     ) -> None:
         self._given = symbols, tuple(kicks), level, monomials, friction
         form, d = symbols.parametric, symbols.ndof
-        self.kicks, self.friction = np.array(kicks, dtype=bool), friction
-        self.values = np.array(form.values, dtype=np.float64)
-        self.width, self._driven = d + (symbols.time is not None), symbols.time is not None
+        self.kicks, self.friction = np.array(kicks, dtype=np.int64), friction
+        self.values = np.array([*form.values, 0.0], dtype=np.float64)
+        self._driven = symbols.time is not None
         self._inverse_mass = np.array(symbols.inverse_mass, dtype=np.float64)
         damping = None if friction is None else tuple(tuple(map(float, row)) for row in friction.matrix(d))
-        self.rows, terms = _compiled(form, level, monomials, damping)
-        ends = np.cumsum([terms if kick else 1 for kick in kicks])
-        given = [1 + (len(monomials) or level) if kick else 1 for kick in kicks]
-        starts = ends - [terms if kick else 1 for kick in kicks]
-        self.n_numbers, self.drifts = int(ends[-1]), starts[~self.kicks]
-        self.places = np.concatenate([start + np.arange(n) for start, n in zip(starts, given, strict=True)])
+        self._maps = _maps(form, level, monomials, damping)
+        sizes = [self._maps.terms if kick else 1 for kick in kicks]
+        self.drifts = (np.cumsum(sizes) - sizes)[self.kicks == 0]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return TableLoops, self._given
@@ -97,19 +95,26 @@ class TableLoops:
         errors = LabelErrors(self, y, t0, zero, zero + 1.0, no_slope, np.empty((*c.shape, 0)))
         return errors(c)[0].reshape(len(c), n_rows, y.shape[1])
 
+    def function(self, linearized: bool) -> Callable[..., None]:
+        """The compiled function: see `_Errors`."""
+        return self._maps.function(linearized)
+
+    def memory(self, n_numbers: int) -> np.ndarray:
+        return aligned(self._maps.memory(len(self.kicks), n_numbers))
+
     def opened(self, y: np.ndarray, t0: np.ndarray | None) -> np.ndarray:
         """States (2d, N) with the times (N,) of a driven system after the positions, and its work after the momenta."""
         if not self._driven:
-            return np.ascontiguousarray(y)
+            return y
         assert t0 is not None
         d = len(y) // 2
         return np.concatenate([y[:d], t0[None], y[d:], 0 * t0[None]])
 
-    def motions(self, s: np.ndarray) -> np.ndarray:
-        """The linear maps of drifts of times s (J, m), with friction: (J, m, 2 d²), else (J, m, 0)."""
+    def motions(self, c: np.ndarray) -> np.ndarray:
+        """The linear maps of the drifts in numbers c (J, n), with friction: (J, m, 2 d²), else none."""
         if self.friction is None:
-            return np.empty((*s.shape, 0))
-        M = self._inverse_mass
+            return NONE
+        M, s = self._inverse_mass, c[:, self.drifts]
         mean, end = (
             part if part.shape[1] == M.size else part.reshape(len(part), -1, 1) * np.eye(len(M))
             for part in self.friction.factors(s.ravel())
@@ -155,16 +160,23 @@ class LabelErrors:
         slope: np.ndarray,
         design: np.ndarray,
     ) -> None:
-        self._loops = loops
-        self._labels = tuple(map(np.ascontiguousarray, (loops.opened(x, t0), y, scale, slope)))
+        self._loops, self._count, self._given = loops, x.shape[1], (x, t0, y, scale, slope, design)
+        times = len(design)
         leaders, leader, factors = _in_proportion(design.swapaxes(0, 1).reshape(design.shape[1], -1))
         self.matrices = np.ascontiguousarray(design[:, leaders])
         used = np.flatnonzero(factors)
         used = used[np.argsort(leader[used], kind="stable")]
-        self._places = np.stack([leader[used], loops.places[used]], axis=1)
-        self._design = np.tile(factors[used], (len(design), 1))
-        self._n_blocks = len(design) * -(-x.shape[1] // LANES)
-        self._shape = len(leaders), len(design) * x.shape[1] * (len(scale) + bool(len(slope)))
+        given = [filled(loops.opened(x, t0), LANES), *(filled(a, LANES, times) for a in (y, scale, slope))]
+        places = np.concatenate([np.searchsorted(leader[used], np.arange(len(leaders) + 1)), used])
+        arrays = (*given, places, factors[used])
+        self._arrays = [loops.kicks, loops.values, *map(np.ascontiguousarray, arrays)]
+        n_errors, n, n_numbers = len(scale) + bool(len(slope)), given[0].shape[1], design.shape[1]
+        self._shape = times, n_errors, n
+        sizes = len(loops.kicks), len(loops.drifts), times, n, n_numbers, len(scale), len(slope), len(leaders)
+        self._plan = np.array([*map(address, self._arrays), *sizes])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return LabelErrors, (self._loops, *self._given)
 
     def __call__(
         self, c: np.ndarray, check: Callable[[], None] = lambda: None, linearized: bool = False
@@ -175,16 +187,16 @@ class LabelErrors:
 
         `check` is called now and then, and may raise.
         """
-        loops, (n_parameters, m) = self._loops, self._shape
-        r, J = np.empty(m), np.empty((n_parameters if linearized else 0, m))
-        numbers = np.zeros((len(c), loops.n_numbers))
-        numbers[:, loops.places] = c
-        motions = loops.motions(numbers[:, loops.drifts])
-        common = (loops.kicks, numbers, motions, loops.values, *self._labels, self._places, self._design)
-        for first in range(0, self._n_blocks, BLOCKS):
+        loops, (times, _, n) = self._loops, self._shape
+        r, J = np.empty(self._shape), np.empty((self.matrices.shape[1] if linearized else 0, *self._shape))
+        memory, function = loops.memory(c.shape[1]), loops.function(linearized)
+        arrays = self._plan, np.ascontiguousarray(c), loops.motions(c), r, J, memory
+        addresses, n_blocks = [address(a) for a in arrays], times * -(-n // LANES)
+        for first in range(0, n_blocks, BLOCKS):
             check()
-            loops.rows(*common, first, min(first + BLOCKS, self._n_blocks), r, J)
-        return r, J
+            function(*addresses, first, min(first + BLOCKS, n_blocks))
+        errors, J = r[..., : self._count].ravel(), J[..., : self._count]
+        return errors, np.ascontiguousarray(J).reshape(len(J), len(errors))
 
 
 def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -222,280 +234,289 @@ def table_loops(
 
 
 @lru_cache(maxsize=64)
-def _compiled(
+def _maps(
     form: SymbolicHamiltonian, level: int, monomials: Monomials, friction: tuple[tuple[float, ...], ...] | None
-) -> tuple[Any, int]:
-    """``table_rows`` and the terms of its kicks.
-
-    Loops for force gradients have curvature terms as well where these are short: `train` tries both, and the time that
-    it takes is for the most part that of compiling.
-    """
-    source = _Source(form, level, monomials, friction)
-    text = source.text()
-    if level == FORCE_GRADIENT:
-        both = _Source(form, CURVATURE, monomials, friction)
-        if both.length() <= MOST_SHARED:
-            source, text = both, both.text()
-    width, d = source.width, form.ndof
-    outputs = (*range(d), *range(width, width + d), *range(width + d, 2 * width))
-    constants: dict[str, Any] = {"WIDTH": width, "TERMS": source.terms, "TAPE": source.tape, "OUTPUTS": outputs}
-    return load_algebra(text, ("aligned", "table_rows"), **constants).table_rows, source.terms
+) -> _Maps:
+    return _Maps(form, level, monomials, friction)
 
 
-class _Source:
-    """The source of ``kick_lanes``, ``kick_taped``, ``kick_back``, ``drift_lanes`` and ``drift_back``."""
+class _Maps:
+    """The kicks and drifts of a system, with what their derivatives need, and the functions that are made of them."""
 
     def __init__(
         self, form: SymbolicHamiltonian, level: int, monomials: Monomials, friction: Sequence[Sequence[float]] | None
     ) -> None:
         assert form.inverse_mass is not None
-        self.form, self.level, self.friction = form, level, friction
-        self.q = form.q if form.time is None else (*form.q, form.time)
-        self.width, self.d = len(self.q), form.ndof
-        self.products = [sp.Mul(*map(sp.Pow, form.q, m)) for m in monomials]
+        self.form, self.level, self.monomials, self.friction = form, level, monomials, friction
+        self._mass = form.inverse_mass
+        self.d, self.width = form.ndof, form.ndof + (form.time is not None)
         self.terms = 1 + (len(monomials) or level)
         self.pairs = list(combinations_with_replacement(range(self.width), 2))
         self.tape = max(self.terms * self.width + len(self.pairs), 2 * self.width)
-        n = range(self.d)
-        self.mass = [[_entry(form.inverse_mass[i, j]) for j in n] for i in n]
+        n_symbols = self.width + len(form.parameters)
+        numbers = [f"x_{i}" for i in range(n_symbols)] + [f"c_{k}" for k in range(self.terms)]
+        self.kick = fused(traced(self._kick, *numbers))
+        _check_length(len(self.kick))
+        self._functions: dict[bool, Callable[..., None]] = {}
 
-    def length(self) -> int:
-        """Lines of the longest function."""
-        return len(self._kick(taped=True)[1])
+    def _kick(self, *numbers: Any) -> list[Any]:
+        """The change of p, then the forces of each term, then the upper triangle of the slope of the change."""
+        form, width = self.form, self.width
+        q, c = numbers[:width], numbers[len(numbers) - self.terms :]
+        times = () if form.time is None else (form.time,)
+        of = evaluator(dict(zip((*form.q, *times, *form.parameters), numbers, strict=False)))
+        slope = gradient(of(form.V), q)
+        terms = [slope]
+        if self.monomials:
+            for powers in self.monomials:
+                product = 1.0
+                for x, n in zip(q, powers, strict=False):
+                    product = product * x**n
+                terms.append(gradient(product, q))
+        elif self.level >= FORCE_GRADIENT:
+            M = [[of(self._mass[i, j]) for j in range(self.d)] for i in range(self.d)]
+            rest = [0.0] * (width - self.d)
+            v = [*_product(M, slope), *rest]
+            along = tangent(slope, q, v)
+            terms.append([-x for x in along])
+            if self.level >= CURVATURE:
+                again = tangent(slope, q, [*_product(M, along), *rest])
+                terms.append([0.5 * (x + y) for x, y in zip(tangent(along, q, v), again, strict=True)])
+        forces = [[-x for x in term] for term in terms]
+        changes = [_dot(c, [force[i] for force in forces]) for i in range(width)]
+        _check_length(len(reached(changes)))
+        slopes = [gradient(change, q) for change in changes]
+        return [*changes, *(x for force in forces for x in force), *(slopes[i][j] for i, j in self.pairs)]
 
-    def text(self) -> str:
-        functions = [
-            self._function("kick_lanes", "W, c, values, width", *self._kick(taped=False)),
-            self._function("kick_taped", "W, T, c, values, width", *self._kick(taped=True)),
-            self._function("kick_back", "A, T, B, width", [], self._kick_back()),
-            self._function("drift_lanes", "W, T, a, motion, values, width", self._motion(), self._drift()),
-            self._function("drift_back", "A, T, B, a, motion, values, width", self._motion(), self._drift_back()),
-        ]
-        return "\n\n\n".join(functions) + "\n"
+    def mass(self, values: Sequence[Any]) -> list[list[Any]]:
+        """M⁻¹ for values of the parameters."""
+        of = evaluator(dict(zip(self.form.parameters, values, strict=True)))
+        return [[of(self._mass[i, j]) for j in range(self.d)] for i in range(self.d)]
 
-    def _function(self, name: str, arguments: str, before: list[str], body: list[str]) -> str:
-        if len(body) > MOST_LINES:
-            raise ValueError(f"`system` has a kick of {len(body)} lines.")
-        if "values" in arguments:
-            before = [*(f"{s} = values[{i}]" for i, s in enumerate(self.form.parameters)), *before]
-        lines = [*before, "for lane in range(width):", *(f"    {line}" for line in body)]
-        return "\n    ".join([f"@njit(**OPTIONS)\ndef {name}({arguments}):", *lines])
+    def memory(self, n_stages: int, n_numbers: int) -> int:
+        return LANES * (4 * self.width + n_numbers + n_stages * self.tape)
 
-    # kicks ------------------------------------------------------------------------------------------------------
+    def function(self, linearized: bool) -> Callable[..., None]:
+        if linearized not in self._functions:
+            self._functions[linearized] = _Errors(self, linearized).compiled()
+        return self._functions[linearized]
 
-    def _kick(self, taped: bool) -> tuple[list[str], list[str]]:
-        """Lines before the loop over lanes, and in it."""
-        numbers = [f"c_{k}" for k in range(self.terms)]
-        before = [f"{name} = c[{k}]" for k, name in enumerate(numbers)]
-        body = [f"{s} = W[{i * LANES} + lane]" for i, s in enumerate(self.q)]
-        order = 1 + taped
-        if not self.products and self.level >= FORCE_GRADIENT:
-            order += min(self.level, CURVATURE)
-        algebra = _Algebra(self, order)
-        forces, slopes = algebra.forces(), algebra.slopes(numbers) if taped else {}
-        body += algebra.lines
-        for k, force in enumerate(forces):
-            body += [f"T[{(k * self.width + i) * LANES} + lane] = {f or '0.0'}" for i, f in enumerate(force) if taped]
-        first = self.terms * self.width
-        if taped:
-            body += [f"T[{(first + n) * LANES} + lane] = {slopes[ij] or '0.0'}" for n, ij in enumerate(self.pairs)]
-        for i in range(self.width):
-            change = _sum([_product(c, force[i]) for c, force in zip(numbers, forces, strict=True)])
-            if change is not None:
-                body.append(f"W[{(self.width + i) * LANES} + lane] += {change}")
-        return before, body
 
-    def _kick_back(self) -> list[str]:
-        w, first = self.width, self.terms * self.width
-        lines = [f"b_{i} = A[{(w + i) * LANES} + lane]" for i in range(w)]
-        for k in range(self.terms):
-            terms = [f"b_{i} * T[{(k * w + i) * LANES} + lane]" for i in range(w)]
-            lines.append(f"B[{k * LANES} + lane] = {' + '.join(terms)}")
-        places = {ij: first + n for n, ij in enumerate(self.pairs)}
-        for i in range(w):
-            terms = [f"T[{places[min(i, j), max(i, j)] * LANES} + lane] * b_{j}" for j in range(w)]
-            lines.append(f"A[{i * LANES} + lane] += {' + '.join(terms)}")
-        return lines
+def _check_length(n: int) -> None:
+    if n > MOST_OPERATIONS:
+        raise ValueError(f"`system` has a kick of {n} operations.")
 
-    # drifts -----------------------------------------------------------------------------------------------------
 
-    def _motion(self) -> list[str]:
-        d = self.d
-        if self.friction is None:
-            return []
-        names = [(i, j, f"motion[{part * d * d + i * d + j}]") for part in (0, 1) for i in range(d) for j in range(d)]
-        return [f"{'me'[n // (d * d)]}_{i}_{j} = {text}" for n, (i, j, text) in enumerate(names)]
+def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
+    """Σ xᵢ yᵢ of as many as there are of both."""
+    total: Any = 0.0
+    for a, b in zip(x, y, strict=False):
+        total = total + a * b
+    return total
 
-    def _drift(self) -> list[str]:
+
+def _product(A: Sequence[Sequence[Any]], x: Sequence[Any]) -> list[Any]:
+    return [_dot(row, x) for row in A]
+
+
+class _Errors:
+    """The function of the errors r of labels, and of their derivatives J.
+
+    Its arguments are the addresses of
+
+    - a plan: the addresses of the kinds of stages (S,), 1 for a kick, and of the values of parameters; of the states X
+      (2D, N) at the start, of a driven system with t and a work of 0; of the labels Y and the weights of their errors
+      (R, J N), and those of one more (R', J N), a sum over components; of the derivatives of numbers by parameters that
+      are not 0 where those of each parameter begin (k + 1,), then the numbers (m,), and of their values (m,); then S,
+      the number of drifts, J, N, n, R, R', k;
+    - the numbers c (J, n) at each time, and with friction the motions (J, drifts, 2 d²) of drifts;
+    - r (J, errors, N), J (k, J, errors, N), and memory;
+
+    then the first and the last block of labels.
+    """
+
+    def __init__(self, maps: _Maps, linearized: bool) -> None:
+        self.maps, self.linearized = maps, linearized
+        self._types = [*[POINTER] * 6, INT, INT]
+        self.code = code = Module(host().fused).function("errors", self._types)
+        plan, self.c, self.motions, self.r, self.J, memory, self.first, self.last = code.arguments
+        (
+            self.kinds, self.values, self.X, self.Y, self.scale, self.slope, self.places, self.design,
+        ) = (code.load(plan, i, POINTER) for i in range(8))  # fmt: skip
+        (
+            self.n_stages, self.n_drifts, self.n_times, self.n_states, self.n_numbers, self.n_rows, self.n_slopes,
+            self.n_parameters,
+        ) = (code.load(plan, i, INT) for i in range(8, 16))  # fmt: skip
+        w = maps.width
+        self.W, self.A, self.B = (Rows(code.at(memory, i * w * LANES), REGISTER) for i in (0, 2, 4))
+        self.tape = self.B.part(self.n_numbers)
+        self.zero = code.constant(0.0, REGISTER)
+
+    def compiled(self) -> Callable[..., None]:
+        code, n = self.code, self.n_states
+        integer = code.constant(LANES, INT)
+        per_time = code.op("sdiv", INT, n + (LANES - 1), integer)
+        n_errors = self.n_rows + code.apply("min", (self.n_slopes, code.constant(1, INT)))
+        self.parameters = [code.splat(code.load(self.values, i), LANES) for i in range(len(self.maps.form.parameters))]
+        self.mass = self.maps.mass(self.parameters)
+        with code.over(self.last - self.first) as k:
+            block = self.first + k
+            j = code.op("sdiv", INT, block, per_time)
+            start = code.apply("min", ((block - j * per_time) * LANES, n - LANES))
+            self.label, self.n_labels = j * n + start, self.n_times * n
+            self.numbers, self.time = code.at(self.c, j * self.n_numbers), j
+            with code.over(2 * self.maps.width) as i:
+                self.W[i] = code.load(self.X, i * n + start, REGISTER)
+            with self.stages() as (kick, number, drift, tape):
+                with code.given(kick):
+                    self.kicked(number, tape)
+                with code.given(~kick):
+                    self.drifted(number, drift, tape)
+            with code.over(self.n_rows) as row:
+                error = self.error(row) * self.weight(self.scale, row)
+                code.store(error, self.r, (j * n_errors + row) * n + start)
+            with code.over(n_errors - self.n_rows):
+                (total,) = code.loop(self.n_slopes, [self.zero], self.summed)
+                code.store(total, self.r, (j * n_errors + self.n_rows) * n + start)
+            if self.linearized:
+                with code.over(n_errors) as row:
+                    self.back(row)
+                    self.derivatives((j * n_errors + row) * n + start, self.n_times * n_errors * n)
+        return finished(code, self._types)
+
+    @contextmanager
+    def stages(self, back: bool = False) -> Iterator[tuple[Value, Value, Value, Rows]]:
+        """Each stage: whether it is a kick, where its numbers begin, which drift it is, its tape."""
+        code, terms = self.code, self.maps.terms
+        none = code.constant(0, INT)
+        number, drift = (code.variable(x if back else none) for x in (self.n_numbers, self.n_drifts))
+        with code.over(self.n_stages) as k:
+            s = self.n_stages - 1 - k if back else k
+            kick = code.apply("eq", (code.load(self.kinds, s, INT), 1))
+            size = code.select(kick, code.constant(terms, INT), code.constant(1, INT))
+            one = code.select(kick, none, code.constant(1, INT))
+            if back:
+                number.value, drift.value = number.value - size, drift.value - one
+            yield kick, number.value, drift.value, self.tape.part(s * self.maps.tape)
+            if not back:
+                number.value, drift.value = number.value + size, drift.value + one
+
+    def number(self, i: Value) -> Value:
+        return self.code.splat(self.code.load(self.numbers, i), LANES)
+
+    def weight(self, array: Value, row: Value) -> Value:
+        """The numbers of a row (…, J N) for the labels of this block."""
+        return self.code.load(array, row * self.n_labels + self.label, REGISTER)
+
+    def place(self, row: Value) -> Value:
+        """The place of a row of labels in a state: positions, momenta, the work."""
+        d, w = self.maps.d, self.maps.width
+        return row if d == w else self.code.select(row < d, row, row + (w - d))
+
+    def error(self, row: Value) -> Value:
+        return self.W[self.place(row)] - self.weight(self.Y, row)
+
+    def summed(self, k: Value, total: Sequence[Value]) -> list[Value]:
+        return [fma(self.error(k), self.weight(self.slope, k), total[0])]
+
+    # the way there ----------------------------------------------------------------------------------------------------
+
+    def kicked(self, number: Value, tape: Rows) -> None:
+        maps, w = self.maps, self.maps.width
+        program = maps.kick if self.linearized else Program(maps.kick.inputs, maps.kick.outputs[:w])
+        c = [self.number(number + k) for k in range(maps.terms)]
+        changes = program(*(self.W[i] for i in range(w)), *self.parameters, *c)
+        for i, x in enumerate(changes[w:]):
+            tape[i] = x
+        for i, x in enumerate(changes[:w]):
+            self.W[w + i] = self.W[w + i] + x
+
+    def drifted(self, number: Value, drift: Value, tape: Rows) -> None:
         """The tape holds M⁻¹p and −Γp at the end."""
-        d, w, friction = self.d, self.width, self.friction
-        lines = [f"y_{i} = W[{(w + i) * LANES} + lane]" for i in range(d)]
+        d, w, friction = self.maps.d, self.maps.width, self.maps.friction
+        a, y = self.number(number), [self.W[w + i] for i in range(d)]
+        moves = None
         if friction is not None:
-            lines += [f"change_{i} = {' + '.join(f'm_{i}_{j} * y_{j}' for j in range(d))}" for i in range(d)]
-            lines += [f"end_{i} = {' + '.join(f'e_{i}_{j} * y_{j}' for j in range(d))}" for i in range(d)]
-            lines += [f"y_{i} = end_{i}" for i in range(d)]
-            lines += [f"W[{(w + i) * LANES} + lane] = y_{i}" for i in range(d)]
-            for i in range(d):
-                slowing = [_product(_number(-friction[i][j]), f"y_{j}") for j in range(d)]
-                lines.append(f"T[{(w + i) * LANES} + lane] = {_sum(slowing) or '0.0'}")
+            mean, end = self.motion(drift)
+            moves, y = _product(mean, y), _product(end, y)
+            for i, x in enumerate(_product(friction, y)):
+                self.W[w + i] = y[i]
+                if self.linearized:
+                    tape[w + i] = -x
+        velocity = [*_product(self.mass, y), *[self.code.constant(1.0, REGISTER)] * (w - d)]  # of the time: 1
+        for i, v in enumerate(velocity):
+            if self.linearized:
+                tape[i] = v
+            self.W[i] = self.W[i] + moves[i] if moves is not None and i < d else fma(a, v, self.W[i])
+
+    def motion(self, drift: Value) -> list[list[list[Value]]]:
+        """The linear maps of a drift with friction, from p to what it adds to q, and to p."""
+        d, code = self.maps.d, self.code
+        start = (self.time * self.n_drifts + drift) * (2 * d * d)
+        entry = [code.splat(code.load(self.motions, start + k), LANES) for k in range(2 * d * d)]
+        return [[entry[part + i * d :][:d] for i in range(d)] for part in (0, d * d)]
+
+    # the way back -----------------------------------------------------------------------------------------------------
+
+    def back(self, row: Value) -> None:
+        """The derivatives of an error by the numbers of all stages, into B."""
+        code, w = self.code, self.maps.width
+        for i in range(2 * w):
+            self.A[i] = self.zero
+        single = row < self.n_rows
+        with code.given(single):
+            self.A[self.place(row)] = self.weight(self.scale, row)
+        with code.given(~single), code.over(self.n_slopes) as k:
+            self.A[self.place(k)] = self.weight(self.slope, k)
+        with self.stages(back=True) as (kick, number, drift, tape):
+            with code.given(kick):
+                self.kick_back(number, tape)
+            with code.given(~kick):
+                self.drift_back(number, drift, tape)
+
+    def kick_back(self, number: Value, tape: Rows) -> None:
+        w, terms = self.maps.width, self.maps.terms
+        b = [self.A[w + i] for i in range(w)]
+        for k in range(terms):
+            self.B[number + k] = _fused(b, [tape[k * w + i] for i in range(w)])
+        slope = {ij: tape[terms * w + n] for n, ij in enumerate(self.maps.pairs)}
         for i in range(w):
-            velocity = "1.0"  # of the time
-            if i < d:
-                velocity = _sum([_product(self.mass[i][j], f"y_{j}") for j in range(d)]) or "0.0"
-            lines += [f"v_{i} = {velocity}", f"T[{i * LANES} + lane] = v_{i}"]
-            change = f"change_{i}" if friction is not None and i < d else f"a * v_{i}"
-            lines.append(f"W[{i * LANES} + lane] += {change}")
-        return lines
+            self.A[i] = _fused(b, [slope[min(i, j), max(i, j)] for j in range(w)], self.A[i])
 
-    def _drift_back(self) -> list[str]:
-        d, w = self.d, self.width
-        lines = [f"a_{i} = A[{i * LANES} + lane]" for i in range(w)]
-        by_time = [f"a_{i} * T[{i * LANES} + lane]" for i in range(w)]
-        if self.friction is None:
-            for j in range(d):
-                change = _sum([_product(self.mass[i][j], f"a_{i}") for i in range(d)])
-                if change is not None:
-                    lines.append(f"A[{(w + j) * LANES} + lane] += a * ({change})")
+    def drift_back(self, number: Value, drift: Value, tape: Rows) -> None:
+        d, w = self.maps.d, self.maps.width
+        a = [self.A[i] for i in range(w)]
+        by_time = _fused(a, [tape[i] for i in range(w)])
+        if self.maps.friction is None:
+            time = self.number(number)
+            for j, x in enumerate(_product([list(column) for column in zip(*self.mass, strict=True)], a)):
+                self.A[w + j] = fma(time, x, self.A[w + j])
         else:
-            lines += [f"b_{i} = A[{(w + i) * LANES} + lane]" for i in range(d)]
-            by_time += [f"b_{i} * T[{(w + i) * LANES} + lane]" for i in range(d)]
+            b = [self.A[w + i] for i in range(d)]
+            by_time = _fused(b, [tape[w + i] for i in range(d)], by_time)
+            mean, end = self.motion(drift)
             for j in range(d):
-                change = " + ".join(f"m_{i}_{j} * a_{i} + e_{i}_{j} * b_{i}" for i in range(d))
-                lines.append(f"A[{(w + j) * LANES} + lane] = {change}")
-        return [*lines, f"B[lane] = {' + '.join(by_time)}"]
+                change = _fused([row[j] for row in mean], a)
+                self.A[w + j] = _fused([row[j] for row in end], b, change)
+        self.B[number] = by_time
+
+    def derivatives(self, place: Value, stride: Value) -> None:
+        """The derivatives by the parameters, into J."""
+        code = self.code
+        with code.over(self.n_parameters) as f:
+            begin, end = (code.load(self.places, f + i, INT) for i in range(2))
+
+            def more(k: Value, total: Sequence[Value]) -> list[Value]:
+                number = code.load(self.places, self.n_parameters + 1 + begin + k, INT)
+                return [fma(code.splat(code.load(self.design, begin + k), LANES), self.B[number], total[0])]
+
+            (total,) = code.loop(end - begin, [self.zero], more)
+            code.store(total, self.J, f * stride + place)
 
 
-class _Algebra:
-    """The forces of a kick and their slopes, by sums of products of the derivatives of V up to an order."""
-
-    def __init__(self, source: _Source, order: int) -> None:
-        self.source, self.n = source, range(source.width)
-        d = source.d
-        self.mass = [[source.mass[i][j] if max(i, j) < d else None for j in self.n] for i in self.n]
-        self.known: dict[tuple[int, ...], Entry] = {}
-        wanted: dict[str, sp.Expr] = {}
-        derivatives: dict[tuple[int, ...], sp.Expr] = {(): source.form.V}
-        for length in range(1, order + 1):
-            for place in combinations_with_replacement(self.n, length):
-                f = derivatives.get(place[:-1])
-                f = None if f is None else sp.diff(f, source.q[place[-1]])
-                if f is None or f == 0:
-                    self.known[place] = None
-                    continue
-                derivatives[place] = f
-                self.known[place] = "V_" + "_".join(map(str, place))
-                wanted[str(self.known[place])] = f
-        self.by_product: list[dict[tuple[int, ...], Entry]] = []
-        for k, product in enumerate(source.products):
-            entries: dict[tuple[int, ...], Entry] = {}
-            for length in range(1, order + 1):
-                for place in combinations_with_replacement(self.n, length):
-                    f = sp.diff(product, *(source.q[i] for i in place))
-                    entries[place] = None if f == 0 else f"P_{k}_" + "_".join(map(str, place))
-                    if f != 0:
-                        wanted[str(entries[place])] = f
-            self.by_product.append(entries)
-        self.lines = statements([*wanted], vectorised([*wanted.values()]))
-
-    def _V(self, *place: int) -> Entry:
-        return self.known[tuple(sorted(place))]
-
-    def _named(self, name: str, value: Entry) -> Entry:
-        """A line for a sum that is used several times."""
-        if value is None or value.isidentifier():
-            return value
-        self.lines.append(f"{name} = {value}")
-        return name
-
-    def _vector(self, name: str, entry: Any) -> list[Entry]:
-        return [self._named(f"{name}_{i}", entry(i)) for i in self.n]
-
-    def _symmetric(self, name: str, entry: Any) -> list[list[Entry]]:
-        found = {(i, j): self._named(f"{name}_{i}_{j}", entry(i, j)) for i, j in self.source.pairs}
-        return [[found[min(i, j), max(i, j)] for j in self.n] for i in self.n]
-
-    def forces(self) -> list[list[Entry]]:
-        """−∇V, ∇²V v and −∇W, v = M⁻¹∇V, W = ½ v·∇²V v, as many as the kicks have; or −∇V and the −∇q^m."""
-        n, source = self.n, self.source
-        result = [[_negative(self._V(i)) for i in n]]
-        if source.products:
-            return result + [[_negative(entries[i,]) for i in n] for entries in self.by_product]
-        if source.level >= FORCE_GRADIENT:
-            self.v = self._vector("v", lambda i: _sum([_product(self.mass[i][j], self._V(j)) for j in n]))
-            self.G = self._vector("G", lambda i: _sum([_product(self._V(i, j), self.v[j]) for j in n]))
-            result.append(self.G)
-        if source.level >= CURVATURE:
-            self.u = self._vector("u", lambda i: _sum([_product(self.mass[i][j], self.G[j]) for j in n]))
-            self.third = self._symmetric("third", lambda i, j: _sum([_product(self._V(i, j, k), self.v[k]) for k in n]))
-
-            def bend(i: int) -> Entry:
-                third = _sum([_product(self.third[i][j], self.v[j]) for j in n])
-                return _sum([_product("0.5", third), *[_product(self._V(i, j), self.u[j]) for j in n]])
-
-            result.append([_negative(self._named(f"W_{i}", bend(i))) for i in n])
-        return result
-
-    def slopes(self, numbers: Sequence[str]) -> dict[tuple[int, int], Entry]:
-        """The derivatives of the forces by the positions, times the numbers of the kick, in the upper triangle."""
-        n, source = self.n, self.source
-        total = {ij: [_product(_negative(self._V(*ij)), numbers[0])] for ij in source.pairs}
-        for number, entries in zip(numbers[1:], self.by_product, strict=False):
-            for ij in source.pairs:
-                total[ij].append(_product(_negative(entries[ij]), number))
-        if not source.products and source.level >= FORCE_GRADIENT:
-            if source.level < CURVATURE:
-                self.third = self._symmetric(
-                    "third", lambda i, j: _sum([_product(self._V(i, j, k), self.v[k]) for k in n])
-                )
-            # A = M⁻¹∇²V: the slope of v
-            A = [
-                [self._named(f"A_{k}_{j}", _sum([_product(self.mass[k][m], self._V(m, j)) for m in n])) for j in n]
-                for k in n
-            ]
-
-            def gradient(i: int, j: int) -> Entry:
-                return _sum([self.third[i][j], *[_product(self._V(i, k), A[k][j]) for k in n]])
-
-            slope = self._symmetric("slope", gradient)
-            for i, j in source.pairs:
-                total[i, j].append(_product(slope[i][j], numbers[1]))
-        if not source.products and source.level >= CURVATURE:
-
-            def bent(i: int, j: int) -> Entry:
-                along = [_product(_sum([_product(self._V(i, j, k, m), self.v[m]) for m in n]), self.v[k]) for k in n]
-                return _sum(
-                    [
-                        _product("0.5", _sum(along)),
-                        *[_product(self.third[i][k], A[k][j]) for k in n],
-                        *[_product(A[k][i], slope[k][j]) for k in n],
-                        *[_product(self._V(i, j, k), self.u[k]) for k in n],
-                    ]
-                )
-
-            for i, j in source.pairs:
-                total[i, j].append(_product(_negative(bent(i, j)), numbers[2]))
-        return {ij: _sum(terms) for ij, terms in total.items()}
-
-
-def _entry(number: sp.Expr) -> Entry:
-    return None if number == 0 else as_factor(number)
-
-
-def _number(value: float) -> Entry:
-    return None if value == 0 else repr(value)
-
-
-def _sum(terms: Sequence[Entry]) -> Entry:
-    there = [term for term in terms if term is not None]
-    return " + ".join(there) if there else None
-
-
-def _product(*factors: Entry) -> Entry:
-    if any(f is None for f in factors):
-        return None
-    there = [f if f.isidentifier() else f"({f})" for f in factors if f is not None and f != "1.0"]
-    return " * ".join(there) or "1.0"
-
-
-def _negative(value: Entry) -> Entry:
-    return None if value is None else f"-{value}" if value.isidentifier() else f"-({value})"
+def _fused(x: Sequence[Value], y: Sequence[Value], total: Value | None = None) -> Value:
+    """total + Σ xᵢ yᵢ."""
+    for a, b in zip(x, y, strict=False):
+        total = a * b if total is None else fma(a, b, total)
+    assert total is not None
+    return total

@@ -8,36 +8,54 @@ however many there are.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
 
+from sympflow.compiler.arrange import Arrangement
+from sympflow.compiler.control import INT, Value
+from sympflow.compiler.program import Program, derivatives, gradient, tangent, traced
+from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.codegen import statements
+from sympflow.kernels.runs import Room
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
-__all__ = [
-    "bend_source",
-    "energy_source",
-    "gradient_and_hessian_source",
-    "gradient_source",
-    "is_large",
-    "product_source",
-    "warn_if_long",
-    "written_out",
-]
+__all__ = ["Family", "Terms", "families", "is_large", "is_long", "warn_if_long", "written_out"]
 
 MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more than a few seconds
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
 MOST_COMPILED = 5000  # operations of all formulas, before a warning
 MOST_SEPARATE = 8  # slopes of a formula that have nothing in common
-MOST_OPERATIONS = 300  # in one function of terms that stand alone
+MOST_TOGETHER = 75  # operations of terms that stand alone in one loop
+MOST_OPERATIONS = 1000  # of derivatives that are written out
 
 
 def is_large(symbols: SymbolicHamiltonian) -> bool:
     """True of a system whose terms are better looped over than written out."""
     return symbols.ndof > MOST_IN_REGISTERS or written_out(symbols.H, symbols.q + symbols.p) > MOST_WRITTEN_OUT
+
+
+def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
+    """True where the derivatives of V that kicks of a level need have more operations than are written out."""
+    n = {FORCE_GRADIENT: 2, CURVATURE: 3}.get(level, 1)
+    known = set(symbols.q)
+    roughly = sum(sp.count_ops(f) * len(f.free_symbols & known) ** n for f in sp.Add.make_args(symbols.V))
+    if not MOST_OPERATIONS < roughly < 20 * MOST_OPERATIONS:
+        return bool(roughly > MOST_OPERATIONS)
+
+    given = (*symbols.q, *symbols.parameters)
+
+    def orders(*numbers: Any) -> list[Any]:
+        q = numbers[: symbols.ndof]
+        found = [gradient(evaluator(dict(zip(given, numbers, strict=True)))(symbols.V), q)]
+        for _ in range(1, n):
+            found.append([x for row in derivatives(found[-1], q) for x in row])
+        return [x for order in found for x in order]
+
+    return len(traced(orders, *(s.name for s in given))) > MOST_OPERATIONS
 
 
 def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
@@ -78,7 +96,7 @@ class Family(NamedTuple):
 
 
 def families(f: sp.Expr, variables: Sequence[sp.Symbol]) -> list[Family]:
-    """The terms of f by their kinds; those of which there is one each, together, up to `MOST_OPERATIONS`."""
+    """The terms of f by their kinds; those of which there is one each, together, up to `MOST_TOGETHER`."""
     place = {s: i for i, s in enumerate(variables)}
     members: dict[tuple[str, tuple[int, ...]], list[tuple[sp.Expr, _Tree, list[int]]]] = {}
     for term in _terms(f, set(variables)):
@@ -119,7 +137,7 @@ def _chunks(terms: Sequence[sp.Expr]) -> Iterator[list[sp.Expr]]:
     size = 0
     for term in terms:
         cost = sp.count_ops(term)
-        if chunk and size + cost > MOST_OPERATIONS // 4:  # slopes are several times as long
+        if chunk and size + cost > MOST_TOGETHER:
             yield chunk
             chunk, size = [], 0
         chunk.append(term)
@@ -179,111 +197,87 @@ def _constant(f: sp.Basic) -> _Tree | None:
 # derivatives as loops ---------------------------------------------------------------------------------------------
 
 
-def energy_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> str:
-    """``name(q)``: the value of f.
+class Terms:
+    """A function as the terms of each kind, whose derivatives are added up by loops over these.
 
-    Raises
-    ------
-    ValueError
-        As `sympflow.kernels.codegen.statements`.
+    Parameters
+    ----------
+    f : Expr
+    variables : sequence of Symbol
+    letters : sequence of Symbol
+        What else is in f, numbers of a stage.
+
+    Attributes
+    ----------
+    data : list of ndarray
+        How many terms each kind has, then the coordinates and the constants of each kind.
     """
-    constant = f.as_independent(*variables, as_Add=True)[0]
-    before, after = f"total = {float(constant)!r}", "return total"
-    return _source(f, variables, name, "q", before, lambda family: {"total": family.f}, after)
 
+    def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
+        self._given = f, tuple(variables), tuple(letters)
+        self._families, self._letters = families(f, variables), tuple(letters)
+        self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
+        for family in self._families:
+            self.data += [family.coordinates.astype(np.int64), family.constants]
 
-def gradient_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
-    """``name(q, out)``: ∇f into out; with letters in f ``name(q, out, numbers)``, of which the last are theirs."""
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Terms, self._given
 
-    def slopes(family: Family) -> dict[str, sp.Expr]:
-        return _each(_slopes(family.f, family.x))
+    @cached_property
+    def slopes(self) -> list[Program]:
+        """∇f of a term of each kind."""
+        return [self._derived(family, 0) for family in self._families]
 
-    return _source(f, variables, name, "q, out", "out[:] = 0.0", slopes, letters=letters)
+    @cached_property
+    def products(self) -> list[Program]:
+        """∇²f v."""
+        return [self._derived(family, 1) for family in self._families]
 
+    @cached_property
+    def bends(self) -> list[Program]:
+        """½ ∇³f(v, v)."""
+        return [self._derived(family, 2) for family in self._families]
 
-def product_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
-    """``name(q, v, out)``: ∇²f v into out."""
+    def _derived(self, family: Family, times: int) -> Program:
+        """∇f, that often differentiated along v, and divided by the factorial."""
+        n, along = len(family.x), [f"v_{j}" for j in range(len(family.x) if times else 0)]
+        given = (*family.x, *family.c, *self._letters)
 
-    def product(family: Family) -> dict[str, sp.Expr]:
-        return _each(_slopes(_along(family.f, family.x), family.x))
+        def slopes(*numbers: Any) -> list[Any]:
+            x, v, rest = numbers[:n], numbers[n : n + len(along)], numbers[n + len(along) :]
+            slope = gradient(evaluator(dict(zip(given, (*x, *rest), strict=True)))(family.f), x)
+            for k in range(times):
+                slope = [y / (k + 1) for y in tangent(slope, x, v)]
+            return slope
 
-    return _source(f, variables, name, "q, v, out", "out[:] = 0.0", product, letters=letters)
+        names = [s.name for s in given]
+        names[n:n] = along
+        made = Arrangement([(name, 0) for name in names])
+        found = traced(slopes, *names)(*made.states)
+        return made.finish([made.written(made.number(y)) for y in found]).body
 
-
-def bend_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, letters: Sequence[sp.Symbol] = ()) -> str:
-    """``name(q, v, out)``: ½ ∇³f(v, v) into out."""
-
-    def bend(family: Family) -> dict[str, sp.Expr]:
-        return _each(_slopes(_along(_along(family.f, family.x), family.x) / 2, family.x))
-
-    return _source(f, variables, name, "q, v, out", "out[:] = 0.0", bend, letters=letters)
-
-
-def gradient_and_hessian_source(f: sp.Expr, variables: Sequence[sp.Symbol], name: str, time: str) -> str:
-    """``name(q, out, S, time)``: ∇f into out and ∇²f into S, of f that may hold the symbol of that time."""
-
-    def both(family: Family) -> dict[str, sp.Expr]:
-        slopes = _slopes(family.f, family.x)
-        targets = _each(slopes)
-        for j, slope in enumerate(slopes):
-            for k, entry in enumerate(_slopes(slope, family.x)):
-                targets[f"S[i_{j}, i_{k}]"] = entry
-        return targets
-
-    return _source(f, variables, name, f"q, out, S, {time}", "out[:] = 0.0\n    S[:] = 0.0", both)
-
-
-def _slopes(f: sp.Expr, x: Sequence[sp.Symbol]) -> list[sp.Expr]:
-    return [sp.diff(f, s) for s in x]
-
-
-def _along(f: sp.Expr, x: Sequence[sp.Symbol]) -> sp.Expr:
-    """The derivative of f along v."""
-    return sp.Add(*[sp.Symbol(f"v_{j}", real=True) * sp.diff(f, s) for j, s in enumerate(x)])
-
-
-def _each(values: Sequence[sp.Expr]) -> dict[str, sp.Expr]:
-    return {f"out[i_{j}]": value for j, value in enumerate(values)}
-
-
-def _source(
-    f: sp.Expr,
-    variables: Sequence[sp.Symbol],
-    name: str,
-    arguments: str,
-    before: str,
-    values: Callable[[Family], dict[str, sp.Expr]],
-    after: str = "",
-    letters: Sequence[sp.Symbol] = (),
-) -> str:
-    """A function that adds up the values of all terms, and one that it calls for each family."""
-    parts, calls = [], []
-    arguments += ", numbers" if letters else ""
-    for k, family in enumerate(families(f, variables)):
-        wanted = {target: value for target, value in values(family).items() if value != 0}
-        if not wanted:
-            continue
-        one = f"{name}_{k}"
-        n_terms, used = len(family.coordinates), set().union(*(value.free_symbols for value in wanted.values()))
-        lines = [f"i_{j} = COORDINATES_{one.upper()}[n, {j}]" for j in range(len(family.x))]
-        drawn = "".join(f"    {s} = numbers[{i - len(letters)}]\n" for i, s in enumerate(letters) if s in used)
-        lines += [f"{s} = q[i_{j}]" for j, s in enumerate(family.x) if s in used]
-        lines += [f"v_{j} = v[i_{j}]" for j in range(len(family.x)) if sp.Symbol(f"v_{j}", real=True) in used]
-        lines += [f"{s} = CONSTANTS_{one.upper()}[n, {j}]" for j, s in enumerate(family.c) if s in used]
-        lines += statements([f"d_{j}" for j in range(len(wanted))], list(wanted.values()))
-        lines += [f"{target} += d_{j}" for j, target in enumerate(wanted)]
-        returns = "total" in wanted
-        parts.append(f"COORDINATES_{one.upper()} = np.array({family.coordinates.tolist()})")
-        if any(s in used for s in family.c):
-            parts.append(f"CONSTANTS_{one.upper()} = np.array({family.constants.tolist()})")
-        body = "\n        ".join(lines)
-        parts.append(
-            f"@njit(**OPTIONS)\ndef {one}({arguments}):\n"
-            + drawn
-            + ("    total = 0.0\n" if returns else "")
-            + f"    for n in range({n_terms}):\n        {body}"
-            + ("\n    return total" if returns else "")
-        )
-        calls.append(f"total += {one}({arguments})" if returns else f"{one}({arguments})")
-    whole = "\n    ".join([f"@njit(**OPTIONS)\ndef {name}({arguments}):", before, *calls, after or "return"])
-    return "\n\n\n".join(["import numpy as np", *parts, whole])
+    def added(
+        self,
+        room: Room,
+        derivatives: Sequence[Program],
+        given: Sequence[Value],
+        out: Value,
+        d: Value,
+        letters: Sequence[Any],
+        first: int = 0,
+    ) -> None:
+        """Write derivatives at places in memory into another one; the `first` of the data of the code is its own."""
+        code = room.code
+        with code.over(d) as i:
+            room.store(0.0, i, out)
+        counts = room.data(first)
+        for k, (family, program) in enumerate(zip(self._families, derivatives, strict=True)):
+            coordinates, constants = room.data(first + 1 + 2 * k), room.data(first + 2 + 2 * k)
+            n, m = len(family.x), len(family.c)
+            with code.over(code.load(counts, k, INT)) as term:
+                places = [code.load(coordinates, term * n + j, INT) for j in range(n)]
+                values = [room.load(place, x) for x in given for place in places]
+                values += [code.splat(code.load(constants, term * m + j), room.width) for j in range(m)]
+                for place, y in zip(places, program(*values, *letters), strict=True):
+                    if not (isinstance(y, float) and y == 0):
+                        room.add(y, place, out)

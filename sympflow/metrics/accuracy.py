@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arrays import Array, is_tensor, to_numpy
-from sympflow.hamiltonian.scales import weights
+from sympflow.hamiltonian.scales import distance, weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import failed
 from sympflow.metrics.reference import Reference
@@ -16,7 +16,10 @@ from sympflow.solver import solve
 
 
 def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike | None = None) -> np.ndarray:
-    """‖y(t) − y_ref(t)‖₂ at the times `sol.t`: (..., n).
+    """‖y(t) − y_ref(t)‖₂ at the times `sol.t`, in units of q: (..., n).
+
+    Each momentum counts as its amplitude in q, pᵢ/sᵢ² with s² = mω the system's natural scale, 1 of an oscillator with
+    m = ω = 1: so the order of methods does not depend on units.
 
     Parameters
     ----------
@@ -48,7 +51,7 @@ def reference_error(sol: Solution, reference: Reference | Solution | ArrayLike |
     if y_ref.shape != y.shape:
         raise ValueError(f"`reference` must have the shape {y.shape} of `sol.y`; got {y_ref.shape}.")
     with np.errstate(all="ignore"):
-        return np.linalg.norm(y - y_ref, axis=-2)
+        return distance(sol.system, y - y_ref, axis=-2)
 
 
 OTHER_ENERGY = 1e-2  # of the energy's scale: what no reference of a problem is off by
@@ -121,7 +124,7 @@ def _brief(x: object) -> str:
 
 
 def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
-    """‖y − y0‖₂ after the run forwards to its end and the same method back from there, (...).
+    """‖y − y0‖₂, as in `reference_error`, after the run forwards to its end and the same method back from there, (...).
 
     On a grid that divides the interval it is at rounding level for a method with Φ(−h) = Φ(h)⁻¹, and for one that goes
     back by its exact inverse, as a SympFlow does. inf for a trajectory that does not get there and back.
@@ -146,7 +149,7 @@ def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
             f"`sol` is of method {sol.integrator.name!r}, which cannot run backwards in time: use a symplectic method."
         ) from refused
     with np.errstate(all="ignore"):
-        error = np.linalg.norm(to_numpy(back).astype(float) - to_numpy(y0), axis=-1)
+        error = distance(sol.system, to_numpy(back).astype(float) - to_numpy(y0))
     return np.where(finite & np.isfinite(error) & ~failed(sol), error, np.inf)[()]
 
 

@@ -11,6 +11,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,10 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
 
-EVERY = 256  # steps between two looks at an orbit, of compiled loops
 ALIGNED = 1e-12
 """Below this SALI and GALI an orbit is chaotic for sure, and ends: what is left is rounding."""
-NONE, ALIGNMENT, VOLUME = 0, 1, 2  # as `kernels.tangent_loops`
+NONE, ALIGNMENT, VOLUME = 0, 1, 2
+"""Kinds of spread of deviation vectors: none, min(|u + v|, |u − v|) of two unit vectors, the volume that they span."""
 BACKENDS = ("auto", "compiled", "array")
 LOG_2 = float(np.log(2.0))
 
@@ -229,8 +230,7 @@ def gali(
 
     Notes
     -----
-    The volume |w₁ ∧ … ∧ w_k| is the product of the singular values of the matrix of the vectors, computed by making
-    them orthogonal one after the other.
+    The volume |w₁ ∧ … ∧ w_k| is computed by making the vectors orthogonal one after the other.
 
     References
     ----------
@@ -351,13 +351,8 @@ def _compiled(
 ) -> _Run:
     counts = np.array([grid.place(t)[0] for t in times], dtype=np.int64)
     save, where = np.unique(counts[counts > 0], return_inverse=True)
-    how = {"scale": scale, "single": not orbits.batch}
-    found = kernel.run(grid.h, orbits.rows, w0, grid.n_steps, save, EVERY, kind, below, **how)
-    if not found.whole.all():  # looked at after every step, to tell the last one at which all was finite
-        failed = np.flatnonzero(~found.whole)
-        last = min(grid.n_steps, int(found.n_steps[failed].max()) + EVERY)
-        again = kernel.run(grid.h, orbits.rows[failed], w0, last, save[:0], 1, **how)
-        found.n_steps[failed] = again.n_steps
+    spread_of = None if kind == NONE else partial(_spread, kind=kind)
+    found = kernel.run(grid.h, orbits.rows, w0, grid.n_steps, save, spread_of, below, scale)
     start, N = int((counts == 0).sum()), len(orbits.rows)
     growth, spread = np.zeros((N, len(w0), len(times) + 1)), np.empty((N, len(times) + 1))
     spread[:] = _spread((scale * w0).T[None], kind)[0]
@@ -433,9 +428,23 @@ def _spread(W: np.ndarray, kind: int) -> np.ndarray:
         return np.full(len(W), np.nan)
     unit = W / np.linalg.norm(W, axis=1, keepdims=True)
     if kind == VOLUME:
-        return np.asarray(np.prod(np.linalg.svd(unit, compute_uv=False), axis=-1))
+        return _volume(np.moveaxis(unit, -1, 0))
     u, v = unit[..., 0], unit[..., 1]
     return np.minimum(np.linalg.norm(u + v, axis=-1), np.linalg.norm(u - v, axis=-1))
+
+
+def _volume(vectors: np.ndarray) -> np.ndarray:
+    """Volume (N,) of the parallelepiped of vectors (k, N, 2d), which are made orthogonal one by one, each twice."""
+    total = np.ones(vectors.shape[1])
+    basis: list[np.ndarray] = []
+    for vector in vectors:
+        w = vector
+        for u in 2 * basis:
+            w = w - np.einsum("ni,ni->n", u, w)[:, None] * u
+        length = np.linalg.norm(w, axis=1)
+        total *= length
+        basis.append(w / np.where(length > 0, length, 1.0)[:, None])
+    return total
 
 
 def _reported(run: _Run, orbits: Orbits, times: np.ndarray, kind: int, below: float) -> Indicator:

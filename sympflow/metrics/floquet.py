@@ -26,6 +26,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build, check_applies
 from sympflow.metrics.crossings import dividing_step
 from sympflow.solver import check_y0, solve
+from sympflow.systems.given import given_system
 
 GROWS = 1e-5
 """Excess of a multiplier over 1 that is more than the rounding of a double eigenvalue, √ε."""
@@ -119,8 +120,7 @@ def floquet_multipliers(
     >>> bool(abs(found.multipliers + 1).max() < 1e-6)
     True
     """
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    system = given_system(system)
     T = system.period if period is None else period
     if T is None:
         raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")

@@ -14,6 +14,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.registry import build, check_applies
 from sympflow.solver import check_y0
+from sympflow.systems.given import given_system
 
 
 class Orbits(NamedTuple):
@@ -50,8 +51,7 @@ def checked_orbits(
     ValueError, TypeError
         For bad arguments, and where the method does not apply to the system.
     """
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    system = given_system(system)
     integrator = build(method, dict(options))
     span = check_t_span(system.t_span if t_span is None else t_span)
     if is_tensor(y0):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sympflow.arrays import to_numpy
-from sympflow.hamiltonian.scales import smallest_size, weights
+from sympflow.hamiltonian.scales import distance, smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import solve
 
@@ -28,7 +28,7 @@ class Reference:
     method : str
         In words.
     accuracy : float or None
-        Estimate of the largest error ‖y − y(t)‖, in the units of y; of a batch the median over its trajectories. None
+        Estimate of the largest `reference_error`, in units of q; of a batch the median over its trajectories. None
         if it is unknown.
     """
 
@@ -68,9 +68,8 @@ def reference(
     exact = _linear_flow(system, t - t_span[0], y0)
     if exact is not None:
         phase = np.abs(t - t_span[0]).max(initial=0.0) * np.abs(np.linalg.eigvals(_linear_part(system))).max()
-        return Reference(
-            t, exact, "exact (linear flow)", float(np.finfo(float).eps * np.abs(exact).max(initial=0.0) * (4 + phase))
-        )
+        size = distance(system, exact, axis=-2).max(initial=0.0)
+        return Reference(t, exact, "exact (linear flow)", float(np.finfo(float).eps * size * (4 + phase)))
     run = _kahan_li if system.separable else _dop853
     return run(system, t_span, y0, t, target)
 
@@ -78,17 +77,17 @@ def reference(
 def _kahan_li(
     system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, t: np.ndarray, target: float
 ) -> Reference:
-    dt, scale = 4 * system.dt, weights(system)[:, None]
+    dt = 4 * system.dt
     previous, best, apart = None, None, math.inf
     for _ in range(_HALVINGS):
         sol = solve(system, "kahan_li8", t_span, y0, t_eval=t, dt=dt)
         y = to_numpy(sol.y) if sol.y.shape[-1] == len(t) else None
         if y is not None and previous is not None:
-            before, apart = apart, _distance(scale * y, scale * previous) / (_size(scale * y) or 1.0)
+            before, apart = apart, _distance(system, y - previous) / (_size(system, y) or 1.0)
             if best is not None and not apart < before:
                 apart = before
                 break
-            best = Reference(t, y, f"Kahan–Li 8, dt = {dt:.3g}", accuracy := _distance(y, previous))
+            best = Reference(t, y, f"Kahan–Li 8, dt = {dt:.3g}", accuracy := _distance(system, y - previous))
             if accuracy <= target or apart <= _ROUNDING:
                 break
         previous = y
@@ -109,18 +108,20 @@ def _dop853(
         solve(system, "dop853", t_span, y0, t_eval=t, rtol=rtol, atol=rtol * smallest).raise_for_status()
         for rtol in (1e-13, 1e-12)
     )
-    return Reference(t, to_numpy(fine.y), "DOP853, rtol = 1e-13", _distance(fine.y, coarse.y))
+    return Reference(
+        t, to_numpy(fine.y), "DOP853, rtol = 1e-13", _distance(system, to_numpy(fine.y) - to_numpy(coarse.y))
+    )
 
 
-def _size(y: np.ndarray) -> float:
-    return float(np.max(np.abs(y), where=np.isfinite(y), initial=0.0))
+def _size(system: HamiltonianSystem, y: np.ndarray) -> float:
+    return float(distance(system, np.where(np.isfinite(y), y, 0.0), axis=-2).max(initial=0.0))
 
 
-def _distance(a: np.ndarray, b: np.ndarray) -> float:
-    """max over time of ‖a − b‖, inf where it is NaN; the median over a batch."""
+def _distance(system: HamiltonianSystem, change: np.ndarray) -> float:
+    """The largest `distance` over time, inf where it is NaN; the median over a batch."""
     with np.errstate(all="ignore"):
-        distance = np.linalg.norm(a - b, axis=-2).max(axis=-1, initial=0.0)
-    return float(np.median(np.where(np.isnan(distance), np.inf, distance)))
+        largest = distance(system, change, axis=-2).max(axis=-1, initial=0.0)
+    return float(np.median(np.where(np.isnan(largest), np.inf, largest)))
 
 
 def _linear_part(system: HamiltonianSystem) -> np.ndarray:

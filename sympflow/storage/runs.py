@@ -236,9 +236,9 @@ class RunStore:
         """Return the times of the committed outputs from a number on."""
         return self._read((TIME,), (), first)
 
-    def states(self) -> np.ndarray:
-        """Return the states (..., 2d, n) of the committed outputs."""
-        return self._read(("q", "p"), self.store.fields["q0"].shape[:-1], 0)
+    def states(self, first: int = 0) -> np.ndarray:
+        """Return the states (..., 2d, n) of the committed outputs from a number on."""
+        return self._read(("q", "p"), self.store.fields["q0"].shape[:-1], first)
 
     def status(self) -> Any:
         """Return the status of each trajectory."""

@@ -34,6 +34,7 @@ from sympflow.studies.attempts import (
     tolerance_of,
 )
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
+from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -119,8 +120,7 @@ def compare(
     >>> [row.status for row in report.rows]
     ['ok', 'ok']
     """
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    system = given_system(system)
     asked = default_metrics(system) if metrics is None else _check_metrics(metrics)
     check_counts(n_outputs=n_outputs, repeats=repeats)
     check_dt(dt)

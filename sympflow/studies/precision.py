@@ -27,6 +27,7 @@ from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, shown_compile_time, tolerance_of
 from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
+from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -97,8 +98,7 @@ def work_precision(
     points below are marked "uncertain". SciPy's methods take the trajectories of a batch one by one: they are timed on
     a few, and the time is scaled to all.
     """
-    if not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
+    system = given_system(system)
     tolerances = positive_numbers("tolerances", tolerances)
     if steps is not None:
         steps = positive_numbers("steps", steps)

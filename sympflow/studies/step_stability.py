@@ -387,7 +387,7 @@ def largest_error(sols: Sequence[Solution]) -> float:
 def domain_exit(sols: Sequence[Solution]) -> float | None:
     """The time at which the first trajectory leaves the domain of the flow, or of the system."""
     system = sols[0].system
-    flow = sols[0].integrator.flow_for(system)
+    flow = sols[0].integrator.known_flow(system)
     domain = system.domain if flow is None else flow.domain_for(system)
     if domain is None:
         return None

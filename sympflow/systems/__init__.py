@@ -196,3 +196,11 @@ __all__ = ["SYSTEMS", "available", "from_toml", "get", "register"]
 __all__ += ["fodo_matrices", "grid", "kepler_ellipse", "lax_eigenvalues", "magnetic_moment", "oscillatory_energies"]
 __all__ += ["perihelion_angle"]
 __all__ += [factory.__name__ for factory in SYSTEMS.values()]
+
+
+def __getattr__(name: str) -> Any:
+    import difflib
+
+    close = difflib.get_close_matches(name, [key.replace("-", "_") for key in SYSTEMS], n=1, cutoff=0.5)
+    hint = f" Did you mean {close[0]!r}?" if close else ""
+    raise AttributeError(f"module 'sympflow.systems' has no attribute {name!r}.{hint}")

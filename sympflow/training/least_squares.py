@@ -25,7 +25,7 @@ from scipy.linalg.blas import dsyrk
 from torch import Tensor
 
 from sympflow.flow.flow_map import FlowMap
-from sympflow.kernels.gauss_newton import gauss_newton_loops
+from sympflow.kernels.gauss_newton import bent, damped, factored
 from sympflow.training.losses import Objective
 from sympflow.training.options import LossOptions
 from sympflow.training.session import OutOfTime
@@ -225,14 +225,15 @@ class _Factored(Linearized):
     """A linear model in compiled code, by QR factorizations of [J r] and, for each λ, of [R; √λ D]."""
 
     def __init__(self, x: np.ndarray, r: np.ndarray, J: np.ndarray | Blocks, scale: np.ndarray) -> None:
-        self.x, self.r, self._loops = x, r, gauss_newton_loops()
+        self.x, self.r = x, np.ascontiguousarray(r)
         J = J if isinstance(J, Blocks) else Blocks(np.ascontiguousarray(J.T), NO_BLOCKS)
-        self.J = J.columns, J.matrices
-        self._R, self.scale = self._loops.factored(*self.J, r, scale)
+        self.J = J
+        self._R, self.scale = factored(J.columns, J.matrices, self.r, scale)
         self.D = np.where(self.scale > 0, self.scale, 1.0)
 
     def damp(self, damping: float) -> None:
-        self._damped, *self._newton = self._loops.damped(self._R, self.D, damping)
+        self._damped, step, decrease = damped(self._R, self.D, damping)
+        self._newton = step, decrease
 
     def newton(self) -> tuple[np.ndarray, float]:
         step, decrease = self._newton
@@ -240,7 +241,7 @@ class _Factored(Linearized):
 
     def bend(self, residuals: Callable[[np.ndarray], np.ndarray], step: np.ndarray) -> Any:
         probed = residuals(self.x + PROBE * step)
-        return self._loops.bent(*self.J, self.r, probed, PROBE, step, self._damped, self.D, CURVED)
+        return bent(self.J.columns, self.J.matrices, self.r, probed, PROBE, step, self._damped, self.D, CURVED)
 
     def moved(self, step: np.ndarray, bend: np.ndarray) -> np.ndarray:
         return self.x + step + bend

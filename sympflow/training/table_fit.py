@@ -70,7 +70,6 @@ SEARCH_STEPS = 60  # iterations from each start
 FROZEN_SHARE = 0.7  # of a time budget, that all work on frozen tables may use
 FRACTIONAL_TIMES = 50  # of the held-out labels; as many as of the fit where these would take longer than
 HELD_OUT_SHARE = 0.1  # of the time left
-WORTH_COMPILING = 250  # iterations of a fit, which take longer without
 LAST_EVALUATIONS = 3  # times what the held-out figures take, for what is left to do when the time is up
 LOST = 0.02  # share of the states of a domain from which no solution may exist without a warning
 CLOSE = 1.1  # held-out errors that differ by less are the same for a warning
@@ -144,9 +143,7 @@ class TableRun(SearchRun):
         """
         deadline = Session().deadline if deadline is None else deadline
         fractions = FRACTIONAL_TIMES
-        iterations = options.restarts * min(SEARCH_STEPS, options.steps) + options.steps
-        compiled = iterations >= WORTH_COMPILING
-        step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled)
+        step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled=True)
         table = Table(flow)
         unit = np.array(scaling.x)
         if options.residual_weight or options.matching_weight or data is not None:

@@ -52,8 +52,7 @@ class TableStep:
     monomials
         Of the polynomial.
     compiled : bool
-        Compile the step and its derivatives, where the system has symbols, or the forces of bodies in pairs: that takes
-        two seconds, and pays for a hundred evaluations.
+        Compile the step and its derivatives, where the system has symbols, or the forces of bodies in pairs.
 
     Attributes
     ----------
@@ -84,7 +83,7 @@ class TableStep:
         self._times_inverse_mass, self._friction = _velocities(system, 1.0), system.friction
         if self._driven and system.friction is not None:
             self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
-        self._forces = forces_of(system, level, monomials, compiled)
+        self._forces_of = system, level, monomials, compiled
         n, terms = len(sequence), len(monomials) or level
         kicks = [i for i in range(n) if sequence[i] == "kick"]
         self.n_coefficients = n + terms * len(kicks)
@@ -99,6 +98,10 @@ class TableStep:
 
             each = [kind == "kick" for kind in self.sequence]
             self.loops = table_loops(system.symbols, each, int(level), monomials, system.friction)
+
+    @cached_property
+    def _forces(self) -> Forces:
+        return forces_of(*self._forces_of)
 
     def _opened(self, y: np.ndarray, t0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """The positions and momenta on which maps are applied, (q, t, s) and (p, 1, E) in time: (D, P) each."""
@@ -290,7 +293,7 @@ class Forces(Protocol):
 
 def _pair_forces(system: HamiltonianSystem, level: int) -> Forces:
     from sympflow.hamiltonian.bodies import PairsHamiltonian
-    from sympflow.kernels.pair_forces import PairForces
+    from sympflow.kernels.pairs import PairForces
 
     assert isinstance(system.local, PairsHamiltonian)
     return PairForces(system.local, level)

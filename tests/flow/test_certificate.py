@@ -12,7 +12,8 @@ from safetensors.torch import load_file, save_file
 import sympflow
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, solve, systems
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
-from sympflow.flow.files import KEY, SUM, load, text_checksum
+from sympflow.flow.files import load
+from sympflow.flow.records import KEY, SUM, text_checksum
 from sympflow.flow.shipped import named, shipped
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
@@ -166,7 +167,7 @@ def test_the_measured_errors_are_those_of_solve():
 
 def test_long_runs_go_piece_by_piece(monkeypatch):
     whole = primed().certificate(HH, **QUICK)
-    monkeypatch.setattr("sympflow.flow.certificate.SAVED_VALUES", 20 * 4 * 7)
+    monkeypatch.setattr("sympflow.flow.certification.SAVED_VALUES", 20 * 4 * 7)
     pieces = primed().certificate(HH, **QUICK)
     assert pieces.left == whole.left
     # the rounding of a chaotic orbit differs where a piece begins

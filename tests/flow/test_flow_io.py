@@ -4,16 +4,20 @@ import json
 import math
 import pickle
 import struct
+from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from sympflow.flow.files import KEY, SUM, load, text_checksum
+import sympflow
+from sympflow.flow.files import load
 from sympflow.flow.io import save
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
+from sympflow.flow.records import FORMAT, KEY, SUM, text_checksum
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.weights import checksum
@@ -335,3 +339,13 @@ def test_a_pickle_of_a_version_without_identities_is_read():
     again = pickle.loads(pickle.dumps(flow))
     assert again.identity is None
     assert again.unfitted == ()
+
+
+@pytest.mark.parametrize(
+    "path", sorted(Path(sympflow.__file__).parent.glob("pretrained/*.safetensors")), ids=lambda path: path.stem
+)
+def test_the_records_of_shipped_files_have_checksums(path):
+    with safe_open(path, "np") as file:
+        notes = file.metadata()
+    assert json.loads(notes[KEY])["format"] == FORMAT
+    assert notes[SUM] == text_checksum(notes[KEY])

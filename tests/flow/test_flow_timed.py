@@ -93,7 +93,6 @@ def test_steps_of_solve_are_chained_calls(system, bare):
     np.testing.assert_allclose(back.y[..., -1], end, rtol=0, atol=1e-14)
 
 
-@pytest.mark.slow  # compiles for fifteen seconds: tests/training/test_network_tangents.py has the same code
 def test_training_fits_it_at_all_times_of_the_drive(system, trained):
     assert type(trained) is TimedSympFlow
     start, end = trained.history[0], trained.figures

@@ -1,6 +1,7 @@
 """Networks from elsewhere: imported and exported by a layout, with activations and potentials of a user's own."""
 
 import importlib
+import math
 import pickle
 from importlib import metadata
 from importlib.metadata import EntryPoint
@@ -191,12 +192,19 @@ def softsign_like_slope(a):
     return a / root, 1 / root**3
 
 
+def softsign_like_by_cases(a):
+    """No function of traced numbers: Numba compiles it."""
+    root = math.sqrt(1 + a * a)
+    return (a / root if a > 0 else -(-a / root)), 1 / root**3
+
+
 def wrong_slope(a):
     return a / (1 + a * a) ** 0.5, 1.0
 
 
-def test_an_activation_of_a_function_has_all_derivatives_and_compiled_loops():
-    register_activation("softsign_like", softsign_like, softsign_like_slope)
+@pytest.mark.parametrize("compiled", [softsign_like_slope, softsign_like_by_cases])
+def test_an_activation_of_a_function_has_all_derivatives_and_compiled_loops(compiled):
+    register_activation("softsign_like", softsign_like, compiled)
     flow = SympFlow(1, pairs=2, hidden=(4, 3), activation="softsign_like", dt=1.0)
     x = states(6, 1)
     t = torch.linspace(0.1, 0.9, 6, dtype=torch.float64)

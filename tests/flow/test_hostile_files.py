@@ -9,7 +9,7 @@ import pytest
 from watchdog import watched
 
 from sympflow import Ball, SympFlow, Tube, load, solve, systems
-from sympflow.flow.files import text_checksum
+from sympflow.flow.records import text_checksum
 
 
 def with_header(header, rest=b""):

@@ -17,7 +17,7 @@ from safetensors.torch import save as save_tensors
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, solve, symplecticity_defect, systems, train
-from sympflow.flow.files import KEY, SUM, text_checksum
+from sympflow.flow.records import KEY, SUM, text_checksum
 from sympflow.schemes import SCHEMES
 
 EPS = np.finfo(float).eps

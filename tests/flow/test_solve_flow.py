@@ -177,3 +177,16 @@ def test_a_network_outside_its_domain_says_that_it_means_nothing_there(flow, bat
     stopped = solve(HH, method, (0, 7), y0, flow=flow, on_domain_exit="stop")
     np.testing.assert_array_equal(stopped.status, [-1, 0] if batch else -1)
     assert "domain" not in solve(HH, method, (0, 7), y0, flow=flow, on_domain_exit="ignore").message
+
+
+def test_a_network_that_ships_runs_by_its_numbers_as_by_its_module():
+    oscillator = systems.harmonic_oscillator()
+    y0 = oscillator.domain.sample(20, 0)
+    sol, named = (
+        solve(oscillator, "sympflow", (0.0, 7.3), y0=y0, flow=flow) for flow in (None, "harmonic_oscillator-sympflow")
+    )
+    np.testing.assert_array_equal(sol.y, named.y)
+    tensors = solve(oscillator, "sympflow", (0.0, 7.3), y0=torch.tensor(y0))
+    np.testing.assert_allclose(tensors.y.numpy(), sol.y, atol=1e3 * EPS)
+    with pytest.raises(ValueError, match="`compensated` sums need the compiled loops of a primed flow"):
+        solve(oscillator, "sympflow", (0.0, 1.0), compensated=True)

@@ -191,7 +191,7 @@ def test_bad_arguments_are_named(make, message):
 @pytest.mark.parametrize("system", [systems.henon_heiles(), systems.kepler(0.6), systems.fput(omega=50.0)], ids=str)
 @pytest.mark.parametrize("slack", [0.0, 0.01])
 def test_compiled_code_agrees_on_what_lies_in_a_sublevel(system, slack):
-    from sympflow.kernels.sublevel_loops import all_within
+    from sympflow.kernels.passes import all_within
 
     domain = system.domain
     if isinstance(domain, Box):

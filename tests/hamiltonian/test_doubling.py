@@ -66,6 +66,17 @@ class TestHamiltonian:
         assert sp.expand(damped.symbols.H - oscillator.symbols.H) == 0
         assert damped.physical.external_force is None
 
+    @pytest.mark.parametrize("method", ["rk4", "dop853"])
+    def test_a_force_is_not_lost_where_the_system_was_solved_before(self, method):
+        base = HamiltonianSystem.from_sympy("(p1**2 + p2**2 + q1**2 + q2**2)/2", y0=[1.0, 0.0, 0.0, 1.0])
+        ends = []
+        for _ in range(2):
+            physical = solve(doubled(base, ["0.1*q2", "-0.1*q1"]), "kahan_li8", (0, 10), dt=0.1).physical()
+            ends.append(solve(physical.system, method, (0, 10), base.y0, t_eval=[10.0]).y)
+            np.testing.assert_allclose(ends[-1][:, 0], physical.y[:, -1], atol=1e-2)
+            solve(base, method, (0, 1))
+        np.testing.assert_array_equal(*ends)
+
     def test_with_a_force_of_positions_it_is_separable(self):
         base = HamiltonianSystem.from_sympy("(p1**2 + p2**2 + q1**2 + q2**2)/2", y0=[1.0, 0.0, 0.0, 1.0])
         system = doubled(base, ["0.1*q2", "-0.1*q1"])

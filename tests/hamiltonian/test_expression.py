@@ -3,14 +3,17 @@
 import json
 import struct
 
+import mpmath
 import numpy as np
 import pytest
 import sympy as sp
+import torch
 from watchdog import watched
 
-from sympflow import HamiltonianSystem, SympFlow, load, systems
-from sympflow.flow.files import KEY, SUM, text_checksum
+from sympflow import HamiltonianSystem, SympFlow, load, solve, systems
+from sympflow.flow.records import KEY, SUM, text_checksum
 from sympflow.hamiltonian.expression import Unreadable, read
+from sympflow.hamiltonian.removable import sinc
 
 q, p, q1, q2 = sp.symbols("q p q1 q2", real=True)
 
@@ -160,12 +163,55 @@ def test_sums_are_the_same_however_they_are_grouped(text, monkeypatch):
     assert sp.expand(read(text) - expected) == 0
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="the derivatives that SymPy writes for sinc cancel near 0, in generated kernels too: for the compiler",
-)
-@pytest.mark.parametrize("q", [0.0, 1e-9, 1e-4])
-def test_the_force_of_sinc_is_right_near_zero(q):
-    with np.errstate(all="ignore"):
-        force = HamiltonianSystem.from_sympy("p**2/2 + sinc(q)").force(np.array([q]))[0]
-    assert force == pytest.approx(q / 3 - q**3 / 30, rel=1e-13, abs=0.0)
+SINC = [
+    ("sinc(q)", 1.0, 1.0),
+    ("sin(q)/q", 1.0, 1.0),
+    ("3*sin(q)/(2*q)", 1.5, 1.0),
+    ("sin(3*q)/q", 3.0, 3.0),
+    ("sin(k*q)/q", 1.3, 1.3),
+    ("sin(k*q)/(k*q)", 1.0, 1.3),
+]
+"""V, and c, k with V = c sin(kq)/(kq); that of a cosine below, c (sin(kq)/(kq))²."""
+SQUARES = [
+    ("(1 - cos(q))/q**2", 0.5, 0.5),
+    ("1/q**2 - cos(q)/q**2", 0.5, 0.5),
+    ("sin(q)**2/q**2", 1.0, 1.0),
+    ("(cos(k*q) - 1)/(k*q)**2", -0.5, 0.65),
+]
+
+
+def of_sinc(V):
+    return HamiltonianSystem.from_sympy(f"p**2/2 + {V}", params={"k": 1.3} if "k*" in V else None)
+
+
+@pytest.mark.parametrize("q", [0.0, 1e-20, 1e-9, -1e-4, 0.3])
+@pytest.mark.parametrize(("V", "c", "k", "n"), [(*row, 1) for row in SINC] + [(*row, 2) for row in SQUARES])
+def test_sinc_and_what_is_written_for_it_are_right_near_zero(V, c, k, n, q):
+    system = of_sinc(V)
+    with mpmath.workdps(100):
+        value = [float(mpmath.diff(lambda x: c * mpmath.sinc(k * x) ** n, q, order)) for order in range(3)]
+    y = np.array([[q, 0.7], [q, 0.0]])
+    np.testing.assert_allclose(system.potential(y[:, :1]), value[0], rtol=1e-15)
+    np.testing.assert_allclose(-system.force(y[:, :1])[0], value[1], rtol=2e-15)
+    np.testing.assert_allclose(system.hessian(y)[0, 0, 0], value[2], rtol=2e-15)
+    tensor = torch.tensor(y, requires_grad=True)
+    (gradient,) = torch.autograd.grad(system.hamiltonian(tensor).sum(), tensor)
+    np.testing.assert_allclose(gradient.numpy(), system.gradient(y), rtol=1e-14)
+
+
+@pytest.mark.parametrize("n", range(4))
+def test_derivatives_of_sinc_have_their_values_on_both_sides_of_where_its_series_ends(n):
+    x = np.concatenate([np.linspace(-4, 4, 41), [1.9999999, 2.0000001, 30.0, -1e3]])
+    s = sp.Symbol("s", real=True)
+    with mpmath.workdps(40):
+        exact = sp.lambdify(s, sp.diff(sp.sin(s) / s, s, n), "mpmath")
+        right = [float(exact(mpmath.mpf(v))) if v else [1, 0, -1 / 3, 0][n] for v in x.tolist()]
+    f = sp.lambdify(s, sinc(s, n), "numpy")
+    np.testing.assert_allclose(f(x), right, rtol=1e-14, atol=1e-15)
+
+
+@pytest.mark.parametrize("V", ["sinc(q)", "sin(k*q)/q - q**2"])
+@pytest.mark.parametrize("method", ["verlet", "srkn11b", "gauss_legendre4"])
+def test_compiled_runs_through_the_zero_of_sinc(V, method):
+    runs = [solve(of_sinc(V), method, (0, 3), [0.0, 0.7], dt=0.1, backend=each) for each in ("compiled", "array")]
+    np.testing.assert_allclose(runs[0].y, runs[1].y, rtol=1e-12, atol=1e-13)

@@ -1,8 +1,8 @@
 """Formulas of all kinds: right values, or an error at once; compiled code has the values of arrays."""
 
-import math
 import random
 
+import mpmath
 import numpy as np
 import pytest
 import sympy as sp
@@ -11,7 +11,9 @@ from numba import njit
 from scipy.interpolate import CubicSpline
 
 from sympflow import HamiltonianSystem, doubled, solve
-from sympflow.kernels.implicit_loops import gradient_and_hessian_source
+from sympflow.integrators.implicit import gauss_legendre
+from sympflow.kernels.newton import newton_code
+from sympflow.kernels.one_steps import Lettered
 
 made = HamiltonianSystem.from_sympy
 Y = np.array([0.31, 0.47, 0.23, -0.39])
@@ -84,6 +86,33 @@ def test_special_functions_have_their_values_and_are_undefined_elsewhere():
     assert np.isnan(W[1])
 
 
+OF_ARRAYS = {
+    **dict.fromkeys(["erf(q)", "erfc(q)", "sec(q/3)", "csc(q + 2)", "cot(q + 2)", "acot(q)*q"], True),
+    **dict.fromkeys(["sech(q)", "csch(q + 2)", "coth(q + 2)", "sinc(q)"], True),
+    "Piecewise((q**2, Piecewise((q, q > 0), (-q, True)) > 1), (2*Abs(q) - 1, True))": True,
+    "Max(Piecewise((q, Heaviside(q) > 0.3), (-q, True)), 1)*q**2": True,
+    **dict.fromkeys(["gamma(q + 2)", "loggamma(q + 2)", "besselj(1, q)", "besselk(0, q + 2)"], False),
+    **dict.fromkeys(["elliptic_k(q/4)", "elliptic_e(q, 0.3)", "airyai(q)", "LambertW(q + 1)"], False),
+}
+"""V, and True if torch has it; else tensors are refused."""
+
+
+@pytest.mark.parametrize("V", OF_ARRAYS)
+def test_functions_of_arrays_have_their_values(V):
+    system, q = made(f"p**2/2 + {V}"), np.array([0.7, 1.3, -0.3])
+    y = np.stack([q, 0 * q], axis=-1)
+    exact = sp.lambdify(system.symbols.q[0], system.symbols.V, "mpmath")
+    with mpmath.workdps(40):
+        right = [[float(mpmath.diff(exact, x, n)) for x in q.tolist()] for n in range(3)]
+    found = system.potential(y[:, :1]), -system.force(y[:, :1])[:, 0], system.hessian(y)[:, 0, 0]
+    np.testing.assert_allclose(found, right, rtol=1e-13, atol=1e-14)
+    if OF_ARRAYS[V]:
+        np.testing.assert_allclose(system.gradient(torch.tensor(y)), system.gradient(y), rtol=1e-13, atol=1e-14)
+    else:
+        with pytest.raises(TypeError, match=r"`expression` holds .* which torch has not: solve on NumPy states"):
+            system.hamiltonian(torch.tensor(y))
+
+
 @pytest.mark.parametrize(
     ("text", "more"),
     [
@@ -132,15 +161,23 @@ def formula(r: random.Random, depth: int) -> str:
     return r.choice([*whole, *chosen, *(f"{r.choice(FUNCTIONS)}({a})" for _ in range(7))])
 
 
-def as_python(source: str, name: str):
-    """A function of generated code, run as it stands."""
-    known = {"math": math, "fast_sin": math.sin, "fast_cos": math.cos, "fast_tanh": math.tanh}
-    exec(source.replace("@njit(**OPTIONS)", ""), known)
-    return known[name]
+def slopes(system):
+    """∇H and the upper triangle of ∇²H as they are compiled."""
+    return newton_code(Lettered(system.symbols, [system.symbols.H]), gauss_legendre(1), False, False).slopes
+
+
+@pytest.mark.parametrize("q", [0.0, 1e-9, 1e-4, 0.999, 1.001, 30.0])
+def test_the_compiled_derivatives_of_sinc_do_not_cancel(q):
+    found = slopes(made("p**2/2 + sinc(q)"))(q, 0.0)
+    with mpmath.workdps(60):
+        x = mpmath.mpf(q or 1e-20)
+        sin, cos = mpmath.sin(x), mpmath.cos(x)
+        exact = [(x * cos - sin) / x**2, -sin / x - 2 * cos / x**2 + 2 * sin / x**3]
+    assert [found[0], found[2]] == pytest.approx([float(e) for e in exact], rel=1e-13, abs=1e-19)
 
 
 @pytest.mark.parametrize("seed", range(25))
-def test_derivatives_of_random_formulas_are_those_of_H_and_of_generated_code(seed):
+def test_derivatives_of_random_formulas_are_those_of_H_and_of_compiled_code(seed):
     text = formula(random.Random(seed), 2)
     try:
         system = made(f"p1**2/2 + p2**2/2 + a*q1 + {text}", params={"a": 0.6})
@@ -152,8 +189,6 @@ def test_derivatives_of_random_formulas_are_those_of_H_and_of_generated_code(see
             pytest.skip("not defined there")
         differences = [(system.hamiltonian(Y + d) - system.hamiltonian(Y - d)) / 2e-5 for d in 1e-5 * np.eye(4)]
     np.testing.assert_allclose(g, differences, rtol=1e-4, atol=1e-5)
-    found, found_h = np.zeros(4), np.zeros((4, 4))
-    code = as_python(gradient_and_hessian_source(system.symbols), "gradient_and_hessian")
-    code(Y.tolist(), found, found_h, 0.0)
-    np.testing.assert_allclose(found, g, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found_h, h, rtol=1e-9, atol=1e-9)
+    found = slopes(system)(*Y.tolist())
+    np.testing.assert_allclose(found[:4], g, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found[4:], h[np.triu_indices(4)], rtol=1e-9, atol=1e-9)

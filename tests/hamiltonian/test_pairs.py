@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, solve, splitting_method
-from sympflow.kernels import pair_forces
-from sympflow.kernels.modules import at_most
-from sympflow.kernels.pair_forces import PairForces
+from sympflow.kernels.pairs import PairCode, PairForces
+from sympflow.kernels.threads import at_most
 from sympflow.schemes import SCHEMES
 from sympflow.training.table_step import ArrayForces
 
@@ -94,12 +93,11 @@ class TestFunctions:
 
 
 class TestRuns:
-    @pytest.mark.parametrize("method", ["verlet", pytest.param("chin4a", marks=pytest.mark.slow)])
-    @pytest.mark.parametrize("n", [4, 40], ids=["few", "blocks"])
-    def test_compiled_and_by_arrays_agree_and_conserve_momenta(self, n, method):
-        """The loops are the same code for 4 and for 40 bodies, which are met one by one and in blocks."""
+    @pytest.mark.parametrize(("method", "options"), [("verlet", {}), ("chin4a", {}), ("verlet", {"compensated": True})])
+    @pytest.mark.parametrize("n", [4, 40], ids=["written out", "in memory"])
+    def test_compiled_and_by_arrays_agree_and_conserve_momenta(self, n, method, options):
         system = gravity(n)
-        sol = solve(system, method)
+        sol = solve(system, method, **options)
         assert sol.stats["backend"] == "compiled"
         np.testing.assert_allclose(sol.y, solve(system, method, backend="array").y, rtol=0, atol=1e-12)
         p = sol.y[3 * n :].reshape(n, 3, -1).sum(0)
@@ -109,8 +107,29 @@ class TestRuns:
         assert np.abs(p - p[:, :1]).max() < 8 * steps * eps * size
         assert np.abs(L - L[:, :1]).max() < 32 * steps * eps * size
 
-    def test_a_batch_and_a_cut_run_are_the_same_bits(self):
-        system = gravity(4)
+    @pytest.mark.parametrize("dim", [1, 2, 3])
+    @pytest.mark.parametrize("n", [5, 20], ids=["written out", "in memory"])
+    def test_kinds_of_bodies_in_a_box_with_a_cut_off(self, n, dim):
+        rng = np.random.default_rng(dim)
+        y0 = np.concatenate([rng.uniform(-9, 9, n * dim), rng.standard_normal(n * dim)])
+        system = HamiltonianSystem.pairs(
+            "c1*c2*(exp(-k*r) + log(1 + r)/(m1 + m2))",
+            masses=rng.uniform(1, 2, n),
+            bodies={"c": rng.uniform(-1, 1, n)},
+            params={"k": 0.5},
+            dim=dim,
+            box=4.0 + np.arange(dim),
+            cutoff=1.9,
+            y0=y0,
+            dt=0.01,
+        )
+        for method in ("verlet", "chin4a"):
+            compiled, by_arrays = (solve(system, method, (0, 0.5), backend=b) for b in ("compiled", "array"))
+            np.testing.assert_allclose(compiled.y, by_arrays.y, rtol=0, atol=1e-12)
+
+    @pytest.mark.parametrize("n", [4, 10], ids=["written out", "in memory"])
+    def test_a_batch_and_a_cut_run_are_the_same_bits(self, n):
+        system = gravity(n)
         Y = system.y0 * np.array([[1.0], [1.1], [0.9]])
         together = solve(system, "verlet", y0=Y)
         for row, y0 in zip(together.y, Y, strict=True):
@@ -134,23 +153,28 @@ class TestRuns:
 
     def test_a_thread_that_fails_ends_the_others(self, monkeypatch):
         system = gravity(330)
-        module = pair_forces._module(pair_forces._Code(system.local), 0, False, False)
-        in_team = module.in_team
+        function = PairCode.function
 
-        def failing(member, *given):
-            if member == 1:
-                raise MemoryError("no room")
-            return in_team(member, *given)
+        def failing(self, name, width):
+            run, fails = function(self, name, width), iter([False, True])
 
-        monkeypatch.setattr(module, "in_team", failing)
+            def member(*given):
+                if next(fails, False):
+                    raise MemoryError("no room")
+                run(*given)
+
+            return member
+
+        monkeypatch.setattr(PairCode, "function", failing)
         with at_most(3), pytest.raises(MemoryError, match="no room"):
             solve(system, "verlet", (0, 1), t_eval=[1], backend="compiled")
 
     def test_friction_of_one_rate_is_compiled(self):
-        system = gravity(4, damping=0.1)
-        sol = solve(system, "verlet")
-        assert sol.stats["backend"] == "compiled"
-        np.testing.assert_allclose(sol.y, solve(system, "verlet", backend="array").y, rtol=0, atol=1e-12)
+        for n in (4, 10):
+            system = gravity(n, damping=0.1)
+            sol = solve(system, "verlet")
+            assert sol.stats["backend"] == "compiled"
+            np.testing.assert_allclose(sol.y, solve(system, "verlet", backend="array").y, rtol=0, atol=1e-12)
         each = gravity(4, damping=np.linspace(0.1, 0.2, 12))
         assert solve(each, "verlet").stats["backend"] != "compiled"
         with pytest.raises(ValueError, match=r"`system` .pairs. has friction, and its loops take one rate"):
@@ -165,8 +189,7 @@ class TestRuns:
         with pytest.raises(ValueError, match=r"^`params` has 'g', and those of the system are G"):
             system.with_params(g=1.0)
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize("n", [4, 40], ids=["few", "blocks"])
+    @pytest.mark.parametrize("n", [4, 40], ids=["written out", "in memory"])
     def test_curvature_terms_are_those_of_arrays(self, n):
         chin = SCHEMES["chin4c"]
         curved = replace(chin, name="curved", curvatures=tuple(0.01 if g else 0.0 for g in chin.gradients))
@@ -186,9 +209,8 @@ class TestRuns:
             system.force(moved[: system.ndof]), system.force(system.y0[: system.ndof]), atol=1e-9
         )
 
-    @pytest.mark.slow
     def test_open_space_with_a_cut_off(self):
-        """The code of a plane is another one; a drop far away makes cells of most of the plane empty."""
+        """A drop far away makes cells of most of the plane empty."""
         rng = np.random.default_rng(2)
         q = np.concatenate([rng.uniform(0, 5, (60, 2)), rng.uniform(300, 303, (20, 2))])
         y0 = np.concatenate([q.ravel(), np.zeros(160)])

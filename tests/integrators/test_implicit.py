@@ -151,7 +151,7 @@ def test_compensated_sums_need_compiled_loops_and_lower_the_rounding():
 
 def test_systems_of_plain_functions_run_with_arrays():
     system = HamiltonianSystem(hamiltonian=lambda q, p: ((p**2 + 1) * (q**2 + 1)).sum(-1) / 2, ndof=1)
-    sol = solve(system, "gauss_legendre4", (0.0, 2.0), y0=PRODUCT.y0)
+    sol = solve(system, "gauss_legendre4", (0.0, 2.0), y0=PRODUCT.y0, dt=PRODUCT.dt)
     reference = solve(PRODUCT, "gauss_legendre4", (0.0, 2.0))
     np.testing.assert_allclose(sol.y, reference.y, rtol=0, atol=1e-13)
     with pytest.raises(ValueError, match=r"^`backend` 'compiled' does not apply"):

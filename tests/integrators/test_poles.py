@@ -165,3 +165,75 @@ def test_a_start_without_h_is_told():
     np.testing.assert_array_equal(sol.status, [0, -1])
     assert sol.message == "H of trajectory 1 is infinite, or no number, at `y0`: start elsewhere."
     assert sf.solve(system, "verlet", (0, 1), [-1.0, 0.0], dt=0.03, diagnose=False).success
+
+
+CANCELLING = {
+    "csch(q) - 1/q": ([1.0, -2.0], 100_000, True),
+    "(exp(q) - 1 - q)/q**2": ([1.0, -3.0], 10_000, True),
+    "tan(q)/q": ([1e-7, 0.0], 100, True),
+    "csch(q) - 1/q + q**2": ([1.0, -2.0], 100, False),
+    "tan(q)/q - q**2": ([0.1, 0.0], 100, False),
+    "sin(q)/q": ([1e-7, 0.0], 1000, False),
+    "exp(-1/q**2)": ([1.0, -3.0], 10_000, False),
+    "csch(q) + 1/q": ([1.0, 1.0], 1000, False),
+}
+"""V, a start, the steps in a time of 10, and True if the force loses digits, as its terms cancel there."""
+
+
+@pytest.mark.parametrize("V", CANCELLING)
+def test_a_run_about_a_place_where_terms_cancel_is_warned_of_once(V):
+    y0, n_steps, lost = CANCELLING[V]
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + {V}")
+    told = []
+    for _ in range(2):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            sf.solve(system, "verlet", (0, 10), y0, dt=10 / n_steps)
+        told.append([str(w.message) for w in caught if "cancel" in str(w.message)])
+    assert [len(each) for each in told] == [lost, 0]
+    assert all(text.startswith("`system` has terms that cancel at q1 = 0, ") and "sinc" in text for text in told[0])
+
+
+def test_a_start_where_terms_cancel_is_told_why_it_fails():
+    system = HamiltonianSystem.from_sympy("p**2/2 + tan(q)/q")
+    with pytest.warns(RuntimeWarning, match=r"cancel at q1 = 0, tan\(q1\)/q1"):
+        assert sf.solve(system, "verlet", (0, 1), [0.0, 0.1], dt=0.1).status == -1
+
+
+@pytest.mark.parametrize("method", ["verlet", "gauss_legendre4"])
+@pytest.mark.parametrize(
+    "params", [{"k": [1.0, 2.0, -3.0]}, {"a": [0.0, -2.0, 3.0]}, {"k": [1.0, 0.0, 2.0], "a": -1.0}]
+)
+def test_trajectories_with_parameters_of_their_own_are_looked_after(params, method):
+    system = HamiltonianSystem.from_sympy("p**2/2 - k/Abs(q - a)", params={"k": 1.0, "a": 0.0})
+    params = {name: np.array(value) for name, value in params.items()}
+    sol, _ = solved(system, method, (0, 6), [1.0, 0.0], params=params, dt=0.07)
+    each = []
+    for i in range(3):
+        own = system.with_params(**{name: np.broadcast_to(x, 3)[i].item() for name, x in params.items()})
+        each.append(solved(own, method, (0, 6), [1.0, 0.0], dt=0.07))
+    np.testing.assert_array_equal(sol.status, [one.status for one, _ in each])
+    assert -1 in sol.status
+    if any("passed q1" in one.message for one, _ in each[:1]):
+        assert "passed q1" in sol.message
+
+
+def test_a_warning_of_a_leap_names_the_parameters():
+    system = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 - k/sqrt(q1**2 + q2**2)", params={"k": 1.0})
+    with pytest.warns(RuntimeWarning, match=r"H with k = 1 changed for good between t = 1\.1 and 1\.11"):
+        sf.solve(system, "verlet", (0, 3), [1, 0, 0, 0.05], dt=0.01, params={"k": np.array([-3.0, 1.0])})
+
+
+@pytest.mark.parametrize("more", [{}, {"save_every": 20}, {"t_eval": [0.5, 1.0, 6.0]}])
+@pytest.mark.parametrize("y0", [[1.0, 0.0], [5.0, 3.0], [[1.0, 0.0], [5.0, 3.0], [2.0, 0.0]]])
+def test_stored_runs_are_looked_after(tmp_path, y0, more):
+    system = HamiltonianSystem.from_sympy("p**2/2 - 1/Abs(q)")
+    kept = sf.solve(system, "verlet", (0, 6), y0, dt=0.07, **more)
+    for store, spans in {"once": [6], "twice": [0.5, 6], "again": [6, 6]}.items():
+        if store == "twice" and "t_eval" in more:
+            continue
+        for i, t1 in enumerate(spans):
+            sol = sf.solve(system, "verlet", (0, t1), y0, dt=0.07, store=tmp_path / store, resume=i > 0, **more)
+        np.testing.assert_array_equal(sol.status, kept.status)
+        np.testing.assert_array_equal(sol.stats.get("failed_at", np.nan), kept.stats.get("failed_at", np.nan))
+        assert ("What the store holds after that means nothing" in sol.message) == bool(np.any(kept.status))

@@ -7,8 +7,8 @@ import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.kernels import lattice_loops
-from sympflow.kernels.modules import at_most
 from sympflow.kernels.splitting_loops import splitting_loops
+from sympflow.kernels.threads import at_most
 from sympflow.schemes import SCHEMES
 
 RNG = np.random.default_rng(21)

@@ -11,10 +11,13 @@ from watchdog import watched
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.parts import linear_and_rest
 from sympflow.kernels import terms
+from sympflow.kernels.array_splittings import ArrayCode, term_code
 from sympflow.kernels.kicks import kicks_source, shapes
-from sympflow.kernels.modules import load_algebra
 from sympflow.kernels.parts_loops import parts_loops
+from sympflow.kernels.protocol import run_state, run_states
 from sympflow.kernels.splitting_loops import splitting_loops
+from sympflow.kernels.splittings import Splitting, SplittingCode
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 SITES = 18
 
@@ -42,26 +45,74 @@ def bodies(n, dim):
     return HamiltonianSystem.from_sympy(" + ".join([*kinetic, *pairs]))
 
 
-def test_derivatives():
-    V, q = SYSTEM.symbols.V, SYSTEM.symbols.q
-    sources = [terms.energy_source(V, q, "energy"), terms.gradient_source(V, q, "slope")]
-    sources += [terms.product_source(V, q, "product"), terms.bend_source(V, q, "bend")]
-    module = load_algebra("\n\n\n".join(sources))
-    x, v = SYSTEM.y0[:SITES], np.cos(np.arange(SITES))
-    slope, product, bend = np.full((3, SITES), np.nan)
-    module.slope(x, slope)
-    module.product(x, v, product)
-    module.bend(x, v, bend)
-    H = SYSTEM.potential_hessian
-    np.testing.assert_allclose(module.energy(x), SYSTEM.potential(x), rtol=1e-14)
-    np.testing.assert_allclose(slope, -SYSTEM.force(x), atol=1e-14)
-    np.testing.assert_allclose(product, H(x) @ v, atol=1e-14)
-    # V is a cubic but for one cosine, of third derivative sin(q)/7: ∇²V(x + v) − ∇²V(x − v) is 2 ∇³V(v) of the cubic
-    cubic = x.copy()
-    cubic[-1] = 0.0
-    module.bend(cubic, v * (np.arange(SITES) < SITES - 1), bend)
-    v[-1] = 0.0
-    np.testing.assert_allclose(bend, (H(cubic + v) - H(cubic - v)) @ v / 4, atol=1e-14)
+SMALL = {
+    "masses": "p1**2/2 + p2**2/3 + p3**2/4 + ",
+    "coupled": "p1**2/2 + p2**2/2 + p3**2/2 + p1*p2/3 + ",
+}
+V = "(q1 - q2)**2/2 + (q2 - q3)**2/3 + (q1 - q2)**4/5 + (q2 - q3)**4/6 + cos(q1) + sqrt(2 + q3**2) + 7"
+
+
+def small(kind="masses", **more):
+    return HamiltonianSystem.from_sympy(SMALL[kind] + V, y0=[0.3, -0.2, 0.5, 0.1, 0.4, -0.3], **more)
+
+
+@pytest.mark.parametrize("kind", SMALL)
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("level", [0, FORCE_GRADIENT, CURVATURE, POLYNOMIAL])
+@pytest.mark.parametrize("friction", [None, 0, 1])
+def test_loops_over_terms_are_the_stages_that_are_written_out(kind, compensated, level, friction):
+    system = small(kind)
+    monomials = ((4, 0, 0), (1, 2, 1)) if level == POLYNOMIAL else ()
+    if friction is not None and compensated:
+        return
+    splitting = Splitting(system.symbols, level, monomials, compensated, friction)
+    rng, save = np.random.default_rng(0), np.array([0, 2, 7])
+    table = 0.05 * rng.standard_normal((len(splitting.numbers), 4))
+    table[3:] *= 0.02  # curvatures, polynomials, and growth by friction
+    table[-1, 1] = 0.0  # a kick with fewer terms
+    y0, found = system.y0 + 0.1 * rng.standard_normal((11, 6)), []
+    for code in (SplittingCode(splitting), term_code(splitting)):
+        run = run_states(lambda _, *r, code=code: code.rollout_batch(table, *r), y0, 7, save, 1, None, code.n_values, 1)
+        one = run_state(lambda *r, code=code: code.rollout(table, *r), y0[3], 7, save, None, code.n_values, 1)
+        assert np.array_equal(one.states, run.states[3])
+        found.append(run.states)
+    assert np.abs(found[0]).max() < 1e3
+    assert np.abs(found[0] - found[1]).max() < 1e-12 * np.abs(found[0]).max()
+
+
+@pytest.mark.parametrize("method", ["verlet", "chin4c"])
+@pytest.mark.parametrize(
+    "more",
+    [{}, {"damping": 0.2}, {"damping": [0.1, 0.2, 0.3]}, {"time": "t"}, {"time": "t", "damping": 0.2}],
+    ids=lambda more: " ".join(more) or "alone",
+)
+def test_loops_over_terms_run_as_arrays_do(more, method, monkeypatch):
+    monkeypatch.setattr(terms, "MOST_WRITTEN_OUT", 0)
+    monkeypatch.setattr(terms, "MOST_OPERATIONS", 0)
+    H = SMALL["masses"] + V + (" + q1*cos(3*t) + q2**2*sin(t)" if "time" in more else "")
+    system = HamiltonianSystem.from_sympy(H, y0=[0.3, -0.2, 0.5, 0.1, 0.4, -0.3], **more)
+    y0 = system.y0 + 0.1 * np.random.default_rng(0).standard_normal((9, 6))
+    code = splitting_loops(system).functions(FORCE_GRADIENT if method == "chin4c" else 0, False)
+    assert isinstance(code, ArrayCode)
+    compiled, arrays = (
+        solve(system, method, (0.5, 1.53), y0=y0, dt=0.05, t_eval=[0.7, 1.52], backend=backend)
+        for backend in ("compiled", "array")
+    )
+    np.testing.assert_allclose(compiled.y, arrays.y, atol=1e-13)
+    np.testing.assert_array_equal(
+        solve(system, method, (0.5, 1.53), y0=y0[2], dt=0.05, t_eval=[0.7, 1.52]).y, compiled.y[2]
+    )
+
+
+def test_code_does_not_depend_on_how_many_terms_there_are(monkeypatch):
+    texts = set()
+    monkeypatch.setattr("sympflow.kernels.runs.compiled", lambda text, *_: texts.add(text))
+    for n in (20, 40):
+        x = ["0", *(f"q{i}" for i in range(1, n + 1)), "0"]
+        springs = [f"({b} - {a})**2/2 + ({b} - {a})**3/{k + 3}" for k, (a, b) in enumerate(itertools.pairwise(x))]
+        H = HamiltonianSystem.from_sympy(" + ".join([*(f"p{i}**2/2" for i in range(1, n + 1)), *springs]))
+        term_code(Splitting(H.symbols, FORCE_GRADIENT)).function("run", 1)
+    assert len(texts) == 1
 
 
 def test_terms_that_differ_in_coordinates_and_constants_are_one_family():

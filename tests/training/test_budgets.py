@@ -22,7 +22,7 @@ from sympflow.training.least_squares import STOPPED, levenberg_marquardt
 from sympflow.training.losses import Loss
 from sympflow.training.points import Labels
 from sympflow.training.session import OutOfTime, Session
-from sympflow.training.table_fit import TableRun
+from sympflow.training.table_fit import TableFit, TableRun
 from sympflow.training.table_step import ArrayForces, SymbolicForces, TableStep
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -104,7 +104,7 @@ def test_least_squares_that_are_cut_keep_what_they_have():
 # primed flows -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("what", [(TableStep, "__call__", 0.2), (TableStep, "with_jacobian", 3.0)])
+@pytest.mark.parametrize("what", [(TableFit, "residuals", 0.2), (TableFit, "model", 3.0)])
 def test_the_search_for_a_primed_flow_keeps_its_budget(clock, what):
     """However much its steps or their Jacobians take: to 20 % and the evaluations that compare what there is."""
     clock.costs_seconds(*what)

@@ -571,7 +571,7 @@ def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatc
 def test_nothing_said_means_at_most_a_quarter_of_a_minute(monkeypatch):
     """A search that is out of time ends with what it has, says so in the recipe, and does not warn."""
     monkeypatch.setattr("sympflow.training.trainer.SHORT_BUDGET", 4.0)
-    monkeypatch.setattr("sympflow.training.table_fit.WORTH_COMPILING", math.inf)
+    monkeypatch.setattr("sympflow.kernels.table_loops.table_loops", lambda *_: None)  # slower
     flow = train(PENDULUM, points=60, reference_states=20, progress=False)
     stage = flow.recipe["stages"][-1]
     assert stage["restarts_taken"] < stage["restarts"] == 72

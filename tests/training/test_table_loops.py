@@ -29,16 +29,12 @@ CASES = {
 }
 
 
-LONG = ("polynomial", "driven")
-"""Cases that are compiled in the long tests: polynomials, and a drive that another case has with friction."""
-
-
-@pytest.fixture(scope="module", params=[pytest.param(c, marks=pytest.mark.slow) if c in LONG else c for c in CASES])
+@pytest.fixture(scope="module", params=CASES)
 def fits(request):
     """Fits of one system at two times to random labels: by arrays and compiled, without and with a weight of H."""
     system, level, of = CASES[request.param]
     d, rng = system.ndof, np.random.default_rng(0)
-    states, times = 70, np.array([0.3, 0.5])
+    states, times = 5 if level == 0 else 70, np.array([0.3, 0.5])  # fewer than lanes too
     t0 = None if system.autonomous else rng.uniform(0, 3, states)
     steps = [TableStep(system, SEQUENCE, level, of, compiled) for compiled in (False, True)]
     assert steps[1].loops is not None

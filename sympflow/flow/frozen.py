@@ -1,0 +1,292 @@
+"""Flows that ship without torch: the numbers of a file that compiled runs read, of primed flows and of networks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+
+from sympflow.arrays import untransformed
+from sympflow.flow.known import UNCOMPENSATED, KnownFlow
+from sympflow.flow.records import Description, Refused, numbers_checksum, read
+from sympflow.flow.tables import PrimedShape, Tables, free_numbers, substeps_of
+from sympflow.hamiltonian.domain import states_of
+from sympflow.hamiltonian.local_states import DRAWN, LocalStates
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.local import LocalHamiltonian
+    from sympflow.kernels.flow_loops import PrimedFlowKernel
+    from sympflow.kernels.networks import NetworkLayer
+    from sympflow.kernels.protocol import Kernel
+
+WORSE = 2.0
+"""Times the energy error of a ring that a lattice with ends may have for the numbers of a flow to hold there."""
+
+
+class PrimedKnown(KnownFlow):
+    """A primed flow, as far as it is known without its map: its table, and its system.
+
+    Attributes
+    ----------
+    shape : PrimedShape
+    """
+
+    symplectic = takes_friction = takes_driving = True
+    shape: PrimedShape
+
+    @property
+    def tables(self) -> Tables:
+        """The tables of the numbers that the flow has now."""
+        raise NotImplementedError
+
+    @property
+    def monomials(self) -> Monomials:
+        return self.shape.monomials
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
+
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> PrimedFlowKernel:
+        tables = self.tables
+        if tables.kernel is not None and tables.kernel.system is system and not compensated:
+            return tables.kernel
+        from sympflow.kernels.flow_loops import PrimedFlowKernel
+
+        self.check_compilable()
+        if compensated:
+            return PrimedFlowKernel(tables, system, compensated=True)
+        tables.kernel = PrimedFlowKernel(tables, system, step=self.step_of_arrays)
+        return tables.kernel
+
+    def check_compilable(self) -> None:
+        """Raise a ValueError unless the numbers of the flow are float64 on the CPU, which compiled loops need."""
+
+    def step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
+        """ψ̄_h of rows y (N, 2d) at times t, for h < 0 the inverse of ψ̄_|h|, each with its own h (N,)."""
+        raise NotImplementedError
+
+    # its system ---------------------------------------------------------------------------------------------
+
+    def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
+        of_one_size = self.monomials or (self.fingerprint is not None and not self.lattice_terms)
+        return system if of_one_size else system.few_sites
+
+    @property
+    def kept_ndof(self) -> int:
+        return self.ndof if self.system is None else self.known_by(self.system).ndof
+
+    def of_size(self, system: HamiltonianSystem) -> Self:
+        """Return this flow for a system of its kind: carried to another size where that is a lattice of one."""
+        mine, theirs = None if self.system is None else self.system.local, system.local
+        if mine is theirs or mine is None or theirs is None or _size(mine) == _size(theirs):
+            return self
+        tables = self.tables
+        if tables.carried is None or tables.carried.system is not system:
+            tables.carried = self.carried(system)
+        return tables.carried
+
+    def carried(self, system: HamiltonianSystem) -> Self:
+        """This flow, of another size of its system, with what is known of it."""
+        raise NotImplementedError
+
+    def description_for(self, system: HamiltonianSystem) -> Description:
+        """What is known of the flow, for another size of its system."""
+        domain = self.domain
+        if isinstance(domain, LocalStates):
+            domain = domain.of(system)
+        elif domain is not None:
+            assert self.system is not None
+            domain = states_of(self.system, domain.sample(DRAWN)).of(system)
+        return replace(self.description, domain=domain)
+
+    def check_ends(self, system: HamiltonianSystem) -> None:
+        if system.local is None:
+            return
+        ring = self.figures.get("ends_periodic")
+        for end in dict.fromkeys(system.local.ends):
+            error = self.figures.get(f"ends_{end}")
+            if ring is None or error is None or error <= WORSE * ring:
+                continue
+            raise ValueError(
+                f"`system` {system.name!r} has {end} ends, at which bonds are missing and the numbers of this "
+                f"flow hold less: a relative energy error of {error:.1e} was measured on a few sites with such "
+                f"ends, {ring:.1e} on a ring. Fit one by sympflow.train(system)."
+            )
+
+    @property
+    def driven(self) -> bool:
+        return self.system is not None and not self.system.autonomous
+
+    @property
+    def period(self) -> float | None:
+        return None if self.system is None else self.system.period
+
+
+class FrozenColumn(NamedTuple):
+    """Numbers of a table as they are in a file: see `sympflow.flow.coefficients.Coefficients`."""
+
+    numbers: np.ndarray
+    exponents: tuple[int, ...]
+
+
+class FrozenFlow(PrimedKnown):
+    """A primed flow from a file of our own, for compiled runs of NumPy states; everything else is done by `thawed`."""
+
+    kind = "sympflow"
+
+    def __init__(
+        self, path: Path, shape: PrimedShape, tables: Tables, system: HamiltonianSystem, description: Description
+    ) -> None:
+        self.ndof, self.shape, self.dt, self.path = system.ndof, shape, tables.dt, path
+        self._tables, self._system = tables, system
+        self.describe(description)
+
+    @classmethod
+    def of_file(cls, path: Path, system: HamiltonianSystem) -> Self:
+        """Read a flow that ships, of that system.
+
+        Raises
+        ------
+        ValueError
+            If the file is damaged, or the system is not that of the flow.
+        """
+        record, arrays = _read(path)
+        plan, ndof = record["architecture"]["primed"], record["architecture"]["ndof"]
+        shape = PrimedShape.from_dict(plan, ndof)
+        tables = _tables(shape, record["dt"], arrays)
+        flow = cls(path, shape, tables, system, Description.of_record(record, ndof))
+        flow.check_system(system)
+        if isinstance(flow.domain, LocalStates):
+            flow.domain = flow.domain.of(system)
+        return flow
+
+    @property
+    def tables(self) -> Tables:
+        return self._tables
+
+    @property
+    def system(self) -> HamiltonianSystem:
+        return self._system
+
+    @cached_property
+    def thawed(self) -> Any:
+        """The flow itself, a module of torch."""
+        return _thawed(self.path, self._system)
+
+    def step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
+        return self.thawed.step_of_arrays(h, y, t)
+
+    def bound(self, system: HamiltonianSystem) -> Self:
+        return self.of_size(system)
+
+    def carried(self, system: HamiltonianSystem) -> Self:
+        tables = Tables(self._tables.substeps, len(self.shape.outer), self.dt, self.monomials)
+        return type(self)(self.path, self.shape, tables, system, self.description_for(system))
+
+
+class FrozenNetwork(KnownFlow):
+    """A SympFlow of networks from a file of our own, for compiled runs; everything else is done by `thawed`."""
+
+    kind = "sympflow"
+    symplectic = True
+
+    def __init__(self, path: Path, dt: float, layers: Sequence[NetworkLayer], description: Description) -> None:
+        self.ndof, self.dt, self.path, self._layers = layers[0].K.shape[1], dt, path, layers
+        self.describe(description)
+
+    @classmethod
+    def of_file(cls, path: Path, system: HamiltonianSystem) -> Self | None:
+        """Read a flow that ships, of that system; None if it is none of networks.
+
+        Raises
+        ------
+        ValueError
+            If the file is damaged, or the system is not that of the flow.
+        """
+        from sympflow.kernels.networks import NetworkLayer
+
+        record, arrays = _read(path)
+        plans = record["architecture"].get("layers", [])
+        if not plans or any(plan["potential"]["type"] != "mlp" for plan in plans):
+            return None
+        layers = []
+        for i, plan in enumerate(plans):
+            start = f"layers.{i}.potential."
+            of = {name.removeprefix(start): a.astype(float) for name, a in arrays.items() if name.startswith(start)}
+            n = len(plan["potential"]["hidden"])
+            first = plan["kind"] == "kick", plan["potential"]["activation"]
+            K, k = of["weight_x"] / of["scale"], of["weight_t"] / of["tau"]
+            biases, weights = ([of[f"{name}.{j}"] for j in range(m)] for name, m in (("biases", n), ("weights", n - 1)))
+            layers.append(NetworkLayer(*first, K, k, biases, weights, of["gain"] * of["weight_out"]))
+        flow = cls(path, record["dt"], layers, Description.of_record(record, record["architecture"]["ndof"]))
+        flow.check_system(system)
+        return flow
+
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
+        if compensated:
+            raise ValueError(UNCOMPENSATED)
+        return self._kernel
+
+    @cached_property
+    def _kernel(self) -> Kernel:
+        from sympflow.kernels.networks import MLPFlowKernel
+
+        return MLPFlowKernel(self.ndof, self._layers)
+
+    @cached_property
+    def thawed(self) -> Any:
+        return _thawed(self.path)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, np.ndarray]]:
+    """The record and the arrays of a file."""
+    from safetensors.numpy import load
+
+    content, _, record, altered = read(path)
+    arrays: Mapping[str, np.ndarray] = load(content)
+    if altered or numbers_checksum(arrays) != record["checksum"]:
+        raise Refused("its numbers are not those that were saved")
+    return record, arrays
+
+
+def _thawed(path: Path, system: HamiltonianSystem | None = None) -> Any:
+    from sympflow.flow.files import load
+
+    with untransformed():  # what is kept must not be a tensor of a transform that ends
+        return load(path, system=system)
+
+
+def _tables(shape: PrimedShape, dt: float, arrays: Mapping[str, np.ndarray]) -> Tables:
+    """The tables of a flow whose free numbers are arrays of a file."""
+
+    def columns(prefix: str, sequence: Any, total: float | None) -> Any:
+        def column(
+            name: str,
+            n: int,
+            exponents: tuple[int, ...],
+            power: int,
+            palindromic: bool,
+            total: float | None,
+            always: bool = False,
+            present: Any = None,
+        ) -> FrozenColumn:
+            bound = len(exponents) if always else int(total is not None)
+            _, basis, offset = free_numbers(n, len(exponents), palindromic, bound, total, present)
+            return FrozenColumn(offset + basis @ arrays[f"{prefix}{name}.free"].astype(float), exponents)
+
+        return shape.columns(sequence, total, column)
+
+    inside, outside = columns("", shape.kernel, 1.0), columns("processor_", shape.outer, None)
+    outer = {sign: substeps_of(shape.outer, outside, sign) for sign in (1, -1)}
+    substeps = *reversed(outer[-1]), *substeps_of(shape.kernel, inside, 1), *outer[1]
+    return Tables(substeps, len(shape.outer), dt, shape.monomials)
+
+
+def _size(local: LocalHamiltonian) -> tuple[Any, ...]:
+    return local.shape, local.ends, local.ndof

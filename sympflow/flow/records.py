@@ -1,0 +1,328 @@
+"""Records of flows in their files, each entry of which is checked before it is believed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from sympflow.flow.certificate import Certificate
+from sympflow.flow.families import KINDS
+from sympflow.flow.scaling import Scaling
+from sympflow.hamiltonian.domain import Domain, domain_from_dict
+from sympflow.hamiltonian.fingerprint import Identity
+
+FORMAT = 2
+KEY, SUM = "sympflow", "sympflow_checksum"
+MAX_HEADER = 2**20
+MAX_FILE = 2**28
+MIN_DT, MAX_DT = 1e-18, 1e18  # were they seconds, from an attosecond to more than the age of the universe
+MAX_LAYERS = 1000
+MAX_WIDTH = 4096
+MAX_DEGREE = 64
+MAX_PARAMETERS = 10_000_000
+FINGERPRINT_LENGTH = 8
+FIELDS = ("version", "domain", "system", "fingerprint", "recipe", "figures")
+STAGE: dict[str, Any] = {
+    "optimizer": str,
+    "loss": str,
+    "schedule": str,
+    "ended_early": (str, type(None)),
+    "points": (int, type(None)),
+    **dict.fromkeys(("steps", "steps_taken", "best_step", "seed"), int),
+}
+"""The types of what every stage of training may record; its other entries are numbers, strings, booleans or None."""
+
+
+class Refused(Exception):
+    """The reason for which a file is refused, and what to do.
+
+    Parameters
+    ----------
+    reason : str
+    remedy : str
+    """
+
+    def __init__(self, reason: str, remedy: str = "Save it again with flow.save(path)") -> None:
+        super().__init__(reason)
+        self.remedy = remedy
+
+
+@dataclass(frozen=True)
+class Description:
+    """All that a file tells of its flow beside architecture and weights.
+
+    Attributes
+    ----------
+    domain, system, fingerprint, recipe, figures, certificate
+        `FlowMap`'s domain, system_name, fingerprint, recipe, figures, certified.
+    identity, unfitted, drive_times, lattice_terms
+        `FlowMap`'s own.
+    """
+
+    domain: Domain | None = None
+    system: str | None = None
+    fingerprint: tuple[float, ...] | None = None
+    recipe: dict[str, Any] = field(default_factory=dict)
+    figures: dict[str, Any] = field(default_factory=dict)
+    certificate: Certificate | None = None
+    identity: Identity | None = None
+    unfitted: tuple[tuple[float, float], ...] = ()
+    drive_times: tuple[float, float] | None = None
+    lattice_terms: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
+        """Return what the record tells, all of it checked.
+
+        Raises
+        ------
+        Refused
+        """
+        missing = [name for name in FIELDS if name not in record]
+        if missing:
+            raise Refused(f"its record has no {', '.join(missing)}")
+        if not isinstance(record["version"], str):
+            raise Refused("its version is not a string")
+        system, fingerprint = record["system"], record["fingerprint"]
+        _check_system(system, fingerprint, ndof)
+        _check_recipe(record["recipe"], ndof)
+        if not isinstance(record["figures"], dict):
+            raise Refused(f"its figures are not a table: {record['figures']!r}")
+        for name, value in record["figures"].items():
+            if value is not None and not _is_number(value):
+                raise Refused(f"its figures have a {name} that is neither a number nor None: {value!r}")
+        certificate, identity = _certificate(record), _identity(record, ndof)
+        domain = None if record["domain"] is None else _domain(record["domain"], ndof)
+        if fingerprint is not None:
+            fingerprint = tuple(math.nan if v is None else float(v) for v in fingerprint)
+        unfitted = _intervals(record.get("unfitted", []), "unfitted times")
+        driven = _intervals(record.get("drive_times", []), "times of its drive")
+        if len(driven) > 1 or any(low >= high for low, high in driven):
+            raise Refused("its times of the drive are not one interval")
+        return cls(
+            domain,
+            system,
+            fingerprint,
+            record["recipe"],
+            record["figures"],
+            certificate,
+            identity,
+            unfitted,
+            driven[0] if driven else None,
+            _texts(record.get("lattice_terms", {})),
+        )
+
+
+def text_checksum(text: str) -> str:
+    """Return the SHA-256 of a record's text."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def numbers_checksum(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return the SHA-256 of arrays by name: their names, dtypes, shapes and little-endian bytes."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(json.dumps([name, str(array.dtype), array.shape]).encode())
+        digest.update(array.astype(array.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
+
+
+def checked_path(path: Any) -> Path:
+    if not isinstance(path, (str, os.PathLike)):
+        raise TypeError(f"`path` must be the path of a file; got {path!r}: pass a string or a pathlib.Path.")
+    return Path(path)
+
+
+def read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any], bool]:
+    """Return the bytes of the file, its safetensors header, the record in it, and True if that was altered."""
+    try:
+        found = path.is_file()
+    except OSError:  # a name that no file can have
+        found = False
+    if not found:
+        raise ValueError(f"`path` {str(path)!r} is not a file: pass the path of a flow saved with flow.save(path).")
+    size = path.stat().st_size
+    if size > MAX_FILE:
+        raise Refused(f"it has {size:,} bytes, more than any flow")
+    with path.open("rb") as file:
+        content = file.read(8)
+        if len(content) < 8:
+            raise Refused("it is truncated")
+        (length,) = struct.unpack("<Q", content)
+        if length > MAX_HEADER:
+            raise Refused(f"it is no safetensors file, or its header is oversized ({length:,} bytes)")
+        content += file.read(length)
+        if len(content) < 8 + length:
+            raise Refused("it is truncated")
+        header = parsed(content[8:], "header")
+        if (expected := len(content) + _tensor_bytes(header)) != size:
+            raise Refused(f"it is truncated or damaged: it has {size:,} bytes, by its header {expected:,}")
+        content += file.read()
+    notes = header.pop("__metadata__", None)
+    if not isinstance(notes, dict) or not isinstance(notes.get(KEY), str):
+        raise Refused("it holds no record of a sympflow flow")
+    record = parsed(notes[KEY], "record")
+    format_ = record.get("format")
+    if isinstance(format_, bool) or not isinstance(format_, int):
+        raise Refused("its record has no format number")
+    if format_ < 1:
+        raise Refused(f"its format {format_} is not one there has been")
+    if format_ > FORMAT:
+        raise Refused(f"its format {format_} is later than {FORMAT}, which this version of sympflow reads: update it")
+    if record.get("kind") not in KINDS:
+        raise Refused(f"its kind {record.get('kind')!r} is unknown")
+    altered = format_ > 1 and notes.get(SUM) != text_checksum(notes[KEY])
+    return content, header, record, altered
+
+
+def parsed(text: str | bytes, what: str) -> dict[str, Any]:
+    def refuse(constant: str) -> None:
+        raise ValueError(constant)
+
+    try:
+        value = json.loads(text, parse_constant=refuse)
+    except (ValueError, RecursionError):
+        raise Refused(f"its {what} is not valid JSON") from None
+    if not isinstance(value, dict):
+        raise Refused(f"its {what} is not a JSON object")
+    return value
+
+
+def _tensor_bytes(header: dict[str, Any]) -> int:
+    """Return how many bytes follow the header, by the offsets in it."""
+    try:
+        return max(
+            (int(entry["data_offsets"][1]) for name, entry in header.items() if name != "__metadata__"), default=0
+        )
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise Refused("its header has a tensor without offsets") from None
+
+
+# parts of a record -----------------------------------------------------------------------------------------
+
+
+def checked_integer(value: Any, what: str, largest: int) -> int:
+    """Return a number of a record that is an integer from 1 to `largest`; else it is refused."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= largest:
+        raise Refused(f"its {what} {value!r} is not an integer from 1 to {largest}")
+    return value
+
+
+def checked_widths(hidden: Any, inputs: int) -> tuple[int, ...]:
+    """Return the widths of hidden layers that a record gives; else they are refused."""
+    if not isinstance(hidden, list) or not 1 <= len(hidden) <= MAX_LAYERS:
+        raise Refused("its hidden layers are missing or absurdly many")
+    widths = tuple(checked_integer(h, "hidden width", MAX_WIDTH) for h in hidden)
+    if count_parameters(widths, inputs) > MAX_PARAMETERS:
+        raise Refused("its architecture is absurdly large")
+    return widths
+
+
+def count_parameters(widths: tuple[int, ...], inputs: int) -> int:
+    """Return how many parameters a network of these widths has, nearly."""
+    return sum(m * n for m, n in zip((inputs + 2, *widths), (*widths, inputs), strict=True))
+
+
+def _certificate(record: dict[str, Any]) -> Certificate | None:
+    """Return the certificate in the record, if there is one; it must be of the weights that the file holds."""
+    if record.get("certificate") is None:
+        return None
+    try:
+        certificate = Certificate.from_dict(record["certificate"])
+    except ValueError as error:
+        raise Refused(f"its certificate is not admissible ({error})") from None
+    if certificate.weights != record.get("checksum"):
+        raise Refused("its certificate is one of other weights")
+    return certificate
+
+
+def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
+    """Return the identity of the system in the record, if there is one; a text in it is not read yet."""
+    if record.get("identity") is None:
+        return None
+    try:
+        return Identity.from_dict(record["identity"], ndof)
+    except ValueError as error:
+        raise Refused(f"its identity of the system is not admissible: {error}") from None
+
+
+def _intervals(pairs: Any, what: str) -> tuple[tuple[float, float], ...]:
+    """Return the intervals of times in a record; else they are refused."""
+    if not isinstance(pairs, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
+        raise Refused(f"its {what} are not a list of pairs")
+    if not all(_is_number(v) for pair in pairs for v in pair):
+        raise Refused(f"its {what} are not numbers")
+    return tuple((float(low), float(high)) for low, high in pairs)
+
+
+def _texts(table: Any) -> dict[str, str]:
+    """Return a table of texts in a record, which are shown and never read; else it is refused."""
+    if not isinstance(table, dict) or not all(isinstance(text, str) for text in table.values()):
+        raise Refused("its terms of a lattice are not a table of texts")
+    return table
+
+
+def _check_system(name: Any, fingerprint: Any, ndof: int) -> None:
+    """Refuse all but a fingerprint, or, of a flow that never had a system, None as its system and fingerprint."""
+    if not isinstance(name, str | None):
+        raise Refused("its system is not a name")
+    if fingerprint is None:
+        if name is not None:
+            raise Refused(f"its fingerprint of the system {name!r} is missing")
+        return
+    friction = 0, 1, ndof, ndof**2
+    if not isinstance(fingerprint, list) or len(fingerprint) - FINGERPRINT_LENGTH not in friction:
+        raise Refused(f"its fingerprint is not a list of {FINGERPRINT_LENGTH} numbers, and those of its friction")
+    if not all(v is None or _is_number(v) for v in fingerprint):
+        raise Refused("its fingerprint is not a list of numbers")
+
+
+def _check_recipe(recipe: Any, ndof: int) -> None:
+    if not isinstance(recipe, dict):
+        raise Refused(f"its recipe is not a table: {recipe!r}")
+    stages = recipe.get("stages", [])
+    if not isinstance(stages, list) or not all(isinstance(stage, dict) for stage in stages):
+        raise Refused("its recipe has stages that are not a list of tables")
+    for stage in stages:
+        for name, value in stage.items():
+            kind = STAGE.get(name, (int, float, str, bool, type(None)))
+            if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+                raise Refused(f"its recipe has a stage with {name} {value!r}, which is of the wrong type")
+    made = recipe.get("transforms")
+    if isinstance(made, dict) and made.get("identity") is not None:
+        _identity(made, ndof - 1)
+    if not isinstance(recipe.get("torch", ""), str):
+        raise Refused("its recipe has a version of torch that is not a string")
+    if "scaling" in recipe:
+        scaling = recipe["scaling"]
+        try:
+            if not all(_is_number(v) for u in scaling.values() for v in (u if isinstance(u, list) else [u])):
+                raise TypeError("not numbers")
+            if len(Scaling.from_dict(scaling).q) != ndof:
+                raise ValueError(f"not of {ndof} degrees of freedom")
+        except (TypeError, ValueError, AttributeError) as error:
+            raise Refused(f"its recipe has a scaling that is not admissible ({error})") from None
+
+
+def _domain(description: Any, ndof: int) -> Domain:
+    try:
+        domain = domain_from_dict(description)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise Refused(f"its domain is not admissible ({error})") from None
+    if domain.width not in (None, 2 * ndof):
+        raise Refused(f"its domain has states of length {domain.width}, not {2 * ndof}")
+    return domain
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

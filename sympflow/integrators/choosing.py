@@ -1,0 +1,282 @@
+"""The choice of a method for a system, and of the step for a tolerance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sympflow.arguments import as_float, check_t_span
+from sympflow.arrays import Array, is_tensor, readable, to_numpy
+from sympflow.hamiltonian.scales import known_scale, smallest_size, weights
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep
+from sympflow.integrators.contract import Integrator, Problem
+from sympflow.integrators.registry import build, check_applies
+
+TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
+"""Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
+AT_ROUNDING = 1e-8
+"""Errors that may be rounding: below it, steps that are shorter and no better end the search."""
+TRIALS = 12
+MOST_STATES = 16  # of a batch in trials
+SAFETY = 0.5  # of the tolerance, at which a step is aimed
+ENOUGH, MOST = 0.2, 0.7  # of the tolerance: errors with which a step is taken
+NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
+
+Candidate = tuple[str, str]
+"""The name of a method, and why it is chosen."""
+
+
+def choose_method(
+    system: HamiltonianSystem,
+    y0: Array,
+    options: dict[str, Any],
+    tol: float | None = None,
+    plain: bool = True,
+    flows: bool = True,
+) -> tuple[Integrator, str]:
+    """Return the method that suits a system, and the reason in words.
+
+    The first of these that applies: a flow that ships for the system, whose domain holds y0; where V is negative and
+    falls without bound towards q = 0, steps on the logarithmic Hamiltonian; the scheme 'srkn11b' where the kinetic
+    energy is ½ pᵀM⁻¹p; 'kahan_li8' where H is separable; 'gauss_legendre6'; 'dop853'. With `rtol` or `atol` it is
+    'dop853', and with `dt` no flow.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    y0 : array or tensor of shape (..., 2d)
+    options : dict
+        Of the method, that are given: a method which does not take them is passed over.
+    tol : float, optional
+        The relative energy error, by which a flow is chosen.
+    plain : bool
+        True if a method in another time will do, for which states are found at the times of outputs.
+    flows : bool
+        True if a trained flow will do.
+
+    Raises
+    ------
+    TypeError
+        If no method that applies takes the options.
+    ValueError
+        If no method applies.
+    """
+    refused: Exception | None = None
+    between = system.between_impulses
+    for name, reason in _candidates(between, y0, options, tol, plain, flows):
+        try:
+            integrator = build(name, options if name != "sympflow" or tol is None else {**options, "tol": tol})
+            check_applies(integrator, between, y0)
+        except (ValueError, TypeError) as error:
+            refused = refused or error
+            continue
+        return integrator, reason
+    raise refused or ValueError(f"`system` {system.name!r} has no method that applies: pass `method`.")
+
+
+def _candidates(
+    system: HamiltonianSystem, y0: Array, options: dict[str, Any], tol: float | None, plain: bool, flows: bool
+) -> Iterator[Candidate]:
+    if "rtol" in options or "atol" in options:
+        yield "dop853", "`rtol` and `atol` are given"
+        return
+    if flows and "dt" not in options and _flow_holds(system, y0, tol):
+        yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
+    if plain and not is_tensor(y0) and y0.dtype == np.float64 and _falls_to_the_origin(system, y0):
+        yield "log_kahan_li8", "V falls without bound at q = 0, where its steps become shorter"
+    if system.separable and system.quadratic_kinetic:
+        yield "srkn11b", "the kinetic energy is ½ pᵀM⁻¹p"
+    if system.separable:
+        yield "kahan_li8", "H is separable"
+    yield "gauss_legendre6", "H is not separable" if not system.separable else "an implicit method applies"
+    yield "dop853", "no symplectic method applies"
+
+
+def _flow_holds(system: HamiltonianSystem, y0: Array, tol: float | None) -> bool:
+    """True if a flow ships for the system, meets `tol`, and has all of y0 in its domain."""
+    from sympflow.flow.shipped import choose, shipped_flows
+
+    if not len(shipped_flows(system, "sympflow")) or not readable(y0):
+        return False
+    try:
+        flow = choose(system, "sympflow", tol).known(system)
+    except ValueError:
+        return False
+    domain = flow.domain_for(system)
+    return domain is None or bool(np.all(np.asarray(domain.contains(y0))))
+
+
+def _falls_to_the_origin(system: HamiltonianSystem, y0: np.ndarray) -> bool:
+    """True if V < 0 along the rays of all positions, and −∞ at their end at q = 0."""
+    if not (system.poles and system.separable and system.conservative and system.autonomous):
+        return False
+    q = y0.reshape(-1, y0.shape[-1])[:MOST_STATES, : system.ndof]
+    with np.errstate(all="ignore"):
+        V = np.stack([np.asarray(system.potential(scale * q)) for scale in (100.0, 10.0, 1.0, *NEAR_POLE)])
+    return bool(
+        np.isfinite(V).all() and (V < 0).all() and (np.diff(V, axis=0) < 0).all() and (V[-1] < 100 * V[2]).all()
+    )
+
+
+# the step ------------------------------------------------------------------------------------------------------
+
+
+def choose_step(
+    system: HamiltonianSystem,
+    method: Any,
+    tol: float,
+    *,
+    y0: Any = None,
+    t_span: tuple[float, float] | None = None,
+    tol_of: str = "energy",
+) -> float:
+    """Return the longest step, within a factor of two or so, with which a fixed-step method meets a tolerance.
+
+    It is found by a few short runs from the given states: of 4096 steps, and over 400 times `system.dt` at least, or
+    over the whole of `t_span` where that is shorter.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem
+    method : str or Integrator
+        A method of fixed steps, such as "srkn11b".
+    tol : float
+        The largest error: |H − H₀| relative to `system.energy_scale`, else to |H₀|. Where H is not conserved, with
+        friction or a drive, the difference of H from that of a run with half of the step takes its place.
+    y0 : array_like of shape (..., 2d), optional
+        Initial states, by default the system's.
+    t_span : (float, float), optional
+        By default the system's.
+    tol_of : {"energy", "state"}
+        With "state" the error is the difference of states from those of a run with half of the step, relative to their
+        size, q and p in comparable units.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    ValueError, TypeError
+        If an argument is wrong, the method has no steps to choose, or `tol` is below what rounding allows.
+
+    Examples
+    --------
+    >>> dt = sympflow.choose_step(sympflow.systems.henon_heiles(), "srkn11b", 1e-9)
+    """
+    integrator = build(method, {})
+    y = np.asarray(system.y0 if y0 is None else to_numpy(y0), dtype=float)
+    if y.ndim == 0 or y.shape[-1] != 2 * system.ndof:
+        raise ValueError(f"`y0` must have shape (..., {2 * system.ndof}), states [q, p]; got {y.shape}.")
+    t0, t1 = check_t_span(system.t_span if t_span is None else t_span, False)
+    return step_for(integrator, Problem(system, t0, t1, y), tol, tol_of)
+
+
+def check_tolerance(tol: Any, tol_of: Any) -> None:
+    """Refuse what is no tolerance."""
+    if not 0 < as_float(tol) < 1:
+        raise ValueError(f"`tol` must be a positive number below 1, a relative error; got {tol!r}: take 1e-6.")
+    if tol_of not in ("energy", "state"):
+        raise ValueError(f"`tol_of` must be 'energy' or 'state'; got {tol_of!r}.")
+
+
+def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str = "energy") -> float:
+    """The step of `choose_step` for a problem."""
+    check_tolerance(tol, tol_of)
+    if not isinstance(integrator, FixedStep) or integrator.trained:
+        raise TypeError(
+            f"`tol` chooses the step of a method with fixed steps, and {integrator.label!r} has none: give 'srkn11b', "
+            "for instance; or `rtol` and `atol` for an adaptive method, `flow` without `tol` for a flow of your own."
+        )
+    if integrator.dt is not None:
+        raise ValueError(f"`tol` chooses the step, but `dt` is given, {integrator.dt:g}: leave out one of them.")
+    system = problem.system.between_impulses
+    states = to_numpy(problem.y0).astype(float)
+    if states.ndim > 1:
+        states = states.reshape(-1, states.shape[-1])[:MOST_STATES]
+    length, error = abs(problem.t1 - problem.t0), _error(integrator, replace(problem, system=system, y0=states), tol_of)
+    check_applies(integrator, system, states)
+    h = min(integrator.step_length(system), length)
+    good, bad, least = 0.0, math.inf, math.inf
+    for _ in range(TRIALS):
+        e = error(h)
+        if e > tol and h < bad and least <= e <= AT_ROUNDING:
+            break
+        least = min(least, e)
+        if e <= MOST * tol:
+            good = max(good, h)
+            if e >= ENOUGH * tol or h >= length:
+                break
+        else:
+            bad = min(bad, h)
+        factor = (SAFETY * tol / e) ** (1 / (integrator.order or 2)) if 0 < e < math.inf else 4.0 if e == 0 else 0.25
+        following = h * min(max(factor, 1 / 16), 8.0)
+        if good and following >= bad:
+            following = math.sqrt(good * bad)
+        if good and (following <= 1.1 * good or bad <= 1.2 * good):
+            break
+        h = min(following, length)
+    if not good:
+        raise ValueError(
+            f"`tol` {tol:g} is not met by method {integrator.label!r}: the smallest error of the trial runs is "
+            f"{least:.1e}, near rounding. Raise it, or pass `dt`."
+        )
+    return _rounded(good, length)
+
+
+def _rounded(h: float, length: float) -> float:
+    """A step at most h, to three digits, or one that ends the run exactly where that has few steps."""
+    if length / h < 100:
+        return length / math.ceil(length / h * (1 - 1e-12))
+    digits = 2 - math.floor(math.log10(h))
+    return math.floor(h * 10.0**digits * (1 + 1e-12)) / 10.0**digits
+
+
+def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[float], float]:
+    """The error of a trial run, as a function of the step."""
+    system, y0 = problem.system, problem.y0
+    sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
+    conserved = system.autonomous and system.conservative
+    with np.errstate(all="ignore"):
+        H0 = np.asarray(system.hamiltonian(y0, problem.t0))
+    scale = known_scale(system, y0, problem.t0, H0)
+    scale = np.where(np.isnan(scale), 1.0, scale)
+    factors, size = weights(system), smallest_size(system, y0)
+
+    compiled = False
+
+    def run(h: float, end: float, n: int) -> tuple[np.ndarray, np.ndarray]:
+        t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
+        with np.errstate(all="ignore"):
+            outcome = replace(integrator, dt=h).run(replace(problem, t1=float(t[-1]), t_eval=t, diagnosed=False))
+        nonlocal compiled
+        compiled = outcome.stats.get("backend") == "compiled"
+        full = np.full((n + 1, *y0.shape), np.nan)
+        full[: len(outcome.y)] = outcome.y
+        return t, full
+
+    def error(h: float) -> float:
+        n = max(TRIAL_STEPS, min(math.ceil(TRIAL_LENGTH * system.dt / h), MOST_TRIAL_STEPS) if compiled else 0)
+        n = max(1, min(n, math.ceil(length / h)))
+        end, n = min(n * h, length), -(-n // -(-n // TRIAL_STEPS))
+        t, y = run(h, end, n)
+        with np.errstate(all="ignore"):
+            if tol_of == "energy" and conserved:
+                found = np.abs(np.asarray(system.hamiltonian(y)) - np.asarray(system.hamiltonian(y0))) / scale
+            else:
+                _, finer = run(h / 2, end, n)
+                if tol_of == "state":
+                    found = np.abs(factors * (y - finer)).max(-1) / (factors.max() * size)
+                else:
+                    times = t.reshape(-1, *[1] * (y0.ndim - 1)) if y0.ndim > 1 else t
+                    times = np.broadcast_to(times, y.shape[:-1])
+                    found = np.abs(np.asarray(system.hamiltonian(y, times) - system.hamiltonian(finer, times))) / scale
+        worst = float(np.max(found))
+        return worst if math.isfinite(worst) else math.inf
+
+    return error

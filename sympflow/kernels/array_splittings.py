@@ -1,0 +1,351 @@
+"""Kicks and drifts of states in memory: of systems of many terms, and of those that are given by functions.
+
+The forces are a loop over the terms of each kind, whose coordinates and constants are arrays, so that code does not
+depend on the size of a system; or functions at an address.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from sympflow.compiler.arrange import Arranged
+from sympflow.compiler.control import INT, POINTER, Value
+from sympflow.compiler.functions import fma
+from sympflow.compiler.program import gradient, traced
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.splittings import Splitting, SplittingCode
+
+if TYPE_CHECKING:
+    from sympflow.kernels.terms import Terms
+
+__all__ = ["ArrayCode", "Functions", "TermForces", "function_code", "term_code"]
+
+ARRAYS = 4  # of d numbers that a kick needs: slopes, velocities, products with the Hessian, curvatures
+
+
+class Forces(Protocol):
+    """The derivatives of T and V as code, of positions and momenta at places in memory into other places.
+
+    Attributes
+    ----------
+    data : sequence of ndarray
+        Arrays that the code reads.
+    lanes : int
+        Trajectories side by side.
+    """
+
+    data: list[np.ndarray]
+    lanes: int
+
+    def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        """∇V(q)."""
+
+    def product(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        """∇²V(q) v."""
+
+    def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        """½ ∇³V(q)(v, v)."""
+
+    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        """∇T(p)."""
+
+
+class TermForces:
+    """Forces by loops over the terms of each kind.
+
+    Parameters
+    ----------
+    V : Terms
+    T : Terms or ndarray, optional
+        Of a kinetic energy; its inverse masses (d,); None where all are 1.
+    """
+
+    lanes = 8
+
+    def __init__(self, V: Terms, T: Terms | np.ndarray | None) -> None:
+        self._V, self._T = V, T
+        self._masses = isinstance(T, np.ndarray)
+        kinetic = [] if T is None else [T] if isinstance(T, np.ndarray) else T.data
+        self.data = [*V.data, *kinetic]
+
+    def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        self._V.added(room, self._V.slopes, [q], out, d, letters)
+
+    def product(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        self._V.added(room, self._V.products, [q, v], out, d, letters)
+
+    def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        self._V.added(room, self._V.bends, [q, v], out, d, letters)
+
+    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        place = len(self._V.data)
+        if self._T is None or isinstance(self._T, np.ndarray):
+            with room.code.over(d) as i:
+                x = room.load(i, p)
+                room.store(x if self._T is None else x * room.code.load(room.data(place), i), i, out)
+            return
+        self._T.added(room, self._T.slopes, [p], out, d, letters, place)
+
+
+class Functions:
+    """Forces by functions at addresses, as a user's Numba functions have them; one trajectory after the other.
+
+    Parameters
+    ----------
+    functions : sequence
+        With an `address`, see `addressed`: of ∇V, and of ∇²V v.
+    inverse_mass : ndarray, optional
+        (d,) or (d, d).
+    """
+
+    lanes = 1
+
+    def __init__(self, functions: Sequence[Any], inverse_mass: np.ndarray | None) -> None:
+        self._functions, self._mass = functions, inverse_mass  # functions are kept alive
+        addresses = np.array([f.address for f in functions], dtype=np.int64)
+        self.data = [addresses, *([] if inverse_mass is None else [np.ascontiguousarray(inverse_mass)])]
+
+    def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        self._called(room, 0, [q], out, d, letters)
+
+    def product(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        self._called(room, 1, [q, v], out, d, letters)
+
+    def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        raise NotImplementedError
+
+    def _called(
+        self, room: Room, which: int, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]
+    ) -> None:
+        code = room.code
+        with code.over(d) as i:
+            room.store(float("nan"), i, out)  # what a function does not write ends the run
+        address = code.load(room.data(0), which, POINTER)
+        time = letters[0] if letters else code.constant(0.0)
+        code.call_at(address, [time, given[0], given[-1], out, d])
+
+    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        code, M = room.code, self._mass
+        with code.over(d) as i:
+            if M is None:
+                room.store(room.load(i, p), i, out)
+            elif M.ndim == 1:
+                room.store(room.load(i, p) * code.load(room.data(1), i), i, out)
+            else:
+                room.store(code.constant(0.0), i, out)
+                with code.over(d) as j:
+                    room.add(code.load(room.data(1), i * d + j) * room.load(j, p), i, out)
+
+
+def term_code(splitting: Splitting) -> ArrayCode:
+    """The compiled functions of a symbolic system of many terms."""
+    from sympflow.kernels.terms import Terms
+
+    symbols = splitting.symbols
+    M = symbols.inverse_mass
+    T: Any = Terms(symbols.T, symbols.p, symbols.parameters)
+    if M is not None and M.is_diagonal() and not M.free_symbols:
+        masses = np.array([float(x) for x in M.diagonal()])
+        T = None if (masses == 1).all() else masses
+    return ArrayCode(splitting, TermForces(Terms(symbols.V, symbols.q, symbols.parameters), T))
+
+
+def function_code(
+    ndof: int,
+    gradient: Any,
+    hessian_vector: Any | None,
+    inverse_mass: np.ndarray | None,
+    driven: bool,
+    friction: int | None,
+    level: int,
+    compensated: bool,
+    monomials: Monomials,
+) -> ArrayCode:
+    """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
+    functions = [addressed(gradient, False, driven), *([addressed(hessian_vector, True, driven)] if level else [])]
+    forces = Functions(functions, inverse_mass)
+    sizes: Any = Sizes(ndof, (Letter("time"),) if driven else ())
+    clock: Any = Clock() if driven else None
+    return ArrayCode(Splitting(sizes, level, monomials, compensated, friction, clock), forces)
+
+
+class Letter(NamedTuple):
+    """A number of a stage."""
+
+    name: str
+
+
+class Sizes(NamedTuple):
+    """In place of the symbols of a system that has none."""
+
+    ndof: int
+    parameters: tuple[Letter, ...]
+    values: tuple[()] = ()
+    V: None = None
+    T: None = None
+
+
+class Clock:
+    """In place of the driving of a system that has no symbols: its letter is the time."""
+
+    def values_at(self, time: Value, length: Value, fixed: Sequence[Value]) -> list[Value]:
+        return [time]
+
+
+def addressed(function: Any, along: bool, timed: bool) -> Any:
+    """A Numba function of arrays as one that C can call, with t, places q, v, out and their length.
+
+    What the function raises makes its result NaN. `along` is true of one that takes v, `timed` of one that takes t.
+    """
+    from numba import carray, cfunc, njit, types
+
+    calls = {
+        (False, False): lambda t, q, v, out: function(q, out),
+        (True, False): lambda t, q, v, out: function(q, v, out),
+        (False, True): lambda t, q, v, out: function(t, q, out),
+    }
+    call = function if along and timed else njit(calls[along, timed])
+    place = types.CPointer(types.float64)
+
+    @cfunc(types.void(types.float64, place, place, place, types.int64))
+    def called(t, q, v, out, n):  # type: ignore[no-untyped-def]
+        try:
+            call(t, carray(q, (n,)), carray(v, (n,)), carray(out, (n,)))
+        except Exception:
+            out[0] = np.nan
+
+    return called
+
+
+class ArrayCode(SplittingCode):
+    """The compiled functions of splitting schemes of states in memory.
+
+    Parameters
+    ----------
+    splitting : Splitting
+        Of which the symbols say no more than how many there are, where forces are functions.
+    forces : Forces
+    """
+
+    def __init__(self, splitting: Splitting, forces: Forces) -> None:
+        super().__init__(splitting)
+        self._forces, self.data, self.lanes, self.chunked = forces, forces.data, forces.lanes, False
+        self.room = ARRAYS * splitting.symbols.ndof
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return ArrayCode, (self._splitting, self._forces)
+
+    @cached_property
+    def _kinds(self) -> list[Arranged]:
+        """Stages whose numbers are those that are given."""
+        names = self._splitting.numbers
+        same = traced(lambda *x: x, *names)
+        return [Arranged(same, same) for _ in self._splitting.terms]
+
+    def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
+        for k in range(len(self._kinds)):
+            with room.code.given(room.code.apply("eq", (kind, k))):
+                self._executed(k, room, self._column(k, room.type, numbers, step))
+
+    def _executed(self, k: int, room: Room, column: Sequence[Any]) -> None:
+        self._kicked(room, self._splitting.terms[k], column)
+        self._drifted(room, column)
+
+    def _kicked(self, room: Room, terms: int, given: Sequence[Any]) -> None:
+        splitting, code, forces = self._splitting, room.code, self._forces
+        d, kicks = self._ndof(room), given[1 : 1 + len(splitting.kick_numbers)]
+        letters = self._letters(given)
+        q, p = room.state, room.part(d)
+        slope, velocity, product, bent = (room.part(d * i, room.work) for i in range(ARRAYS))
+        forces.gradient(room, q, slope, d, letters)
+        factors = [(-kicks[0], slope)]
+        if terms > 1:
+            forces.velocity(room, slope, velocity, d, letters)
+            forces.product(room, q, velocity, product, d, letters)
+            factors.append((kicks[1], product))
+        if terms > 2:
+            forces.bend(room, q, velocity, bent, d, letters)
+            with code.over(d) as i:
+                bend = kicks[2] * room.load(i, bent)
+                change = fma(kicks[1], room.load(i, product), -(kicks[0] * room.load(i, slope)))
+                room.store(change - bend, i, slope)
+            forces.velocity(room, product, velocity, d, letters)
+            forces.product(room, q, velocity, product, d, letters)
+            factors = [(1.0, slope), (-kicks[2], product)]
+        if splitting.monomials:
+            self._store_polynomial(room, velocity, kicks)
+            factors.append((-1.0, velocity))
+        with code.over(d) as i:
+            changes = [(factor, room.load(i, place)) for factor, place in factors]
+            self._move(room, p, i, changes, 3)
+
+    def _store_polynomial(self, room: Room, out: Value, kicks: Sequence[Any]) -> None:
+        """Σ e ∇q^m."""
+        splitting, d = self._splitting, self._splitting.symbols.ndof
+
+        def slopes(*numbers: Any) -> list[Any]:
+            total: Any = 0.0
+            for e, powers in zip(numbers[d:], splitting.monomials, strict=True):
+                monomial = e
+                for x, n in zip(numbers[:d], powers, strict=True):
+                    monomial = monomial * x**n
+                total = total + monomial
+            return gradient(total, numbers[:d])
+
+        names = [*(s.name for s in splitting.symbols.q), *splitting.kick_numbers[1:]]
+        for i, x in enumerate(traced(slopes, *names)(*(room.load(i) for i in range(d)), *kicks[1:])):
+            room.store(x, i, out)
+
+    def _drifted(self, room: Room, given: Sequence[Any]) -> None:
+        splitting, code, forces = self._splitting, room.code, self._forces
+        d, a = self._ndof(room), given[0]
+        q, p = room.state, room.part(d)
+        spread, velocity = (room.part(d * i, room.work) for i in range(2))
+        moved = p
+        if splitting.friction is not None:
+            n = splitting.symbols.ndof**splitting.friction
+            first = 1 + len(splitting.kick_numbers)
+            mean, decay = given[first : first + n], given[first + n : first + 2 * n]
+            for i, k in self._each(room, d, n):
+                x = room.load(i, p)
+                room.store(mean[k] * x, i, spread)
+                room.store(decay[k] * x, i, p)
+            moved, a = spread, 1.0
+        forces.velocity(room, moved, velocity, d, self._letters(given))
+        with code.over(d) as i:
+            self._move(room, q, i, [(a, room.load(i, velocity))], 2)
+
+    def _each(self, room: Room, d: Value, n: int) -> Iterator[tuple[Any, int]]:
+        """Each degree of freedom with the place of its rate; a loop where there is one rate."""
+        if n > 1:
+            yield from ((i, i) for i in range(n))
+            return
+        with room.code.over(d) as i:
+            yield i, 0
+
+    def _move(self, room: Room, x: Value, i: Value, changes: Sequence[tuple[Any, Value]], errors: int) -> None:
+        """Number i of x and Σ factor·change; by Kahan's compensated sum where there are errors, d numbers each."""
+        total, old = room.load(i, x), room.load(i, x)
+        if not self._splitting.compensated:
+            for factor, change in changes:
+                total = fma(factor, change, total)
+            room.store(total, i, x)
+            return
+        place = room.part(self._ndof(room) * errors)
+        corrected = -room.load(i, place)
+        for factor, change in changes:
+            corrected = fma(factor, change, corrected)
+        total = old + corrected
+        room.store((total - old) - corrected, i, place)
+        room.store(total, i, x)
+
+    def _letters(self, given: Sequence[Any]) -> Sequence[Any]:
+        return given[len(given) - len(self._splitting.symbols.parameters) :]
+
+    def _ndof(self, room: Room) -> Value:
+        return room.code.op("sdiv", INT, room.size, room.code.constant(2 * (1 + self._splitting.compensated), INT))

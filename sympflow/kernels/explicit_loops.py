@@ -1,0 +1,252 @@
+"""Compiled explicit Runge–Kutta steps, and the compiled vector field of a symbolic system for solvers of others."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import sympy as sp
+
+from sympflow.compiler.control import DOUBLE, POINTER, Module, Value
+from sympflow.compiler.machine import compiled, host
+from sympflow.compiler.program import Program, gradient
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, add_terms, recorded
+from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.terms import families, is_large
+
+__all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
+
+
+class Tableau(Protocol):
+    """Stages K_i = f(t + c_i h, y + h Σ_j A_ij K_j) and the step y + h Σ_i B_i K_i."""
+
+    A: Any
+    B: Any
+
+
+def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKernel:
+    """The compiled loops of a method on a symbolic system.
+
+    Raises
+    ------
+    ValueError
+        If the system cannot be compiled, with the reason.
+    """
+    field = _field(system)
+    kind = _InMemory if field.large else _InRegisters
+    A = tuple(tuple(map(float, row)) for row in tableau.A)
+    code = kind(field, A, tuple(map(float, tableau.B)))
+    return OneStepKernel(code, code, field.more)
+
+
+def compiled_field(system: HamiltonianSystem) -> CompiledField:
+    """Return the vector field of a symbolic system, compiled, for one solver.
+
+    Raises
+    ------
+    ValueError
+        If the system cannot be compiled, with the reason.
+    """
+    return CompiledField(_field(system))
+
+
+def _field(system: HamiltonianSystem) -> Field:
+    if system not in _FIELDS:
+        _FIELDS[system] = Field(system)
+    return _FIELDS[system]
+
+
+_FIELDS: WeakKeyDictionary[HamiltonianSystem, Field] = WeakKeyDictionary()
+
+
+class Field:
+    """J∇H of a symbolic system, less Γp, plus a force by symbols, as code.
+
+    Attributes
+    ----------
+    lettered : Lettered
+    large : bool
+        True if terms of a kind are looped over.
+    data : list of ndarray
+        Arrays that the code of a large system reads: coordinates and constants of the kinds of terms, and Γ.
+    """
+
+    def __init__(self, system: HamiltonianSystem) -> None:
+        symbols, force = system.symbols, system.external_force
+        assert symbols is not None
+        forces = getattr(force, "expressions", None)
+        if force is not None and forces is None:
+            raise ValueError("`system` has a force that is no formula, which is not compiled: use backend='array'.")
+        self.large = is_large(symbols) and force is None
+        symbols = symbols if is_large(symbols) else symbols.parametric
+        self.lettered = Lettered(symbols, [symbols.H, *(forces or [])])
+        self.ndof = system.ndof
+        self._damping = None if system.friction is None else system.friction.matrix(self.ndof)
+        self.rates = [] if self._damping is None else self._damping[self._damped].tolist()
+        self._families = families(self.lettered.expressions[0], (*symbols.q, *symbols.p)) if self.large else []
+        self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]
+        if self._damping is not None:
+            self.data.append(np.ascontiguousarray(self._damping))
+
+    @property
+    def _damped(self) -> Any:
+        """The entries of Γ that are numbers of a column."""
+        assert self._damping is not None
+        return np.nonzero(np.zeros_like(self._damping) if self.large else self._damping)
+
+    def more(self, h: np.ndarray) -> np.ndarray:
+        """The numbers of Γ in the columns of steps."""
+        return np.broadcast_to(np.array(self.rates), (len(h), len(self.rates)))
+
+    @cached_property
+    def program(self) -> Program:
+        """f, from q, p, the parameters, the letters and the numbers of Γ."""
+        symbols, d, n = self.lettered.symbols, self.ndof, 2 * self.ndof
+        rates = sp.symbols(f"rate_:{len(self.rates)}")
+        inputs = (*symbols.q, *symbols.p, *self.lettered.given, *rates)
+        found = recorded([*self.lettered.expressions, *rates], inputs)
+        slope = gradient(found.outputs[0], found.inputs[:n])
+        more = found.outputs[1 : len(self.lettered.expressions)] or [0.0] * d
+        forces = [-x + F for x, F in zip(slope[:d], more, strict=True)]
+        if rates:
+            for i, j, rate in zip(*self._damped, found.inputs[len(inputs) - len(rates) :], strict=True):
+                forces[i] = forces[i] - rate * found.inputs[d + j]
+        return Program(found.inputs, [*slope[d:], *forces])
+
+    @cached_property
+    def function(self) -> Callable[..., None]:
+        """f compiled: of addresses (y, out, time, numbers, room, data)."""
+        module, lettered = Module(host().fused), self.lettered
+        code = module.function("field_at", [POINTER] * 6)
+        y, out, time, numbers, room, data = code.arguments
+        k, n = len(lettered.symbols.parameters), 2 * self.ndof
+        given = [code.load(numbers, i) for i in range(k)]
+        if lettered.letters:
+            given += lettered.at(code.load(time), given)
+        if self.large:
+            letters = code.at(room, n)
+            for i, x in enumerate(given):
+                code.store(x, letters, i)
+            arrays = [code.load(data, i, POINTER) for i in range(len(self.data))]
+            code.outlined("field", [y, out, room, letters, *arrays], self.fill, rare=False)
+        else:
+            rates = [code.load(numbers, k + i) for i in range(len(self.rates))]
+            for i, x in enumerate(self.program(*(code.load(y, i) for i in range(n)), *given, *rates)):
+                code.store(code.operand(x, DOUBLE), out, i)
+        code.give()
+        return compiled(str(module), "field_at", ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 6))
+
+    def fill(self, y: Value, out: Value, g: Value, letters: Value, *data: Value) -> None:
+        """f(y) into `out` by loops over the terms of each kind; `g` is room for ∇H."""
+        code, d, n = y.code, self.ndof, 2 * self.ndof
+        given = [code.load(letters, k) for k in range(len(self.lettered.given))]
+        with code.over(n) as m:
+            code.store(code.constant(0.0), g, m)
+        for i, family in enumerate(self._families):
+            found = recorded([family.f], (*family.x, *family.c, *self.lettered.given))
+            slopes = Program(found.inputs, gradient(found.outputs[0], found.inputs[: len(family.x)]))
+            add_terms(family, data[2 * i : 2 * i + 2], slopes, y, given, lambda places: [(g, m) for m in places])
+        with code.over(d) as m:
+            code.store(code.load(g, m + d), out, m)
+            force = -code.load(g, m)
+            if self._damping is not None:
+                damping = data[-1]
+
+                def damped(j: Value, values: list[Value], m: Value = m) -> list[Value]:
+                    return [values[0] - code.load(damping, m * d + j) * code.load(y, j + d)]
+
+                (force,) = code.loop(d, [force], damped)
+            code.store(force, out, m + d)
+
+
+class _Explicit(OneStep):
+    """Steps of an explicit Runge–Kutta method."""
+
+    def __init__(self, field: Field, A: tuple[tuple[float, ...], ...], B: tuple[float, ...]) -> None:
+        super().__init__(field.lettered, 2 * field.ndof, len(field.rates))
+        self.field, self.A, self.B = field, A[: len(B)], B
+        self.work = 4.0 * len(B) * field.ndof
+
+
+class _InRegisters(_Explicit):
+    """Steps with every number in a register."""
+
+    lanes = 8
+
+    def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+        column, parameters = self.column(values[0].code, numbers, step), self.parameters
+        rates = column[self.size - len(self.field.rates) :]
+        K: list[list[Value]] = []
+        for row in self.A:
+            letters = self.letters_at(column, sum(row))
+            f = self.field.program(*_moved(values, column[0], row, K), *column[1 : 1 + parameters], *letters, *rates)
+            K.append([values[0].code.operand(x, values[0].type) for x in f])
+        return _moved(values, column[0], self.B, K)
+
+
+class _InMemory(_Explicit):
+    """Steps in memory, of a large system."""
+
+    lanes = 1
+    fewest = 1 << 62
+
+    def __init__(self, field: Field, A: tuple[tuple[float, ...], ...], B: tuple[float, ...]) -> None:
+        super().__init__(field, A, B)
+        self.room = self.n_out * (len(B) + 2) + len(self.lettered.given)
+        self.data = field.data
+
+    def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
+        code, n, s = room.code, self.n_out, len(self.B)
+        column = self.column(code, numbers, step)
+        *K, Y, g, letters = (room.part(n * i, room.work) for i in range(s + 3))
+        data = [room.data(i) for i in range(len(self.data))]
+        for i, row in enumerate(self.A):
+            for k, x in enumerate([*column[1 : 1 + self.parameters], *self.letters_at(column, sum(row))]):
+                code.store(x, letters, k)
+            self._move(room, Y, column[0], row, K)
+            code.outlined("field", [Y, K[i], g, letters, *data], self.field.fill, rare=False)
+        self._move(room, room.state, column[0], self.B, K)
+
+    def _move(self, room: Room, to: Value, h: Value, weights: Sequence[float], K: Sequence[Value]) -> None:
+        code = room.code
+        with code.over(self.n_out) as m:
+            (x,) = _moved([room.load(m)], h, weights, [[code.load(k, m)] for k in K[: len(weights)]])
+            code.store(x, to, m)
+
+
+def _moved(y: Sequence[Value], h: Value, weights: Sequence[float], K: Sequence[Sequence[Value]]) -> list[Value]:
+    """y + h Σ weights_i K_i."""
+    moved = []
+    for m, x in enumerate(y):
+        total: Any = None
+        for w, k in zip(weights, K, strict=False):
+            if w:
+                total = w * k[m] if total is None else total + w * k[m]
+        moved.append(x if total is None else x + h * total)
+    return moved
+
+
+class CompiledField:
+    """The vector field y' = f(t, y) of one state, to be called as ``field(t, y)``, by one thread at a time."""
+
+    def __init__(self, field: Field) -> None:
+        self._field, n = field, 2 * field.ndof
+        symbols = field.lettered.symbols
+        self._y, self._out, self._time = np.empty(n), np.empty(n), np.zeros(1)
+        self._numbers = np.array([*symbols.values, *field.rates])
+        self._room = np.empty(n + len(field.lettered.given))
+        self._data = np.array([x.ctypes.data for x in field.data], dtype=np.int64)
+        arrays = self._y, self._out, self._time, self._numbers, self._room, self._data
+        self._places = [ctypes.c_void_p(x.ctypes.data) for x in arrays]
+        self._function = field.function
+
+    def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
+        self._y[:] = y
+        self._time[0] = t
+        self._function(*self._places)
+        return self._out.copy()

@@ -1,0 +1,389 @@
+"""Compiled runs of SympFlows whose potentials are multilayer perceptrons.
+
+A layer adds ∓(∇V(t, x) − ∇V(0, x)) to p or to q. V(t, ·) and V(0, ·) share K x and run side by side through
+
+    a₁ = K x + b₁ (+ k t),  z_l = σ(a_l),  a_{l+1} = W_l z_l + b_{l+1},      V = w · z_n,
+    r_n = w σ'(a_n),  r_l = σ'(a_l) W_lᵀ r_{l+1},                          ∇V = Kᵀ r₁.
+
+Weights are read from memory, so that a trained network is compiled once. Of one trajectory the features of a level are
+lanes, of several the trajectories are. Both add up in one order, so that they give the same bits: of the features in
+Kᵀ r₁ each fourth one by itself, then these four sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
+from sympflow.compiler.functions import fma
+from sympflow.compiler.program import traced
+from sympflow.kernels.activations import SLOPES
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
+from sympflow.kernels.rollouts import Columns, Rollouts, aligned
+from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.threads import run_rows
+
+__all__ = ["MLPFlowKernel", "NetworkLayer"]
+
+FEATURES = 4  # side by side in a register
+REGISTERS = 4  # of features, at most, that are computed together
+ONE = np.ones(1, dtype=np.int64)
+STEP = 1000  # about how many nanoseconds one takes
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkLayer:
+    """The weights of a kick or a drift, whose potential is V(t, x) = w · σ(… σ(K x + k t + b_1) …).
+
+    Attributes
+    ----------
+    is_kick : bool
+    activation : str
+        The name of σ.
+    K, k : ndarrays of shape (h_1, d) and (h_1,)
+    biases : sequence of ndarrays of shape (h_l,)
+    weights : sequence of ndarrays of shape (h_{l+1}, h_l)
+    w : ndarray of shape (h_n,)
+    slopes : callable, optional
+        Where the loops do not know σ by its name: a function of a number a that returns σ(a) and σ'(a).
+    """
+
+    is_kick: bool
+    activation: str
+    K: np.ndarray
+    k: np.ndarray
+    biases: Sequence[np.ndarray]
+    weights: Sequence[np.ndarray]
+    w: np.ndarray
+    slopes: Callable[[float], Any] | None = None
+
+
+class MLPFlowKernel(Kernel):
+    """Compiled loops of one SympFlow with the weights given, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
+
+    Parameters
+    ----------
+    ndof : int
+        d.
+    layers : sequence of NetworkLayer
+        In their order, with potentials of one depth and one activation; steps |h| are at most Δt.
+
+    Raises
+    ------
+    ValueError
+        If depths or activations differ, or there is no compiled form of the activation.
+    """
+
+    saves_finite = False
+
+    def __init__(self, ndof: int, layers: Sequence[NetworkLayer]) -> None:
+        depths, activations = {len(layer.biases) for layer in layers}, {layer.activation for layer in layers}
+        slopes = layers[0].slopes
+        if len(depths) > 1 or len(activations) > 1 or not (activations <= set(SLOPES) or slopes is not None):
+            raise ValueError(
+                "`flow` must have potentials of one depth with one activation out of "
+                f"{', '.join(SLOPES)}, or one that was registered with `compiled`, to be compiled: use "
+                "backend='array'."
+            )
+        self._rollouts = _NetworkRollouts(ndof, layers)
+
+    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
+        """`n_steps` times ψ̄_h from one state: see `Kernel`."""
+        Y, n_finite, _ = self.run_batch(h, y0[None], n_steps, save, 1, carry)
+        return Run(Y[0], int(n_finite[0]))
+
+    def run_batch(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        threads: int | None = None,
+        carry: Carry | None = None,
+    ) -> Run:
+        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
+
+        def rows(_: slice, *rest: Any) -> None:
+            arguments: tuple[Any, ...] = h, *rest, False
+            self._rollouts.rollout_batch(*arguments)
+
+        return run_states(rows, y0, n_steps, save, threads, carry, y0.shape[1], STEP)
+
+    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,), negative for the inverse."""
+        steps, out = np.empty(len(y)), np.empty(y.shape)
+        steps[:] = h
+        back = steps < 0
+        for sign, rows in ((1.0, ~back), (-1.0, back)):
+            if rows.all():
+                return Steps(self._steps(sign, y, steps))
+            out[rows] = self._steps(sign, y[rows], steps[rows])
+        return Steps(out)
+
+    def _steps(self, sign: float, y: np.ndarray, h: np.ndarray) -> np.ndarray:
+        """Steps of one sign."""
+        given = np.concatenate([y, np.abs(h)[:, None]], axis=1)
+        out, finite = np.empty((len(y), 1, y.shape[1])), np.empty(len(y), dtype=np.int64)
+
+        def rows(i: slice, stop: np.ndarray) -> None:
+            running = np.empty((len(y[i]), 0))
+            self._rollouts.rollout_batch(sign, given[i], 1, ONE, out[i], finite[i], stop, 0, running, False)
+
+        run_rows(rows, len(y), STEP, None)
+        return out[:, 0]
+
+
+class _Layout(NamedTuple):
+    """The sizes of the networks of a flow, and where the weights of one begin: all levels as wide as the widest one.
+
+    Weights are k, w (h,), b (n, h), K (d, h), W (n − 1, from, to) and Wᵀ; those that a network has not are 0.
+    """
+
+    ndof: int
+    depth: int
+    used: int
+    registers: int
+
+    @classmethod
+    def of(cls, ndof: int, depth: int, width: int) -> _Layout:
+        needed = -(-width // FEATURES)
+        registers = min(range(1, REGISTERS + 1), key=lambda g: (-(-needed // g) * g, -g))
+        return cls(ndof, depth, width, registers)
+
+    @property
+    def h(self) -> int:
+        """Features of a level, in whole groups of registers."""
+        group = self.registers * FEATURES
+        return -(-self.used // group) * group
+
+    @property
+    def starts(self) -> list[int]:
+        """Where k, w, b, K, W and Wᵀ begin, and where they end."""
+        h, squares = self.h, (self.depth - 1) * self.h**2
+        return [int(x) for x in np.cumsum([0, h, h, self.depth * h, self.ndof * h, squares, squares])]
+
+    def weights(self, layer: NetworkLayer) -> np.ndarray:
+        h, n = self.h, self.depth
+        shapes = (h,), (h,), (n, h), (self.ndof, h), (n - 1, h, h), (n - 1, h, h)
+        arrays = [np.zeros(shape) for shape in shapes]
+        k, w, b, K, W, transposed = arrays
+        pairs = [(k, layer.k), (w, layer.w), (K, layer.K.T), *zip(b, layer.biases, strict=True)]
+        pairs += zip(W, (M.T for M in layer.weights), strict=True)
+        pairs += zip(transposed, layer.weights, strict=True)
+        for target, values in pairs:
+            target[tuple(map(slice, values.shape))] = values
+        return np.concatenate([a.ravel() for a in arrays])
+
+
+_compiled: dict[Any, dict[Any, Callable[..., None]]] = {}
+"""The functions of networks of the same sizes and activations."""
+
+
+class _NetworkRollouts(Rollouts):
+    """The compiled functions of networks: a column is a layer, by its number and whether it is a kick."""
+
+    fewest, size = 8, 2
+
+    def __init__(self, ndof: int, layers: Sequence[NetworkLayer]) -> None:
+        super().__init__(2 * ndof, 2 * ndof)
+        first = layers[0]
+        width, depth = max(len(b) for layer in layers for b in layer.biases), len(first.biases)
+        self._layout = layout = _Layout.of(ndof, depth, width)
+        self._kinds = np.array([2 * i + layer.is_kick for i, layer in enumerate(layers)])
+        self.room, weights = 6 * depth * layout.h, aligned(len(layers) * layout.starts[-1])
+        weights[:] = np.concatenate([layout.weights(layer) for layer in layers])
+        self._slopes, address = _slopes(first)
+        self.data = [weights, np.array([address])]
+        self._functions = _compiled.setdefault((layout, first.activation, first.slopes), {})
+
+    def prepared(self, table: Any) -> Columns:
+        """The columns of steps of a length h: signs and times."""
+        columns, kinds = self._columns(table, np.array([[abs(table)]]))
+        return columns[0], kinds
+
+    def own_columns(self, table: Any, values: np.ndarray, width: int) -> Columns:
+        """Those of trajectories with their own |h|, and the sign of `table`."""
+        groups = -(-len(values) // width)
+        times = np.concatenate([values[:, 0], np.repeat(values[-1:, 0], groups * width - len(values))])
+        return self._columns(table, times.reshape(groups, width))
+
+    def _columns(self, h: float, t: np.ndarray) -> Columns:
+        """The columns (groups, layers + 2, 2, width) of times (groups, width)."""
+        kinds = self._kinds[::-1] if h < 0 else self._kinds
+        kinds = np.concatenate([kinds, kinds[:1], kinds[:1]])
+        columns = np.empty((len(t), len(kinds), 2, t.shape[1]))
+        columns[:, :, 0] = np.where(kinds % 2 == (h < 0), 1.0, -1.0)[:, None]
+        columns[:, :, 1] = t[:, None]
+        return columns, kinds
+
+    def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
+        """One layer, in place."""
+        code, layout = room.code, self._layout
+        kick = code.apply("eq", (kind & 1, 1))
+        q, p = code.constant(0, INT), code.constant(layout.ndof, INT)
+        x, target = room.part(code.select(kick, q, p)), room.part(code.select(kick, p, q))
+        weights = code.at(room.data(0), (kind >> 1) * layout.starts[-1])
+        sigma = self._slopes
+        if sigma is None:
+            sigma = partial(_called, code.load(room.data(1), 0, POINTER))
+        _Impulse(layout, room, weights, sigma).add(numbers(0), numbers(1), x, target)
+
+
+class _Impulse:
+    """The code of one layer. Registers hold features of one trajectory, or one feature of several."""
+
+    def __init__(self, layout: _Layout, room: Room, weights: Value, slopes: Callable[[Value], Any]) -> None:
+        self.layout, self.code, self.width, self._weights, self.slopes = layout, room.code, room.width, weights, slopes
+        self.side = FEATURES if room.width == 1 else 1  # features in a register
+        self.type = Type("double", FEATURES if room.width == 1 else room.width)
+        self.block = layout.registers * FEATURES if room.width == 1 else 1
+        self.z, self.s, self.r = (room.part(2 * i * layout.depth * layout.h, room.work) for i in range(3))
+
+    def weights(self, first: Any, count: int) -> list[Value]:
+        """Registers of as many weights, from one on."""
+        if self.width == 1:
+            return [self.code.load(self._weights, first + i, self.type) for i in range(0, count, FEATURES)]
+        return [self.code.splat(self.code.load(self._weights, first + i), self.width) for i in range(count)]
+
+    def features(self, place: Value, first: Any, count: int) -> list[Value]:
+        return [self.code.load(place, (first + i) * self.width, self.type) for i in range(0, count, self.side)]
+
+    def put(self, registers: Sequence[Value], place: Value, first: Any) -> None:
+        for i, x in enumerate(registers):
+            self.code.store(self.code.operand(x, self.type), place, (first + i * self.side) * self.width)
+
+    def feature(self, place: Value, i: Any) -> Value:
+        """One feature, or coordinate, for all weights."""
+        x = self.code.load(place, i * self.width, self.type if self.width > 1 else DOUBLE)
+        return self.code.operand(x, self.type)
+
+    def blocks(self, n: int) -> Iterator[Value]:
+        """The first of the features that are computed together."""
+        with self.code.over(-(-n // self.block)) as i:
+            yield i * self.block
+
+    def add(self, sign: Value, t: Value, x: Value, target: Value) -> None:
+        """target += sign · (∇V(t, x) − ∇V(0, x))."""
+        layout, code = self.layout, self.code
+        h, used, top = layout.h, layout.used, layout.depth - 1
+        k, w, b, K, W, transposed, _ = layout.starts
+        zero, t = code.constant(0.0, self.type), code.operand(t, self.type)
+        for first in self.blocks(used):
+            start = self.weights(first + b, self.block)
+            (a,) = self.products(layout.ndof, first + K, start, 1, lambda j: [self.feature(x, j)])
+            moved = [fma(factor, t, y) for factor, y in zip(self.weights(first + k, self.block), a, strict=True)]
+            self.activate(first, moved, a)
+        with code.over(top) as level:
+            for first in self.blocks(used):
+                start = self.weights((level + 1) * h + first + b, self.block)
+                both = self.products(used, level * (h * h) + first + W, start, 2, self.both(self.z, level * (2 * h)))
+                self.activate((level + 1) * (2 * h) + first, *both)
+        for first in self.blocks(used):
+            factors = self.weights(first + w, self.block)
+            for column in (0, h):
+                slope = self.features(self.s, first + (top * 2 * h + column), self.block)
+                self.put([x * y for x, y in zip(factors, slope, strict=True)], self.r, first + column)
+        with code.over(top) as down:
+            level, source, out = (top - 1) - down, (down & 1) * (2 * h), ((down + 1) & 1) * (2 * h)
+            for first in self.blocks(used):
+                start = [zero] * (self.block // self.side)
+                R = self.products(used, level * (h * h) + first + transposed, start, 2, self.both(self.r, source))
+                for column, total in zip((0, h), R, strict=True):
+                    slope = self.features(self.s, level * (2 * h) + first + column, self.block)
+                    self.put([x * y for x, y in zip(total, slope, strict=True)], self.r, out + first + column)
+        end = (top & 1) * 2 * h
+        for first in self.blocks(used):
+            ends = [self.features(self.r, first + (end + column), self.block) for column in (0, h)]
+            self.put([x - y for x, y in zip(*ends, strict=True)], self.r, first + end)
+        if self.width > 1:
+            with code.over(h - used) as i:
+                self.put([zero], self.r, i + (end + used))
+        with code.over(layout.ndof) as j:
+
+            def more(i: Value, sums: Sequence[Value]) -> list[Value]:
+                factors = self.weights(j * h + i * FEATURES + K, FEATURES)
+                given = self.features(self.r, i * FEATURES + end, FEATURES)
+                return [fma(x, y, total) for x, y, total in zip(factors, given, sums, strict=True)]
+
+            sums = code.loop(h // FEATURES, [zero] * (FEATURES // self.side), more)
+            each = sums if self.width > 1 else [code.lane(sums[0], i) for i in range(FEATURES)]
+            change = (each[0] + each[1]) + (each[2] + each[3])
+            y = code.load(target, j * self.width, change.type)
+            code.store(fma(sign, change, y), target, j * self.width)
+
+    def both(self, place: Value, level: Value) -> Callable[[Value], list[Value]]:
+        """A feature of a level in the columns t and 0."""
+        return lambda i: [self.feature(place, level + i), self.feature(place, level + (i + self.layout.h))]
+
+    def products(
+        self, count: int, first: Value, start: list[Value], columns: int, given: Callable[[Value], list[Value]]
+    ) -> list[list[Value]]:
+        """start + Σᵢ xᵢ Mᵢ of a block of features, for the x of each column; a row of M is as long as a level."""
+        h, size = self.layout.h, len(start)
+
+        def more(i: Value, totals: Sequence[Value]) -> list[Value]:
+            factors = self.weights(first + i * h, self.block)
+            return [
+                fma(factor, x, totals[column * size + v])
+                for column, x in enumerate(given(i))
+                for v, factor in enumerate(factors)
+            ]
+
+        totals = self.code.loop(count, start * columns, more)
+        return [totals[i : i + size] for i in range(0, len(totals), size)]
+
+    def activate(self, first: Value, *columns: Sequence[Value]) -> None:
+        """σ and σ' of both columns of a block."""
+        for place, a in zip((first, first + self.layout.h), columns, strict=True):
+            values, slopes = zip(*map(self.slopes, a), strict=True)
+            self.put(values, self.z, place)
+            self.put(slopes, self.s, place)
+
+
+def _slopes(layer: NetworkLayer) -> tuple[Callable[[Any], Any] | None, int]:
+    """σ and σ' as a function of numbers; or None, and the address of a function of the user's that cannot be traced."""
+    if layer.activation in SLOPES:
+        return SLOPES[layer.activation], 0
+    function: Any = layer.slopes
+    try:
+        return traced(getattr(function, "py_func", function), "a"), 0
+    except (TypeError, ValueError, AttributeError):
+        return None, _by_numba(function).address
+
+
+@cache
+def _by_numba(function: Any) -> Any:
+    """A function (n, a, values, slopes) of addresses."""
+    try:
+        from numba import carray, cfunc, njit, types
+    except ImportError as error:
+        raise ValueError(
+            "`compiled`, with which the activation of the flow was registered, has branches or calls functions, which "
+            "Numba compiles: install numba, or write it by operators."
+        ) from error
+
+    compiled = function if hasattr(function, "py_func") else njit(error_model="numpy")(function)
+    numbers = types.CPointer(types.float64)
+
+    @cfunc(types.void(types.int64, numbers, numbers, numbers))
+    def both(n: Any, a: Any, values: Any, slopes: Any) -> None:
+        a, values, slopes = carray(a, n), carray(values, n), carray(slopes, n)
+        for i in range(n):
+            values[i], slopes[i] = compiled(a[i])
+
+    return both
+
+
+def _called(address: Value, a: Value) -> tuple[Value, Value]:
+    """σ and σ' by an address."""
+    code, n = a.code, a.type.width
+    given, values, slopes = (code.memory(1, a.type) for _ in range(3))
+    code.store(a, given)
+    code.call_address(address, [code.constant(n, INT), given, values, slopes])
+    return code.load(values, 0, a.type), code.load(slopes, 0, a.type)

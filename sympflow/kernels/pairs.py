@@ -1,0 +1,881 @@
+"""Splitting methods on bodies that interact in pairs: forces of any potential of one pair, over traced numbers.
+
+A few bodies are a symbolic system whose pairs are written out. Of more, states stand in memory, and one body meets a
+register of others at a time; with a cut-off bodies are sorted into cells, and each meets those of the cells around its
+own. Each pair is met once: its force is added to one body and taken from the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import numpy as np
+import sympy as sp
+
+from sympflow.compiler.arrange import Arranged, Arrangement
+from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
+from sympflow.compiler.functions import apply
+from sympflow.compiler.machine import address, host
+from sympflow.hamiltonian.bodies import PairsHamiltonian
+from sympflow.hamiltonian.recorded import evaluator
+from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
+from sympflow.kernels.rollouts import Columns, Rollouts, aligned
+from sympflow.kernels.runs import Memory, Numbers, Room, finished
+from sympflow.kernels.splittings import Shape, Splitting, WithinRange
+from sympflow.kernels.teams import Team, meet
+from sympflow.kernels.threads import NEVER, threads_for
+from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.local import LocalHamiltonian
+    from sympflow.hamiltonian.monomials import Monomials
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
+__all__ = ["PairCode", "PairForces", "few", "pair_code"]
+
+KINDS = {"gradient": (1,), "hessian_vector": (1, 2), "bend": (2, 3)}
+"""The derivatives of V by s that are in ∇V, ∇²V·v and ½ ∇³V(v, v)."""
+SHIFT = 3
+LANES = 1 << SHIFT
+"""Bodies that one meets at a time."""
+CHUNKS, WORTH_CHUNKS = 8, 100_000
+"""Chunks of a sum, which threads share, and about how many nanoseconds a sum takes from which there are more than one:
+threads wait for each other after each sum."""
+BLOCK, MOMENT = 1024, 200_000_000
+"""Most steps between two looks for an interrupt, and about how many nanoseconds they may take."""
+
+
+def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Arranged:
+    """The derivatives of V by s, those of `kinds` with factors 2ᵏ: a program of s, columns of both bodies, constants.
+
+    A number that is known for a body is multiplied before those of its partners.
+    """
+    states = [(local.s.name, 0), *((a.name, -40) for a in local.first), *((b.name, -20) for b in local.second)]
+    made = Arrangement(states, [c.name for c in local.c])
+    letters = (local.s, *local.first, *local.second, *local.c)
+    value = evaluator(dict(zip(letters, (*made.states, *made.constants), strict=True)))
+    return made.finish([made.written(made.number(value(local.slopes[k]))) for k in kinds])
+
+
+class Pair(NamedTuple):
+    """A body and its partners: the differences d of positions and u of velocities, and the derivatives of V."""
+
+    d: list[Value]
+    u: list[Value]
+    g: list[Value]
+
+
+class PairLaw:
+    """The forces of one pair, of one kind of sum.
+
+    Parameters
+    ----------
+    local : PairsHamiltonian
+    kinds : sequence of int
+        The derivatives of V that are computed.
+    """
+
+    def __init__(self, local: PairsHamiltonian, kinds: Sequence[int]) -> None:
+        self.columns = len(local.first)
+        self.dim, self.cut, self.periodic = local.dim, local.cutoff is not None, local.box is not None
+        self.program = slopes_of(local, kinds)
+        self.n_numbers = 2 + 2 * local.dim + len(self.program.table.outputs)
+        self._local = local
+
+    def numbers(self) -> np.ndarray:
+        """ε², the largest s, the sides of the box and their inverses, and what the derivatives need."""
+        local = self._local
+        end = math.inf if local.cutoff is None else local.cutoff**2 + local.softening**2
+        box = np.zeros(local.dim) if local.box is None else local.box
+        inverse = np.zeros(local.dim) if local.box is None else 1 / local.box
+        return np.array([local.softening**2, end, *box, *inverse, *self.program.table(*local.constants)])
+
+    def met(
+        self,
+        numbers: Sequence[Value],
+        own: Sequence[Value],
+        other: Sequence[Value],
+        columns: Sequence[Value],
+        inside: Value | None = None,
+    ) -> Pair:
+        """A body with positions, and velocities behind them, and its partners, which are `inside`; 0 for others."""
+        code, dim = own[0].code, self.dim
+        softening, end, rest = numbers[0], numbers[1], numbers[2 + 2 * dim :]
+        d, u = ([a - b for a, b in zip(own[k:][:dim], other[k:][:dim], strict=True)] for k in (0, dim))
+        if self.periodic:
+            box, inverse = numbers[2:][:dim], numbers[2 + dim :][:dim]
+            d = [
+                x - side * code.apply("floor", (code.fma(x, over, code.operand(0.5, x.type)),))
+                for x, side, over in zip(d, box, inverse, strict=True)
+            ]
+        s = softening
+        for x in d:
+            s = code.fma(x, x, s)
+        if self.cut:
+            inside = s < end if inside is None else inside & (s < end)
+        g = self.program.body(s, *columns, *rest)
+        if inside is not None:
+            g = [code.apply("where", (inside, code.operand(x, s.type), 0.0)) for x in g]
+        return Pair(d, u, g)
+
+    def parts(self, kind: str, pair: Pair) -> list[tuple[Value, list[Value]]]:
+        """Factors of vectors, whose sum is the part of the pair in the sum of its first body."""
+        d, u, g = pair
+        if kind == "gradient":
+            return [(g[0], d)]
+        e = dot(d, u)
+        if kind == "hessian_vector":
+            return [(g[1] * e, d), (g[0], u)]
+        return [(0.5 * (g[1] * e * e + g[0] * dot(u, u)), d), (g[0] * e, u)]
+
+
+def summed(total: Value, parts: Sequence[tuple[Value, list[Value]]], axis: int, sign: float = 1.0) -> Value:
+    """A sum with the part of a pair along an axis."""
+    for factor, x in parts:
+        total = total.code.fma(factor if sign > 0 else -factor, x[axis], total)
+    return total
+
+
+def dot(x: Sequence[Value], y: Sequence[Value]) -> Value:
+    total = x[0] * y[0]
+    for a, b in zip(x[1:], y[1:], strict=True):
+        total = total.code.fma(a, b, total)
+    return total
+
+
+# a few bodies: their pairs written out ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FewSymbols:
+    """A few bodies in the place of a symbolic Hamiltonian, whose parameters are all that a pair depends on."""
+
+    local: PairsHamiltonian
+    T = None
+
+    @cached_property
+    def numbers(self) -> dict[str, float]:
+        """The values of the parameters, by their names."""
+        local, named = self.local, {}
+        for c, value in zip(local.c, local.constants, strict=True):
+            named[c.name] = value
+        named["softening"] = local.softening**2
+        for k, side in enumerate(() if local.box is None else local.box.tolist()):
+            named |= {f"box_{k}": side, f"over_box_{k}": 1 / side}
+        for i, mass in enumerate(local.masses.tolist()):
+            named[f"w_{i}"] = 1 / mass
+        for i, column in enumerate(local.columns):
+            named |= {f"column_{i}_{k}": x for k, x in enumerate(column.tolist())}
+        return named
+
+    @property
+    def ndof(self) -> int:
+        return self.local.ndof
+
+    @property
+    def parametric(self) -> FewSymbols:
+        return self
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        return tuple(self.numbers.values())
+
+    @property
+    def parameters(self) -> tuple[sp.Symbol, ...]:
+        return tuple(map(sp.Symbol, self.numbers))
+
+    @property
+    def q(self) -> tuple[sp.Symbol, ...]:
+        return tuple(sp.Symbol(f"q{i + 1}") for i in range(self.ndof))
+
+    @property
+    def p(self) -> tuple[sp.Symbol, ...]:
+        return tuple(sp.Symbol(f"p{i + 1}") for i in range(self.ndof))
+
+    @cached_property
+    def V(self) -> sp.Expr:
+        local, number = self.local, sp.Symbol
+        columns = [[number(f"column_{c}_{i}") for i in range(local.n_bodies)] for c in range(len(local.columns))]
+        box = [number(f"box_{k}") for k in range(0 if local.box is None else local.dim)]
+        return local.written_potential(self.q, number("softening"), columns, {c: number(c.name) for c in local.c}, box)
+
+    @cached_property
+    def inverse_mass(self) -> sp.Matrix:
+        return sp.diag(*(sp.Symbol(f"w_{i // self.local.dim}") for i in range(self.ndof)))
+
+
+def few(local: LocalHamiltonian) -> tuple[Callable[..., Splitting] | None, tuple[float, ...]]:
+    """The splitting of a few bodies, None of more, and the values that it reads."""
+    assert isinstance(local, PairsHamiltonian)
+    if not local.is_few:
+        return None, ()
+    symbols = FewSymbols(local)
+    return partial(FewSplitting, cast("SymbolicHamiltonian", symbols)), symbols.values
+
+
+class FewSplitting(Splitting):
+    """The kicks and drifts of a few bodies."""
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        local = cast("FewSymbols", self.symbols).local
+        pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
+        return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
+
+    def kinds(self) -> Sequence[Arranged | WithinRange]:
+        _check_level(self.level)
+        return super().kinds()
+
+    def _arranged(self, terms: int) -> Arranged:
+        return FewShape(self, terms, True).arranged()[1]
+
+
+class FewShape(Shape):
+    """A stage of a few bodies: both of a pair share its square root, its division and all else."""
+
+    @cached_property
+    def _local(self) -> PairsHamiltonian:
+        return cast("FewSymbols", self.symbols).local
+
+    def _kicked(self) -> list[Any]:
+        return self._moved([self.made.node(p) for p in self.p])
+
+    def _changes(self) -> list[Any]:
+        return [self.made.letter(x) for x in self._moved([0.0] * self.d)]
+
+    def _moved(self, momenta: list[Any]) -> list[Any]:
+        """Momenta, numbers of the body, after the kick."""
+        made, op = self.made, self.made.operation
+        b, *more = (self.number[name] for name in self.splitting.kick_numbers)
+        if self.terms == 1:
+            return self._sum("gradient", [], momenta, -b)
+        nothing: list[Any] = [0.0] * self.d
+
+        def moved(by: Any, x: Sequence[Any]) -> list[Any]:
+            return [op("fma", made.written(by), a, p) for a, p in zip(x, momenta, strict=True)]
+
+        slope = self._sum("gradient", [], nothing)
+        momenta = moved(-b, slope)
+        v = self._velocities(slope)
+        product = self._sum("hessian_vector", v, nothing)
+        momenta = moved(more[0], product)
+        if self.terms > 2:
+            bent = self._sum("bend", v, self._sum("hessian_vector", self._velocities(product), nothing))
+            momenta = moved(-more[1], bent)
+        return momenta
+
+    def _velocities(self, x: Sequence[Any]) -> list[Any]:
+        return [self.made.written(y) for y in self._by_mass([self.made.letter(y) for y in x])]
+
+    def _sum(self, kind: str, v: Sequence[Any], start: Sequence[Any], factor: Any = None) -> list[Any]:
+        """A sum over all pairs of numbers of the body, behind others, of a kind of `KINDS` along v."""
+        op, dim, total = self.made.operation, self._local.dim, list(start)
+        for (i, j), (d, s) in self._pairs.items():
+            g = [self._slope(i, j, s, k, factor) for k in KINDS[kind]]
+            u = [op("sub", v[dim * i + k], v[dim * j + k]) for k in range(dim if v else 0)]
+            parts = [(g[0], d)]
+            if kind == "hessian_vector":
+                parts = [(op("mul", g[1], self._dot(d, u)), d), (g[0], u)]
+            elif kind == "bend":
+                e = self._dot(d, u)
+                square = op("fma", op("mul", g[1], e), e, op("mul", g[0], self._dot(u, u)))
+                parts = [(op("mul", 0.5, square), d), (op("mul", g[0], e), u)]
+            for x, vector in parts:
+                for k in range(dim):
+                    total[dim * i + k] = op("fma", x, vector[k], total[dim * i + k])
+                    total[dim * j + k] = op("fma", op("neg", x), vector[k], total[dim * j + k])
+        return total
+
+    def _dot(self, x: Sequence[Any], y: Sequence[Any]) -> Any:
+        op = self.made.operation
+        total = op("mul", x[0], y[0])
+        for a, b in zip(x[1:], y[1:], strict=True):
+            total = op("fma", a, b, total)
+        return total
+
+    @cached_property
+    def _pairs(self) -> dict[tuple[int, int], tuple[list[Any], Any]]:
+        """The differences of the coordinates of each two bodies, and s."""
+        local, made = self._local, self.made
+        pairs = {}
+        for i in range(local.n_bodies):
+            for j in range(i + 1, local.n_bodies):
+                d = [made.written(self.q[local.dim * i + k] - self.q[local.dim * j + k]) for k in range(local.dim)]
+                if local.box is not None:
+                    for k, x in enumerate(map(made.letter, d)):
+                        image = apply("floor", self.number[f"over_box_{k}"] * x + 0.5)
+                        d[k] = made.written(x - self.number[f"box_{k}"] * image)
+                s = made.written(self.number["softening"])
+                for x in d:
+                    s = made.operation("fma", x, x, s)
+                pairs[i, j] = d, s
+        return pairs
+
+    def _slope(self, i: int, j: int, s: Any, kind: int, factor: Any) -> Any:
+        """A derivative of V by s, times a factor."""
+        local, made = self._local, self.made
+        columns = [self.number[f"column_{c}_{body}"] for body in (i, j) for c in range(len(local.columns))]
+        letter = made.letter(s)
+        letters = (local.s, *local.first, *local.second, *local.c)
+        values = (letter, *columns, *(self.number[c.name] for c in local.c))
+        slope = evaluator(dict(zip(letters, values, strict=True)))(local.slopes[kind])
+        slope = made.written(slope if factor is None else factor * slope)
+        if local.cutoff is None:
+            return slope
+        return made.operation("where", made.operation("lt", s, made.written(self.number["end"])), slope, 0.0)
+
+
+def zeros(n: int) -> np.ndarray:
+    """Numbers 0 that begin with a line of memory."""
+    x = aligned(n)
+    x[:] = 0.0
+    return x
+
+
+# more bodies than a few: states in memory ---------------------------------------------------------------------------
+
+FIELDS = [
+    *("bodies", "size", "chunks", "member", "members", "sites", "numbers", "work", "sorted", "order", "cells"),
+    *("most_cells", "sums", "turn", "meeting", "stop", "block"),
+]
+"""Numbers of a context: sizes, addresses, the sums that are in turn, and the steps between two looks."""
+_LANES = Type("double", LANES)
+
+
+def field(context: Value, name: str) -> Value:
+    return context.code.load(context, FIELDS.index(name), INT)
+
+
+def place(context: Value, name: str) -> Value:
+    return context.code.address(field(context, name))
+
+
+class BodiesInMemory(Memory):
+    """A state as arrays (sets, dim, size) of q, p and, compensated, their errors."""
+
+    def __init__(self, dim: int, sets: int, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
+        super().__init__(code, width, arguments, before)
+        self._dim, self._sets, self._context = dim, sets, arguments[3]
+
+    def block(self, every: int) -> Value:
+        return field(self._context, "block")
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        state, code = self._running.state, self.code
+        with code.over(self.n_values) as i:
+            code.store(code.constant(0.0), state, i)
+        sets = self._sets if given is None else 2
+        for at, place, row in self._numbers(sets, rows, begin):
+            code.store(code.load(row, place), state, at)
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self._written(self._end, 2, out, begin * stride + at)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        self._written(self._running, self._sets, running, begin)
+
+    def _written(self, room: Room, sets: int, out: Value, row: Value) -> None:
+        """Write a state to a row, which one thread does."""
+        with self.code.given(self.code.apply("eq", (field(self._context, "member"), 0))):
+            for at, place, to in self._numbers(sets, out, row):
+                self.code.store(self.code.load(room.state, at), to, place)
+
+    def _numbers(self, sets: int, rows: Value, row: Value) -> Iterator[tuple[Value, Value, Value]]:
+        """The place of each number in a state and in a row; the code that is written next is that of all numbers."""
+        code, n, size = self.code, field(self._context, "bodies"), field(self._context, "size")
+        start = code.at(rows, row * (n * (sets * self._dim)))
+        for s in range(sets):
+            with code.over(n) as i:
+                for k in range(self._dim):
+                    yield size * (s * self._dim + k) + i, (n * s + i) * self._dim + k, start
+
+
+class PairStages:
+    """The code of stages that change a state in memory.
+
+    `sites` has a row of 1/m and one of each column. `work` holds the sum that was taken last and, behind it, the
+    velocities that sums are taken along.
+    """
+
+    def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
+        self.dim, self.columns = local.dim, len(local.first)
+        self.level, self.compensated, self.damped = level, compensated, damped
+        self.helpers = {0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level]
+        self.laws = {kind: PairLaw(local, KINDS[kind]) for kind in tuple(KINDS)[: self.helpers]}
+        self.cells = None if local.cutoff is None else Cells(local.dim, local.box is not None)
+
+    def numbers(self) -> np.ndarray:
+        """The numbers of all laws."""
+        return np.concatenate([law.numbers() for law in self.laws.values()])
+
+    # a stage ----------------------------------------------------------------------------------------------------------
+
+    def stage(self, context: Value, state: Value, kind: Value, numbers: Sequence[Value]) -> None:
+        """Kicks of the sums that a kind of kick has, and a drift."""
+        code = state.code
+        code.outlined("stage", (state, context, kind, *numbers), self._stage)
+
+    def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
+        """A kick, plain (1), with a force gradient (2) or with curvature terms too (3), or none (0); and a drift."""
+        code = state.code
+        a, b, *more = numbers
+        with code.given(kind > 0):
+            self._kick(context, state, "gradient", 0, -b, kind > 1, 1)
+        if self.level:
+            g = more[0]
+            with code.given(kind > 1):
+                self._kick(context, state, "hessian_vector", 1, g, kind > 2, 2)
+        if self.level == CURVATURE:
+            c = -more[1]
+            with code.given(kind > 2):
+                self._kick(context, state, "bend", 1, c)
+                self._kick(context, state, "hessian_vector", 2, c)
+        size, sites = field(context, "size"), place(context, "sites")
+        factors = more[-2:] if self.damped else [a]
+        factors = [code.splat(x, LANES) for x in factors]
+        with self._blocks(size) as i:
+            w = code.load(sites, i, _LANES)
+            for k in range(self.dim):
+                p = code.load(state, size * (self.dim + k) + i, _LANES)
+                self._add(state, size, k, i, factors[0], w * p)
+                if self.damped:
+                    code.store(p * factors[1], state, size * (self.dim + k) + i)
+
+    def _kick(
+        self,
+        context: Value,
+        state: Value,
+        kind: str,
+        along: int,
+        factor: Value,
+        kept: Value | None = None,
+        helper: int = 0,
+    ) -> None:
+        """A kick by a sum, which is kept as a velocity where a condition holds."""
+        code, dim = state.code, self.dim
+        size, work = field(context, "size"), place(context, "work")
+        code.outlined(f"sum_{kind}", (context, state, code.at(work, size * (dim * along))), self._sum(kind))
+        factor = code.splat(factor, LANES)
+        with self._blocks(size * dim) as i:
+            self._add(state, size, dim, i, factor, code.load(work, i, _LANES))
+        if kept is None or helper >= self.helpers:
+            return
+        sites = place(context, "sites")
+        with code.given(kept), self._blocks(size) as i:
+            w = code.load(sites, i, _LANES)
+            for k in range(dim):
+                code.store(w * code.load(work, size * k + i, _LANES), work, size * (dim * helper + k) + i)
+
+    def _add(self, state: Value, size: Value, row: int, i: Value, factor: Value, x: Value) -> None:
+        """Add a change, factor·x, to numbers of a row of a state."""
+        code = state.code
+        at = size * row + i
+        value = code.load(state, at, _LANES)
+        if not self.compensated:
+            code.store(code.fma(factor, x, value), state, at)
+            return
+        error = size * (2 * self.dim) + at
+        corrected = factor * x - code.load(state, error, _LANES)
+        total = value + corrected
+        code.store((total - value) - corrected, state, error)
+        code.store(total, state, at)
+
+    @contextmanager
+    def _blocks(self, size: Value) -> Iterator[Value]:
+        with size.code.over(size >> SHIFT) as k:
+            yield k << SHIFT
+
+    # a sum ------------------------------------------------------------------------------------------------------------
+
+    def _sum(self, kind: str) -> Callable[[Value, Value, Value], None]:
+        """The sum over all pairs, of this thread's chunks and, when all threads are here, of all chunks."""
+
+        def summed_up(context: Value, state: Value, along: Value) -> None:
+            code, dim = state.code, self.dim
+            n, size, chunks, member, members = (field(context, name) for name in FIELDS[:5])
+            rows = self._rows(kind, context, state, along)
+            turn = code.constant(1, INT) - field(context, "turn")
+            code.store(turn, context, FIELDS.index("turn"))
+            sums = code.at(place(context, "sums"), turn * (chunks * (size * dim)))
+            begin, end = (code.op("sdiv", INT, chunks * m, members) for m in (member, member + 1))
+            with code.over(end - begin) as k:
+                chunk = begin + k
+                F = code.at(sums, chunk * (size * dim))
+                with self._blocks(size * dim) as i:
+                    code.store(code.constant(0.0, _LANES), F, i)
+                self._chunk(kind, context, rows, F, chunk, chunks, n)
+            meet(field(context, "meeting"), members, field(context, "stop"))
+            work, order = place(context, "work"), place(context, "order")
+            to = work if self.cells is None else code.at(place(context, "sorted"), size * dim)
+            with self._blocks(size * dim) as i:
+                total = code.variable(code.load(sums, i, _LANES))
+                with code.over(chunks - 1) as k:
+                    total.value = total.value + code.load(sums, (k + 1) * (size * dim) + i, _LANES)
+                code.store(total.value, to, i)
+            if self.cells:
+                with code.over(n) as i:
+                    body = code.load(order, i, INT)
+                    for axis in range(dim):
+                        code.store(code.load(to, size * axis + i), work, size * axis + body)
+
+        return summed_up
+
+    def _rows(self, kind: str, context: Value, state: Value, along: Value) -> list[Value]:
+        """Rows of what a pair depends on: coordinates, velocities along which a sum is taken, columns.
+
+        With cells they are in the order of these: that of coordinates and columns is made with the first sum of a kick.
+        """
+        code, dim = state.code, self.dim
+        size, sites = field(context, "size"), place(context, "sites")
+        x, v, c = (
+            [code.at(first, size * (k + shift)) for k in range(count)]
+            for first, shift, count in (
+                (state, 0, dim),
+                (along, 0, 0 if kind == "gradient" else dim),
+                (sites, 1, self.columns),
+            )
+        )
+        if self.cells is None:
+            return [*x, *v, *c]
+        n, order, ready = field(context, "bodies"), place(context, "order"), place(context, "sorted")
+        to = [code.at(ready, size * k) for k in range(2 * dim + self.columns)]
+        moved = list(zip(v, to[dim:], strict=False))
+        if kind == "gradient":
+            law = self.laws[kind]
+            numbers = place(context, "numbers")
+            end, softening = code.load(numbers, 1), code.load(numbers)
+            cutoff = code.apply("sqrt", (end - softening,))
+            box = [code.load(numbers, 2 + k) for k in range(dim)] if law.periodic else []
+            self.cells.sort(state, n, size, field(context, "most_cells"), cutoff, box, order, place(context, "cells"))
+            moved = list(zip([*x, *c], [*to[:dim], *to[2 * dim :]], strict=True))
+        with code.over(n) as i:
+            at = code.load(order, i, INT)
+            for source, target in moved:
+                code.store(code.load(source, at), target, i)
+        return [*to[:dim], *to[dim:][: len(v)], *to[2 * dim :]]
+
+    def _chunk(
+        self, kind: str, context: Value, rows: Sequence[Value], F: Value, chunk: Value, chunks: Value, n: Value
+    ) -> None:
+        """The pairs of each body of a chunk: of one in so many."""
+        code, law, dim = F.code, self.laws[kind], self.dim
+        size, moved = field(context, "size"), len(rows) - self.columns
+        start = sum(self.laws[k].n_numbers for k in [*self.laws][: [*self.laws].index(kind)])
+        given = place(context, "numbers")
+        numbers = [code.splat(code.load(given, start + i), LANES) for i in range(law.n_numbers)]
+        lanes, zero = code.lane_numbers(LANES), code.constant(0.0, _LANES)
+        found, cell = code.memory(2 * MOST_RANGES, INT), code.variable(code.constant(0, INT))
+        cells = None if self.cells is None else place(context, "cells")
+        with code.over(code.op("sdiv", INT, n - chunk + (chunks - 1), chunks)) as turn:
+            i = chunk + turn * chunks
+            mine = [code.splat(code.load(row, i), LANES) for row in rows]
+            totals = [code.variable(zero) for _ in range(dim)]
+
+            def meets(first: Value, last: Value) -> None:
+                bounds = code.splat(first - 1, LANES), code.splat(last, LANES)
+
+                def block(k: Value, sums: Sequence[Value]) -> list[Value]:
+                    j = ((first >> SHIFT) + k) << SHIFT
+                    number = code.splat(j, LANES) + lanes
+                    other = [code.load(row, j, _LANES) for row in rows]
+                    pair = law.met(
+                        numbers,
+                        mine[:moved],
+                        other[:moved],
+                        [*mine[moved:], *other[moved:]],
+                        (bounds[0] < number) & (number < bounds[1]),
+                    )
+                    parts = law.parts(kind, pair)
+                    for axis in range(dim):
+                        at = size * axis + j
+                        code.store(summed(code.load(F, at, _LANES), parts, axis, -1.0), F, at)
+                    return [summed(total, parts, axis) for axis, total in enumerate(sums)]
+
+                count = ((last + (LANES - 1)) >> SHIFT) - (first >> SHIFT)
+                for variable, total in zip(totals, code.loop(count, [x.value for x in totals], block), strict=True):
+                    variable.value = total
+
+            if cells is None or self.cells is None:
+                meets(i + 1, n)
+            else:
+                with code.over(self.cells.ranges(code, i, n, cell, cells, found)) as k:
+                    meets(code.load(found, k * 2, INT), code.load(found, k * 2 + 1, INT))
+            for axis, variable in enumerate(totals):
+                at = size * axis + i
+                code.store(code.load(F, at) + code.total(variable.value), F, at)
+
+
+def pair_code(
+    local: LocalHamiltonian, damped: bool, level: int, compensated: bool, monomials: Monomials = ()
+) -> PairCode:
+    """The compiled functions of more bodies than a few; `damped` if there is friction −γp."""
+    assert isinstance(local, PairsHamiltonian)
+    return PairCode(local, level, compensated, damped)
+
+
+def _check_level(level: int) -> None:
+    if level == POLYNOMIAL:
+        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+
+
+class PairCode(Rollouts):
+    """The compiled functions of splitting schemes on bodies in pairs, of which only the potential is part of the code.
+
+    Parameters
+    ----------
+    local : PairsHamiltonian
+    level : int
+        See `Scheme`.
+    compensated : bool
+    damped : bool
+        True if there is friction −γp, whose numbers are the last two rows of a table.
+    """
+
+    lanes = 1
+    room = 0
+
+    def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
+        _check_level(level)
+        self._given = local, level, compensated, damped
+        self._local = local
+        self._stages = PairStages(local, level, compensated, damped)
+        self.memory = partial(BodiesInMemory, local.dim, 4 if compensated else 2)
+        self._numbers = self._stages.numbers()
+        n = local.n_bodies
+        self._sites = zeros((1 + len(local.columns)) * (-(-n // LANES) * LANES)).reshape(1 + len(local.columns), -1)
+        self._sites[0, :n], self._sites[1:, :n] = 1 / local.masses, local.columns
+        super().__init__(2 * local.ndof * (1 + compensated), 2 * local.ndof)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PairCode, self._given
+
+    @cached_property
+    def size(self) -> int:
+        return self._stages.helpers + 1 + 2 * self._stages.damped
+
+    def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
+        self._stages.stage(room.places, room.state, kind, [numbers(i) for i in range(self.size)])
+
+    def prepared(self, table: np.ndarray) -> Columns:
+        """The columns of a table, and which sums their kicks have."""
+        kinds = np.zeros(table.shape[1], dtype=np.int64)
+        for k in range(1, 1 + self._stages.helpers):
+            kinds[table[k] != 0] = k
+        return np.ascontiguousarray(table.T), kinds
+
+    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
+        """Call a compiled run or map; one state is shared by several threads where that pays."""
+        local, stages = self._local, self._stages
+        n, dim = local.n_bodies, local.dim
+        if name == "run":
+            n_rows, n_columns = arguments[5], arguments[2] * (arguments[7] - arguments[6])
+        else:
+            n_rows, n_columns = arguments[6], arguments[2]
+        stop = np.zeros(1, dtype=np.int64)
+        if name == "run" and arguments[-1] is not NEVER:
+            stop = arguments[-1]
+        elif name == "run":
+            arguments = *arguments[:-1], stop
+        size, chunks = self._sites.shape[1], CHUNKS if local.work >= WORTH_CHUNKS else 1
+        team = Team(threads_for(chunks, n_columns * local.work, None) if n_rows == 1 else 1)
+        sums, meeting = aligned(2 * chunks * dim * size), np.zeros(16, dtype=np.int64)
+        sets, sorts = 4 if stages.compensated else 2, stages.cells is not None
+        function = self.function(name, width)
+        shared = {"sites": self._sites, "numbers": self._numbers, "sums": sums, "meeting": meeting, "stop": stop}
+        sizes = {"bodies": n, "size": size, "chunks": chunks, "members": team.threads, "turn": 0}
+        sizes |= {"most_cells": most_along(n, dim), "block": max(1, min(BLOCK, MOMENT // local.work))}
+        given = [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
+
+        def member(k: int) -> None:
+            room, work = aligned(3 * sets * dim * size), zeros(stages.helpers * dim * size)
+            ready = zeros((2 * dim + stages.columns) * size * sorts)
+            order, cells = np.arange(n), np.zeros(most_cells(n, dim) * sorts, dtype=np.int64)
+            arrays = shared | {"work": work, "sorted": ready, "order": order, "cells": cells}
+            numbers = sizes | {"member": k} | {name: address(x) for name, x in arrays.items()}
+            context = np.array([numbers[name] for name in FIELDS], dtype=np.int64)
+            function(*given, sets * dim * size, 2 * dim * n, address(room), address(context))
+
+        team(member, stop)
+
+    def step_rows(
+        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
+        numbers = np.zeros((*table.shape[:2], len(h)))
+        for k in range(table.shape[2] - 1, -1, -1):
+            numbers = numbers * x + table[:, :, k, None]
+        powers = np.array([1, 1, 3, 5])[: len(table)]
+        tables = (numbers * h ** powers[:, None, None]).transpose(2, 0, 1)
+        for i, each in enumerate(tables):
+            self.mapped(each, y[i : i + 1], out[i : i + 1])
+
+
+# forces at many states ------------------------------------------------------------------------------------------------
+
+
+DIRECTIONS = 16
+"""Directions along which derivatives are taken together."""
+
+
+class PairForces:
+    """F = −∇V and G = ∇²V M⁻¹∇V of bodies at many states, and their derivatives, for the fits of tables.
+
+    States q are (d, P), directions (K, d, P), Jacobians (d, d, P), as in `sympflow.training.table_step`. States stand
+    side by side in registers.
+
+    Parameters
+    ----------
+    local : PairsHamiltonian
+    level : int
+        See `Scheme`; there are no curvature terms.
+    """
+
+    def __init__(self, local: PairsHamiltonian, level: int) -> None:
+        assert level < CURVATURE
+        self._given, self._has_gradient = (local, level), level >= FORCE_GRADIENT
+        self._law = PairLaw(local, (1, 2, 3))
+        self._numbers = self._law.numbers()
+        self._sites = np.concatenate([1 / local.masses[None], local.columns])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PairForces, self._given
+
+    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
+        """F and G."""
+        P, q = q.shape[1], _in_registers(q)
+        F, G = np.zeros_like(q), np.zeros_like(q)
+        self._forces(*self._given_arrays(q, F, G))
+        return (F[:, :P], G[:, :P])[: 1 + self._has_gradient]
+
+    def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """These, and their derivatives along directions."""
+        P, q, v = q.shape[1], _in_registers(q), _in_registers(v)
+        F, G, DF, DG = np.zeros_like(q), np.zeros_like(q), np.zeros_like(v), np.zeros_like(v)
+        self._forces(*self._given_arrays(q, F, G))
+        self._products(*self._given_arrays(q, F, v, DF, DG), len(v))
+        values, changes = ([x[..., :P] for x in pair][: 1 + self._has_gradient] for pair in ((F, G), (DF, DG)))
+        return values, changes
+
+    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """These, and their Jacobians."""
+        d, P = q.shape
+        values, changes = self.along(q, np.broadcast_to(np.eye(d)[..., None], (d, d, P)))
+        return values, [change.swapaxes(0, 1) for change in changes]
+
+    def _given_arrays(self, *arrays: np.ndarray) -> tuple[int, ...]:
+        return self._sites.shape[1], arrays[0].shape[1], *map(address, (self._sites, self._numbers, *arrays))
+
+    @cached_property
+    def _forces(self) -> Callable[..., None]:
+        """Of (n, P, sites, numbers, q, F, G): adds F and G at P states to zeros."""
+        code = Module(host().fused).function("forces", [INT, INT, *[POINTER] * 5])
+        *_, F, G = code.arguments
+        states = _States(self._law, code)
+        with states.groups():
+            for i, j, pair in states.pairs():
+                states.add(F, (i, j), self._law.parts("gradient", pair), -1.0)
+            if self._has_gradient:
+                for i, j, pair in states.pairs(F):
+                    states.add(G, (i, j), self._law.parts("hessian_vector", pair), 1.0)
+        return finished(code, [INT, INT, *[POINTER] * 5])
+
+    @cached_property
+    def _products(self) -> Callable[..., None]:
+        """Of (n, P, sites, numbers, q, F, v, DF, DG, K): adds the derivatives of F and G along K directions."""
+        types = [INT, INT, *[POINTER] * 7, INT]
+        code = Module(host().fused).function("products", types)
+        *_, F, v, DF, DG, K = code.arguments
+        law, states = self._law, _States(self._law, code)
+        with states.groups(), states.some(K) as (first, count):
+            for i, j, (d, a, g) in states.pairs(F):
+                da = dot(d, a)
+                with code.over(count) as k:
+                    m = first + k
+                    u = [x - y for x, y in zip(states.vector(v, i, m), states.vector(v, j, m), strict=True)]
+                    along, across = dot(d, u), dot(a, u)
+                    states.add(DF, (i, j), [(g[1] * along, d), (g[0], u)], -1.0, m)
+                    if self._has_gradient:
+                        straight = g[2] * da * along + g[1] * across
+                        states.add(DG, (i, j), [(straight, d), (g[1] * along, a), (g[1] * da, u)], 1.0, m)
+            if self._has_gradient:
+                for i, j, (d, _, g) in states.pairs():
+                    with code.over(count) as k:
+                        m = first + k
+                        u = states.between(DF, i, j, m)
+                        states.add(DG, (i, j), law.parts("hessian_vector", Pair(d, u, g)), 1.0, m)
+        return finished(code, types)
+
+
+class _States:
+    """The code of loops over states side by side, and over the pairs of each."""
+
+    def __init__(self, law: PairLaw, code: Code) -> None:
+        self._law, self._code, self._dim = law, code, law.dim
+        self._n, self._P, self._sites, numbers, self._q = code.arguments[:5]
+        self._numbers = [code.splat(code.load(numbers, i), LANES) for i in range(law.n_numbers)]
+
+    @contextmanager
+    def groups(self) -> Iterator[None]:
+        with self._code.over(self._P >> SHIFT) as k:
+            self._begin = k << SHIFT
+            yield
+
+    @contextmanager
+    def some(self, K: Value) -> Iterator[tuple[Value, Value]]:
+        """The first of some directions and their number, so few that what is made of them stays near."""
+        code = self._code
+        with code.over((K + (DIRECTIONS - 1)) >> 4) as b:
+            first = b << 4
+            yield first, code.apply("min", (K - first, code.constant(DIRECTIONS, INT)))
+
+    def pairs(self, F: Value | None = None) -> Iterator[tuple[Value, Value, Pair]]:
+        """Two bodies, of whom velocities are those of −M⁻¹F: the code written next is that of all pairs."""
+        code = self._code
+        with code.over(self._n) as i:
+            x, columns = self.vector(self._q, i), self._columns(i)
+            with code.over(self._n - 1 - i) as k:
+                j = i + 1 + k
+                pair = self._law.met(self._numbers, x, self.vector(self._q, j), [*columns, *self._columns(j)])
+                yield i, j, pair if F is None else pair._replace(u=self.between(F, i, j))
+
+    def between(self, F: Value, i: Value, j: Value, m: Value | None = None) -> list[Value]:
+        """The difference of the −M⁻¹F of two bodies."""
+        w_i, w_j = (self._site(0, body) for body in (i, j))
+        return [b * w_j - a * w_i for a, b in zip(self.vector(F, i, m), self.vector(F, j, m), strict=True)]
+
+    def vector(self, x: Value, i: Value, m: Value | None = None) -> list[Value]:
+        """The numbers of a body, of direction m where there are directions."""
+        return [self._code.load(x, self._place(i, k, m), _LANES) for k in range(self._dim)]
+
+    def add(
+        self, x: Value, ends: tuple[Value, Value], parts: Sequence[Any], sign: float, m: Value | None = None
+    ) -> None:
+        """Add the part of a pair to that of its first body, and take it from the second; with a sign of −1 reversed."""
+        for body, part in zip(ends, (sign, -sign), strict=True):
+            for axis, value in enumerate(self.vector(x, body, m)):
+                self._code.store(summed(value, parts, axis, part), x, self._place(body, axis, m))
+
+    def _place(self, i: Value, axis: int, m: Value | None) -> Value:
+        row = i * self._dim + axis
+        if m is not None:
+            row = row + m * (self._n * self._dim)
+        return row * self._P + self._begin
+
+    def _site(self, row: int, i: Value) -> Value:
+        return self._code.splat(self._code.load(self._sites, self._n * row + i), LANES)
+
+    def _columns(self, i: Value) -> list[Value]:
+        return [self._site(1 + k, i) for k in range(self._law.columns)]
+
+
+def _in_registers(x: np.ndarray) -> np.ndarray:
+    """Arrays (…, P) with the last column again where they do not fill registers."""
+    P = x.shape[-1]
+    full = np.empty((*x.shape[:-1], -(-P // LANES) * LANES))
+    full[..., :P], full[..., P:] = x, x[..., -1:]
+    return full

@@ -1,0 +1,119 @@
+"""Compiled passes over rows of states: tests if many lie in a box or an energy sublevel, products with a matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from sympflow.compiler.control import BOOL, INT, POINTER, Module, Value
+from sympflow.compiler.machine import address, host
+from sympflow.kernels.runs import Lanes, finished, groups
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.domain import Box, EnergySublevel
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.hamiltonian.system import HamiltonianSystem
+
+__all__ = ["all_within", "row_products"]
+
+LANES = 16
+MOST_OPERATIONS = 2000  # of an H that is written out
+
+_SUBLEVELS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., None] | None] = WeakKeyDictionary()
+
+
+def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: np.ndarray, slack: float) -> bool:
+    """True if every one of the states (..., 2d) is in the domain, as its `contains` with this slack tells.
+
+    A sublevel without an H is one of the system's. False says nothing where a sublevel has another H, or where the
+    system cannot be compiled.
+    """
+    from sympflow.hamiltonian.domain import Box
+
+    symbols, width = system.symbols, states.shape[-1]
+    within: Callable[..., None] | None = None
+    if isinstance(domain, Box):
+        (low, high), within = domain.bounds, _box_function(width)
+    else:
+        low, high = domain.limits(slack)
+        if symbols is not None and (domain.hamiltonian is None or domain.hamiltonian == system.hamiltonian):
+            if symbols not in _SUBLEVELS:
+                _SUBLEVELS[symbols] = _sublevel_function(symbols)
+            within = _SUBLEVELS[symbols]
+    if within is None or states.dtype != np.float64 or len(low) != width + 2 * (not isinstance(domain, Box)):
+        return False
+    rows, inside = np.ascontiguousarray(states), np.zeros(1, dtype=np.int64)
+    within(address(rows), rows.size // width, address(low), address(high), address(inside))
+    return bool(inside[0])
+
+
+@cache
+def _box_function(width: int) -> Callable[..., None]:
+    return _within_function(width, None)
+
+
+def _sublevel_function(symbols: SymbolicHamiltonian) -> Callable[..., None] | None:
+    """The test of an H; None if that cannot be recorded or is long."""
+    import sympy as sp
+
+    from sympflow.hamiltonian.recorded import can_be_recorded
+
+    if not can_be_recorded(symbols.H) or sp.count_ops(symbols.H) > MOST_OPERATIONS:
+        return None
+    return _within_function(2 * symbols.ndof, symbols)
+
+
+def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..., None]:
+    """Compile the test of rows of n numbers, and of H and, in a plane, |L|, of (rows, n_rows, low, high, inside)."""
+    types = [POINTER, INT, POINTER, POINTER, POINTER]
+    code = Module(host().fused).function("within", types)
+    rows, n_rows, low, high, result = code.arguments
+    lanes = Lanes(code, n, LANES)
+    inside = code.variable(code.constant(1, BOOL))
+    with code.over(groups(code, n_rows, LANES)) as group:
+        x = lanes.loaded(rows, group * LANES, n_rows)
+        least, most = ([code.load(bound, i) for i in range(n if symbols is None else n + 2)] for bound in (low, high))
+        outside = [~((a <= value) & (value <= b)) for a, value, b in zip(least, x, most, strict=False)]
+        if symbols is not None:
+            from sympflow.hamiltonian.recorded import evaluator
+
+            H = evaluator(dict(zip(symbols.q + symbols.p, x, strict=True)))(symbols.H)
+            outside.append(~((least[n] < H) & (most[n] > H)))
+        if symbols is not None and n == 4:
+            L = abs(x[0] * x[3] - x[1] * x[2])
+            outside.append(~((least[5] <= L) & (most[5] >= L)))
+        any_out = outside[0]
+        for each in outside[1:]:
+            any_out = any_out | each
+        inside.value = inside.value & ~code.any(any_out)
+    code.store(code.convert("zext", inside.value, "i64"), result)
+    return finished(code, types)
+
+
+def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A x of all vectors x (..., n), of which none depends on how many there are, as the products of a library do."""
+    rows, matrix = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(A)
+    out = np.empty_like(rows)
+    n = rows.shape[-1]
+    _products_function()(address(matrix), n, address(rows), rows.size // n, address(out))
+    return out
+
+
+@cache
+def _products_function() -> Callable[..., None]:
+    types = [POINTER, INT, POINTER, INT, POINTER]
+    code = Module(host().fused).function("products", types)
+    A, n, x, n_rows, out = code.arguments
+    with code.over(n_rows) as i, code.over(n) as j:
+        row, start = code.at(A, j * n), code.at(x, i * n)
+
+        def added(k: Value, total: list[Value], row: Value = row, start: Value = start) -> list[Value]:
+            return [total[0] + code.load(row, k) * code.load(start, k)]
+
+        (total,) = code.loop(n, [code.constant(0.0)], added)
+        code.store(total, out, i * n + j)
+    return finished(code, types)

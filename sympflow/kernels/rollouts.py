@@ -1,0 +1,312 @@
+"""Rollouts: the runs and maps of one stage as functions of arrays, each compiled when it is first called."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from sympflow.compiler.control import Value
+from sympflow.compiler.machine import address
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
+
+__all__ = ["Columns", "Rollouts", "aligned", "filled"]
+
+NONE = np.empty(0)
+LINE = 8  # numbers in a line of memory
+START = np.zeros(1, dtype=np.int64)
+AT_ONCE = 4096  # trajectories with tables of their own
+
+Columns = tuple[np.ndarray, np.ndarray]
+"""The numbers (m, size) of columns and their kinds (m,), as compiled code reads them: see `run_function`."""
+
+
+def aligned(n: int) -> np.ndarray:
+    """Numbers in memory, of any values, that begin with a line of it."""
+    memory = np.empty(n + LINE)
+    begin = -(address(memory) // 8) % LINE
+    return memory[begin : begin + n]
+
+
+def filled(x: np.ndarray, lanes: int, times: int = 1) -> np.ndarray:
+    """Columns (…, J N), of each of J times the last one again where there are fewer than lanes."""
+    n = x.shape[-1] // times
+    if n >= lanes:
+        return np.ascontiguousarray(x)
+    each = x.reshape(*x.shape[:-1], times, n)
+    more = np.repeat(each[..., -1:], lanes - n, axis=-1)
+    return np.concatenate([each, more], axis=-1).reshape(*x.shape[:-1], times * lanes)
+
+
+class Rollouts:
+    """The compiled functions of one stage. A method says what its stage is, and how its tables become columns.
+
+    Attributes
+    ----------
+    n_out : int
+        Numbers of a state.
+    n_values : int
+        Numbers that a stage changes: those of the state, and others behind them, which begin as 0.
+    lanes : int
+        Trajectories of a batch that run side by side: of two registers or four, so that one need not wait for the
+        other.
+    fewest : int
+        Trajectories that run in lanes rather than one after the other.
+    room : int, optional
+        Where states are in memory, how many numbers more stages need there; None where they are in registers.
+    memory : callable
+        How they are there: `sympflow.kernels.runs.Memory`, or such a class.
+    data : sequence of ndarray
+        Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
+    chunked : bool
+        True if many trajectories of a batch are in memory, and pass through registers in each stage.
+    timed : bool
+        True if stages depend on the step.
+    every : int, optional
+        Steps after which `look` changes the running state.
+    block : int
+        Steps between two looks for a state that is not finite, or a stop, where nothing is saved.
+    counted : bool
+        True if the last of `n_values` is a count, which is no part of the running state.
+    closing : bool
+        False if outputs are never closed, so that the code need not hold a stage for that.
+    """
+
+    lanes = 16
+    fewest = 2
+    room: int | None = None
+    data: Sequence[np.ndarray] = ()
+    memory: Callable[..., Memory] = Memory
+    every: int | None = None
+    timed = False
+    chunked = False
+    block = BLOCK
+    counted = False
+    closing = True
+
+    def __init__(self, n_values: int, n_out: int) -> None:
+        self.n_values, self.n_out = n_values, n_out
+        self._lock = threading.RLock()
+        self._functions: dict[Any, Callable[..., None]] = {}
+
+    def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+        """The values after one column: see `sympflow.kernels.runs.Stage`."""
+        raise NotImplementedError
+
+    def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
+        """One column of many states: see `sympflow.kernels.runs.Over`."""
+        each(lambda values: self.stage(values, numbers, kind, step))
+
+    def look(self, values: Any) -> Any:
+        """The running state changed, where there is `every`: see `sympflow.kernels.runs.run_function`."""
+        raise NotImplementedError
+
+    @cached_property
+    def size(self) -> int:
+        """Numbers of a column."""
+        raise NotImplementedError
+
+    def prepared(self, table: Any) -> Columns:
+        """The columns of a table."""
+        raise NotImplementedError
+
+    def own_columns(self, table: Any, values: np.ndarray, width: int) -> Columns:
+        """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
+        raise NotImplementedError
+
+    @property
+    def place(self) -> Callable[..., Memory] | None:
+        """What is made of states in memory; None where they are in registers."""
+        return None if self.room is None else self.memory
+
+    def function(self, name: str, width: int) -> Callable[..., None]:
+        """The compiled function of a name, see `made`."""
+        return self.kept((name, width), lambda: self.made(name, width))
+
+    def kept(self, key: Any, make: Callable[[], Callable[..., None]]) -> Callable[..., None]:
+        """The result of `make`, made once for each key."""
+        found = self._functions.get(key)
+        if found is None:
+            with self._lock:
+                found = self._functions.get(key)
+                if found is None:
+                    found = self._functions[key] = make()
+        return found
+
+    def made(self, name: str, width: int) -> Callable[..., None]:
+        """Compile the function of a name: "run", "run own" or "map"."""
+        memory = self.place
+        if name == "map":
+            return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
+        look, every = (None, self.block) if self.every is None else (self.look, self.every)
+        own, over = name == "run own", self.over if self.chunked else None
+        return run_function(
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over
+        )
+
+    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
+        """Call the compiled function of a name with arrays and integers."""
+        if self.room is not None:
+            work = aligned((3 * self.n_values + self.room) * width)
+            places = np.array([*map(address, self.data)], dtype=np.int64)
+            arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, places
+        self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
+
+    def rollout(
+        self,
+        table: Any,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+        closed: bool = True,
+    ) -> int:
+        """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``."""
+        finite = np.empty(1, dtype=np.int64)
+        self._run(table, y0[None], n_steps, save, out[None], finite, stop, first, running[None], closed, 1)
+        return int(finite[0])
+
+    def rollout_batch(
+        self,
+        table: Any,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        n_finite: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+        closed: bool = True,
+        counts: np.ndarray = NONE,
+    ) -> None:
+        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it.
+
+        The counts (N,) of stages that count go into `counts`.
+        """
+        rest = n_steps, save, stop, first, closed
+        if len(y0) == 1 or y0.shape[1] > self.n_out:
+            size = AT_ONCE if y0.shape[1] > self.n_out else 1
+            for k in range(0, len(y0), size):
+                rows = slice(k, k + size)
+                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], counts[rows], *rest)
+            return
+        self._some(table, y0, out, n_finite, running, counts, *rest)
+
+    def _some(
+        self,
+        table: Any,
+        y0: np.ndarray,
+        out: np.ndarray,
+        n_finite: np.ndarray,
+        running: np.ndarray,
+        counts: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        closed: bool,
+    ) -> None:
+        """One row, or rows side by side; those that end early once more, by themselves, to find that end."""
+        before = running.copy() if first > 0 else running
+        rest = stop, first
+        width = self.lanes if len(y0) >= self.fewest else 1
+        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width, counts)
+        for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
+            one = slice(i, i + 1)
+            if len(before):
+                running[i] = before[i]
+            found = out[one], n_finite[one]
+            self._run(table, y0[one], n_steps, save, *found, *rest, running[one], closed, 1, counts[one])
+
+    def _run(
+        self,
+        table: Any,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        out: np.ndarray,
+        n_finite: np.ndarray,
+        stop: np.ndarray,
+        first: int,
+        running: np.ndarray,
+        closed: bool,
+        width: int,
+        counts: np.ndarray = NONE,
+    ) -> None:
+        states = y0[:, : self.n_out]
+        if y0.shape[1] > self.n_out:
+            name, (entries, kinds) = "run own", self.own_columns(table, y0[:, self.n_out :], width)
+        else:
+            name, (entries, kinds) = "run", self.prepared(table)
+        begun = int(save.searchsorted(0, "right")) if len(save) and save[0] <= 0 else 0
+        if begun:
+            out[:, :begun] = states[:, None]
+        later, outputs = save[begun:], out[:, begun:]
+        apart = not outputs.flags.c_contiguous
+        if apart:
+            outputs = np.empty(outputs.shape)
+        start = np.ascontiguousarray(running if first > 0 else states)
+        if self.n_values > start.shape[1]:
+            start = np.concatenate([start, np.zeros((len(states), self.n_values - start.shape[1]))], axis=1)
+        keeps = running.shape[-1] > 0
+        left = np.empty((len(y0), self.n_values)) if keeps or self.counted else running
+        given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps, later, len(later)
+        self.call(name, width, *given, outputs, n_finite, left, int(keeps or self.counted), stop)
+        if apart:
+            out[:, begun:] = outputs
+        if self.counted:
+            counts[:], left = left[:, -1], left[:, :-1]
+        if keeps:
+            running[:] = left
+        if width == 1 and n_finite[0] < n_steps:
+            out[0, np.searchsorted(save, n_finite[0], side="right") :] = np.nan
+            if keeps:
+                running[0] = np.nan
+
+    def rollout_processed(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> int:
+        """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
+        n_steps, save, out, stop, first, running = rest
+        finite = np.empty(1, dtype=np.int64)
+        rows = n_steps, save, out[None], finite, stop, first, running[None]
+        self.rollout_processed_batch(before, run, after, y0[None], *rows)
+        return int(finite[0])
+
+    def rollout_processed_batch(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> None:
+        """The same of every row of `y0` (N, 2d)."""
+        n_steps, save, out, n_finite, stop, first, running = rest
+        start = y0
+        if first == 0:
+            start = np.empty_like(y0)
+            self.mapped(before, y0, start)
+        self.rollout_batch(run, start, n_steps, save, out, n_finite, stop, first, running, False)
+        self.mapped(after, out.reshape(-1, self.n_out), out.reshape(-1, self.n_out), save)
+        out[:, : np.searchsorted(save, 0, side="right")] = y0[:, None]
+        good = np.isfinite(out).all(-1)
+        for i in np.flatnonzero(~good.all(-1)):
+            row = int(np.argmin(good[i]))
+            if save[row] <= n_finite[i]:
+                out[i, row:], n_finite[i] = np.nan, save[row] - 1
+
+    def step_rows(
+        self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
+        raise NotImplementedError
+
+    def mapped(self, table: Any, y: np.ndarray, out: np.ndarray, steps: np.ndarray = START) -> None:
+        """All columns of a table, applied to rows `y` (N, 2d) after steps (n,), one row after the other and again.
+
+        `out` may be `y`.
+        """
+        if not len(y):
+            return
+        entries, kinds = self.prepared(table)
+        width = 1 if len(y) == 1 else self.lanes
+        self.call("map", width, entries, kinds, len(kinds), steps, len(steps), y, len(y), out)

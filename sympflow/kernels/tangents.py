@@ -1,0 +1,502 @@
+"""Compiled runs of splitting schemes with deviation vectors, moved by the exact linearisation of each kick and drift.
+
+The change of p by a kick and its derivative by q are one program, made once; then they serve all vectors: p' = p +
+k(q), w_p' = w_p + ∇k w_q, and likewise of a drift. Vectors are scaled by powers of two only, which rounds nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from sympflow.compiler.arrange import Arranged, Arrangement
+from sympflow.compiler.control import INT, Value
+from sympflow.compiler.functions import fma, times
+from sympflow.compiler.program import Program, derivatives, gradient, traced
+from sympflow.hamiltonian.monomials import Monomials
+from sympflow.hamiltonian.recorded import evaluator
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.protocol import Carry, run_states
+from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.splitting_loops import splitting_loops
+from sympflow.kernels.splittings import EARLY, Splitting, SplittingCode, shared
+from sympflow.kernels.stages import StageTable, run_table
+from sympflow.kernels.threads import given
+from sympflow.schemes import POLYNOMIAL, Scheme
+
+__all__ = ["TangentCode", "TangentKernel", "TangentRun", "step_tangents", "tangent_kernel"]
+
+EVERY = 256  # steps after which vectors are rescaled
+AT_ONCE = 1 << 20  # numbers of outputs
+LOOKS = 1 << 14  # at all orbits, before those that have ended are left out
+MOST_WRITTEN_OUT = 160  # products of all vectors in one stage; more are a loop over the vectors
+LOG_2 = float(np.log(2.0))
+
+
+class TangentRun(NamedTuple):
+    """Deviation vectors along N orbits.
+
+    Attributes
+    ----------
+    growth : ndarray of shape (N, k, n + 1)
+        Logarithms of the lengths of the vectors, 0 at the start, after the n counts of steps that were to be saved, and
+        at the end of the orbit. NaN where the orbit has ended before.
+    spread : ndarray of shape (N, n + 1)
+        Of the vectors, as the function that was given tells it.
+    n_steps : ndarray of int64 of shape (N,)
+        The steps of each orbit.
+    whole : ndarray of bool of shape (N,)
+        False where something was not finite any more; then `n_steps` is the last step after which all was.
+    """
+
+    growth: np.ndarray
+    spread: np.ndarray
+    n_steps: np.ndarray
+    whole: np.ndarray
+
+
+class Linearised:
+    """The stages of a splitting with their derivatives as programs, and what they do to a vector.
+
+    The outputs of a program are q' and p', then ∇k, row by row to the diagonal, the derivative of q' by the momenta
+    after the kick, and, with friction, that of p' by these.
+    """
+
+    def __init__(self, splitting: Splitting) -> None:
+        self.splitting, self.d = splitting, splitting.symbols.ndof
+
+    def arranged(self, terms: int, vectors: int) -> Arranged:
+        """The stage with a kick of so many terms; of some vectors, these moved in place of the derivatives."""
+        splitting, symbols, d = self.splitting, self.splitting.symbols, self.d
+        names = [f"{name}{i}" for i in range(1 + vectors) for name in ("q", "p")]
+        states = [(f"{name}_{i}", 0 if name[0] == "q" else EARLY) for name in names for i in range(d)]
+        made = Arrangement(states, splitting.numbers)
+        q, p = made.states[:d], made.states[d : 2 * d]
+        number = dict(zip(splitting.numbers, made.constants, strict=True))
+        values = [number[s.name] for s in symbols.parameters]
+        kicks = [number[name] for name in splitting.kick_numbers]
+        found = self._kick(terms)(*q, *kicks, *values)
+        momenta = [made.written(x + y) for x, y in zip(p, found[:d], strict=True)]
+        bends = [made.written(made.number(x)) for x in found[d:]]
+        after = [made.letter(x) for x in momenta]
+        ends: list[Any] = []
+        if splitting.friction is not None:
+            mean, decay = (self._friction(number, name) for name in ("mean", "decay"))
+            factors = self._mass_times(mean, values)
+            ends = [made.written(made.number(x)) for row in decay for x in row]
+            momenta = [made.written(made.number(_dot(row, after))) for row in decay]
+        elif symbols.inverse_mass is not None:
+            unit = [[number["a"] if i == j else 0.0 for j in range(d)] for i in range(d)]
+            factors = self._mass_times(unit, values)
+        else:
+            slopes = self._drift()(*after, *values)
+            moves = [number["a"] * x for x in slopes[:d]]
+            factors = [[number["a"] * x for x in slopes[d * (i + 1) :][:d]] for i in range(d)]
+        slants = [made.written(made.number(x)) for row in factors for x in row]
+        if symbols.inverse_mass is None:
+            positions = [made.written(x + y) for x, y in zip(q, moves, strict=True)]
+        else:
+            positions = self._drifted(made, q, slants, after)
+        if not vectors:
+            return made.finish([*positions, *momenta, *bends, *slants, *ends])
+        outputs = [*positions, *momenta]
+        for k in range(1, 1 + vectors):
+            x = made.states[2 * d * k : 2 * d * (k + 1)]
+            kicked = [
+                made.letter(made.written(y + _dot([made.letter(bends[_place(i, j)]) for j in range(d)], x[:d])))
+                for i, y in enumerate(x[d:])
+            ]
+            outputs += self._drifted(made, x[:d], slants, kicked)
+            if ends:
+                rows = [[made.letter(y) for y in ends[d * i : d * (i + 1)]] for i in range(d)]
+                kicked = [_dot(row, kicked) for row in rows]
+            outputs += [made.written(made.number(y)) for y in kicked]
+        return made.finish(outputs)
+
+    def _drifted(self, made: Arrangement, q: Sequence[Any], slants: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+        """q + ∇²T p, a number of the body for each."""
+        d, positions = self.d, [made.node(x) for x in q]
+        for i in range(d):
+            for j in range(d):
+                if not _is_zero(slants[d * i + j]):
+                    positions[i] = made.moved(positions[i], slants[d * i + j], made.written(p[j]))
+        return positions
+
+    def _kick(self, terms: int) -> Program:
+        """The change of p by a kick, and its derivatives by q, row by row to the diagonal."""
+        splitting, symbols, d = self.splitting, self.splitting.symbols, self.d
+        names = [*(s.name for s in symbols.q), *splitting.kick_numbers, *(s.name for s in symbols.parameters)]
+
+        def changes(*numbers: Any) -> list[Any]:
+            n = d + len(splitting.kick_numbers)
+            q, kicks, values = numbers[:d], numbers[d:n], numbers[n:]
+            known = evaluator(dict(zip((*symbols.q, *symbols.parameters), (*q, *values), strict=True)))
+            slope = gradient(known(symbols.V), q)
+            change = [-times(kicks[0], x) for x in slope]
+            if terms > 1:
+                hessian = derivatives(slope, q)
+                v = self._by_mass(slope, values)
+                product = [_dot(row, v) for row in hessian]
+                change = [x + kicks[1] * y for x, y in zip(change, product, strict=True)]
+            if terms > 2:
+                again = [_dot(row, self._by_mass(product, values)) for row in hessian]
+                bent = [_dot([_dot(row, v) for row in derivatives(rows, q)], v) for rows in hessian]
+                change = [x - kicks[2] * (y + 0.5 * z) for x, y, z in zip(change, again, bent, strict=True)]
+            if splitting.level == POLYNOMIAL:
+                for e, powers in zip(kicks[1:], splitting.monomials, strict=True):
+                    monomial = 1.0
+                    for x, n in zip(q, powers, strict=True):
+                        monomial = monomial * x**n
+                    change = [x - e * y for x, y in zip(change, gradient(monomial, q), strict=True)]
+            return [*change, *(x for i, y in enumerate(change) for x in gradient(y, q)[: i + 1])]
+
+        return traced(changes, *names)
+
+    def _drift(self) -> Program:
+        """∇T and ∇²T."""
+        symbols, d = self.splitting.symbols, self.d
+
+        def slopes(*numbers: Any) -> list[Any]:
+            p = numbers[:d]
+            known = evaluator(dict(zip((*symbols.p, *symbols.parameters), numbers, strict=True)))
+            slope = gradient(known(symbols.T), p)
+            return [*slope, *(x for row in derivatives(slope, p) for x in row)]
+
+        return traced(slopes, *(s.name for s in (*symbols.p, *symbols.parameters)))
+
+    def _by_mass(self, v: Sequence[Any], values: Sequence[Any]) -> list[Any]:
+        """M⁻¹v."""
+        M, known = self.splitting.symbols.inverse_mass, self._known(values)
+        assert M is not None
+        return [_dot([known(M[i, j]) for j in range(self.d)], v) for i in range(self.d)]
+
+    def _mass_times(self, A: Sequence[Sequence[Any]], values: Sequence[Any]) -> list[list[Any]]:
+        """M⁻¹A."""
+        columns = [self._by_mass(column, values) for column in zip(*A, strict=True)]
+        return [list(row) for row in zip(*columns, strict=True)]
+
+    def _known(self, values: Sequence[Any]) -> Any:
+        return evaluator(dict(zip(self.splitting.symbols.parameters, values, strict=True)))
+
+    def _friction(self, number: dict[str, Any], name: str) -> list[list[Any]]:
+        """One of the two linear maps of a drift with friction, as a matrix."""
+        d, found = self.d, [x for key, x in number.items() if key.startswith(f"{name}_")]
+        if self.splitting.friction == 2:
+            return [found[d * i : d * (i + 1)] for i in range(d)]
+        return [[found[i if self.splitting.friction else 0] if i == j else 0.0 for j in range(d)] for i in range(d)]
+
+    def moved(self, derivatives: Sequence[Any], q: Sequence[Value], p: Sequence[Value]) -> tuple[list[Any], list[Any]]:
+        """A vector (q, p) after a stage, of the derivatives that its program gives after the state."""
+        d = self.d
+        n = d * (d + 1) // 2
+        bend, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
+
+        p = [_summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
+        q = [_summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
+        return q, [_summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
+
+
+def _place(i: int, j: int) -> int:
+    """The place of an entry of a symmetric matrix, of which the rows are known to the diagonal."""
+    return max(i, j) * (max(i, j) + 1) // 2 + min(i, j)
+
+
+def _is_zero(x: Any) -> bool:
+    return isinstance(x, float) and x == 0.0
+
+
+def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
+    total: Any = 0.0
+    for a, b in zip(x, y, strict=True):
+        total = total + times(a, b)
+    return total
+
+
+def _summed(total: Any, factors: Sequence[Any], x: Sequence[Value]) -> Any:
+    """total + Σ factor·x."""
+    for factor, value in zip(factors, x, strict=True):
+        if not _is_zero(factor):
+            total = fma(factor, value, total)
+    return total
+
+
+class TangentCode(SplittingCode):
+    """The compiled functions of a splitting with k vectors: states are [q, p, w₁ …], then exponents of the vectors.
+
+    Parameters
+    ----------
+    splitting : Splitting
+    vectors : int
+        k.
+    grows : bool
+        True if vectors are rescaled, by powers of two, whose exponents are part of the state.
+    """
+
+    def __init__(self, splitting: Splitting, vectors: int, grows: bool) -> None:
+        super().__init__(splitting)
+        self.vectors, self._grows, self._linearised = vectors, grows, Linearised(splitting)
+        self._d = d = splitting.symbols.ndof
+        self.n_values = self.n_out = 2 * d * (1 + vectors) + (vectors if grows else 0)
+        products = d * d + (d if splitting.symbols.inverse_mass is not None else d * d)
+        self.room = 0 if vectors * products > MOST_WRITTEN_OUT else None
+        self.every = EVERY if grows else None
+        self.lanes, self.chunked = 16, False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return TangentCode, (self._splitting, self.vectors, self._grows)
+
+    @cached_property
+    def _kinds(self) -> list[Arranged]:
+        vectors = self.vectors if self.room is None else 0
+        return [self._linearised.arranged(terms, vectors) for terms in self._splitting.terms]
+
+    def stage(self, values: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
+        if not isinstance(values, Room):
+            return super().stage(values, numbers, kind, step)
+        for k in range(len(self._kinds)):
+            with values.code.given(values.code.apply("eq", (kind, k))):
+                self._executed(k, values, self._column(k, values.type, numbers, step))
+        return None
+
+    def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
+        d, body = self._d, self._kinds[k].body
+        if not isinstance(values, Room):
+            n = 2 * d * (1 + self.vectors)
+            return [*body(*values[:n], *column), *values[n:]]
+        room = values
+        found = body(*(room.load(i) for i in range(2 * d)), *column)
+        for m, x in enumerate(found[: 2 * d]):
+            room.store(x, m)
+        with room.code.over(self._count(room)) as i:
+            place = room.part((i + 1) * (2 * d))
+            w = [room.load(m, place) for m in range(2 * d)]
+            q, p = self._linearised.moved(found[2 * d :], w[:d], w[d:])
+            for m, x in enumerate([*q, *p]):
+                room.store(x, m, place)
+        return None
+
+    def _count(self, room: Room) -> Value:
+        each = 2 * self._d + self._grows
+        return room.code.op("sdiv", INT, room.size - 2 * self._d, room.code.constant(each, INT))
+
+    def look(self, values: Any) -> Any:
+        """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
+        d, k = self._d, self.vectors
+        if isinstance(values, Room):
+            return self._look_at(values)
+        state, exponents = values[:-k], []
+        for i in range(1, 1 + k):
+            w = slice(2 * d * i, 2 * d * (i + 1))
+            state[w], exponent = _rescaled(state[w], values[i - 1 - k])
+            exponents.append(exponent)
+        return [*state, *exponents]
+
+    def _look_at(self, room: Room) -> None:
+        width, count = 2 * self._d, self._count(room)
+        with room.code.over(count) as i:
+            place, last = room.part((i + 1) * width), (count + 1) * width + i
+            w, exponent = _rescaled([room.load(m, place) for m in range(width)], room.load(last))
+            for m, x in enumerate(w):
+                room.store(x, m, place)
+            room.store(exponent, last)
+
+
+def _rescaled(w: Sequence[Value], exponent: Value) -> tuple[list[Value], Value]:
+    """A vector divided by a power of two, and the sum of exponents."""
+    length = abs(w[0])
+    for x in w[1:]:
+        length = length + abs(x)
+    n = (length.bits >> 52) - 1023
+    factor = ((1023 - n) << 52).real
+    code = length.code
+    return [x * factor for x in w], exponent + code.convert("sitofp", n, "double")
+
+
+class TangentKernel:
+    """Compiled loops of one scheme on one system with k deviation vectors: see `tangent_kernel`."""
+
+    def __init__(self, system: HamiltonianSystem, scheme: Scheme, vectors: int) -> None:
+        self.vectors, self._width = vectors, 2 * system.ndof
+        self._loops, self._scheme = splitting_loops(system), scheme
+        self._code = tangent_code(system, scheme.level, scheme.monomials, vectors, True)
+
+    def run(
+        self,
+        h: float,
+        y0: np.ndarray,
+        w0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        spread: Callable[[np.ndarray], np.ndarray] | None = None,
+        limit: float = 0.0,
+        scale: np.ndarray | None = None,
+        threads: int | None = None,
+    ) -> TangentRun:
+        """`n_steps` steps of length h of every row of `y0`.
+
+        Parameters
+        ----------
+        h : float
+        y0 : ndarray of shape (N, 2d)
+        w0 : ndarray of shape (k, 2d)
+            The vectors at the start of each orbit.
+        n_steps : int
+        save : ndarray of int64, sorted, in 1 … n_steps
+            The steps after which growth and spread are kept.
+        spread : callable, optional
+            From vectors (M, 2d, k), multiplied by `scale`, to numbers (M,); NaN without.
+        limit : float
+            An orbit ends where the spread is below it, which is looked at after every 256 steps.
+        scale : ndarray of shape (2d,), optional
+            Lengths are those of scale·w; 1 by default.
+        threads : int, optional
+            The default is as many as pay.
+        """
+        N, k, n = len(y0), self.vectors, self._code.n_out
+        start = np.zeros((N, n))
+        start[:, : self._width], start[:, self._width : n - k] = y0, w0.reshape(-1)
+        looks = _looks(save, n_steps, limit)
+        some = min(64, max(4, LOOKS // N)) if limit > 0 else len(looks)
+        found = TangentRun(
+            np.full((N, k, len(save) + 1), np.nan),
+            np.full((N, len(save) + 1), np.nan),
+            np.full(N, n_steps),
+            np.ones(N, dtype=bool),
+        )
+        table = self._loops.rows(run_table(self._scheme, h), h)
+        size = max(64, AT_ONCE // (n * some))
+        for first in range(0, N, size):
+            rows, carry = np.arange(first, min(first + size, N)), Carry()
+            for i in range(0, len(looks), some):
+                piece = looks[i : i + some]
+                ended = self._followed(
+                    table, start[rows], piece, save, found, rows, carry, spread, limit, scale, threads
+                )
+                if ended.any():
+                    rows, carry.running, carry.spare = rows[~ended], carry.running[~ended], None
+                if not len(rows):
+                    break
+        return found
+
+    def _followed(
+        self,
+        table: np.ndarray,
+        start: np.ndarray,
+        looks: np.ndarray,
+        save: np.ndarray,
+        found: TangentRun,
+        rows: np.ndarray,
+        carry: Carry,
+        spread: Callable[[np.ndarray], np.ndarray] | None,
+        limit: float,
+        scale: np.ndarray | None,
+        threads: int | None,
+    ) -> np.ndarray:
+        """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
+        code, k = self._code, self.vectors
+
+        def rollout(_: slice, *rest: Any) -> None:
+            code.rollout_batch(table, *rest)
+
+        work = table.shape[1] * code.n_out / 2
+        run = run_states(rollout, start, int(looks[-1]), looks, threads, carry, code.n_values, work)
+        w = run.states[..., self._width : -k].reshape(*run.states.shape[:2], k, self._width)
+        w = w if scale is None else w * scale
+        with np.errstate(all="ignore"):
+            growth = LOG_2 * run.states[..., -k:] + 0.5 * np.log(np.einsum("nmki,nmki->nmk", w, w))
+            W = w.swapaxes(-1, -2).reshape(-1, self._width, k)
+            spreads = np.full(w.shape[:2], np.nan) if spread is None else spread(W).reshape(w.shape[:2])
+        known = looks <= run.n_finite[:, None]
+        below = known & (spreads < limit)
+        last = np.where(below.any(1), below.argmax(1), len(looks) - 1)
+        known &= np.arange(len(looks)) <= last[:, None]
+        first, end = np.searchsorted(save, [looks[0], looks[-1] + 1])
+        where, each = np.searchsorted(looks, save[first:end]), np.arange(len(rows))
+        if len(where):
+            columns = np.arange(first, end)
+            found.growth[rows[:, None], :, columns] = np.where(known[:, where, None], growth[:, where], np.nan)
+            found.spread[rows[:, None], columns] = np.where(known[:, where], spreads[:, where], np.nan)
+        failed = ~below.any(1) & (run.n_finite < looks[-1])
+        found.growth[rows, :, -1] = np.where(failed[:, None], np.nan, growth[each, last])
+        found.spread[rows, -1] = np.where(failed, np.nan, spreads[each, last])
+        found.n_steps[rows] = np.where(failed, run.n_finite, looks[last])
+        found.whole[rows] = ~failed
+        return failed | below.any(1)
+
+
+def _looks(save: np.ndarray, n_steps: int, limit: float) -> np.ndarray:
+    """The steps after which orbits are looked at: those to be saved, the last, and where there is a limit others."""
+    ends = save if len(save) and save[-1] == n_steps else np.append(save, n_steps)
+    if limit <= 0:
+        return ends
+    return np.concatenate([[*range(a + EVERY, b, EVERY), b] for a, b in pairwise([0, *ends.tolist()])])
+
+
+def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool) -> TangentCode:
+    """The compiled functions of splittings of a system with k vectors, made once.
+
+    Raises
+    ------
+    ValueError
+        If there are none, with the reason.
+    """
+    codes, key = _CODES.setdefault(system, {}), (level, monomials, vectors, grows)
+    if key not in codes:
+        codes[key] = _lacks(system)
+        if not codes[key]:
+            splitting = splitting_loops(system).splitting(level, monomials)
+            codes[key] = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
+    found = codes[key]
+    if isinstance(found, str):
+        raise ValueError(found)
+    return found
+
+
+def _lacks(system: HamiltonianSystem) -> str:
+    """The reason why a system has no compiled vectors, "" if it has."""
+    from sympflow.kernels.terms import is_large
+
+    if not system.autonomous:
+        return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
+    symbols = system.symbols
+    given = system.local is not None if symbols is None else not is_large(symbols)
+    if not given or not splitting_loops(system).traced:
+        return (
+            f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "
+            "few terms: use backend='auto'."
+        )
+    return ""
+
+
+def tangent_kernel(system: HamiltonianSystem, scheme: Scheme, vectors: int) -> TangentKernel:
+    """The compiled loops of a scheme with k deviation vectors; a ValueError says why there are none."""
+    return TangentKernel(system, scheme, vectors)
+
+
+def step_tangents(
+    system: HamiltonianSystem, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The steps from rows of `y` (N, 2d) and their Jacobians (N, 2d, 2d), as `SplittingLoops.step_rows` makes them.
+
+    None where they are not compiled.
+    """
+    if system.friction is not None:
+        return None
+    n = y.shape[1]
+    try:
+        code = tangent_code(system, table.level, monomials, n, False)
+    except ValueError:
+        return None
+    rows = np.empty((len(y), n * (1 + n)))
+    rows[:, :n], rows[:, n:] = y, np.eye(n).reshape(-1)
+    out = np.empty_like(rows)
+    code.step_rows(splitting_loops(system).rows(table), given(x), given(h), given(h), rows, out)
+    return out[:, :n], out[:, n:].reshape(-1, n, n).swapaxes(1, 2)
+
+
+_CODES: WeakKeyDictionary[HamiltonianSystem, dict[Any, TangentCode | str]] = WeakKeyDictionary()

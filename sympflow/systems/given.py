@@ -1,0 +1,59 @@
+"""The system that an argument means: one, the name of a scene, or H as a formula."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import sys
+from typing import Any
+
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
+
+
+def given_system(system: Any) -> HamiltonianSystem:
+    """Return the system that an argument `system` means.
+
+    Parameters
+    ----------
+    system : HamiltonianSystem, str or sympy.Expr
+        A system; the name of a scene, such as "henon-heiles"; or H, as `HamiltonianSystem.from_sympy` takes it.
+
+    Raises
+    ------
+    ValueError
+        If there is no such scene, or the formula cannot be read.
+    TypeError
+        If it is anything else: the message says how a system is made of it.
+    """
+    if isinstance(system, HamiltonianSystem):
+        return system
+    if isinstance(system, str):
+        from sympflow.systems import available, get
+
+        if NAME.fullmatch(system) and system not in ("q", "p", "q1", "p1"):
+            key = system.replace("_", "-").lower()
+            if key in available():
+                return get(key)()
+            close = difflib.get_close_matches(key, available(), n=1, cutoff=0.5)
+            hint = f"Did you mean {close[0]!r}? " if close else ""
+            raise ValueError(
+                f"`system` {system!r} is the name of no scene. {hint}There are {', '.join(available())}; a formula "
+                "such as 'p**2/2 + q**2/2' is a system too."
+            )
+        return HamiltonianSystem.from_sympy(system)
+    sympy = sys.modules.get("sympy")
+    if sympy is not None and isinstance(system, sympy.Basic | sympy.MatrixBase):
+        return HamiltonianSystem.from_sympy(system)
+    what, remedy = type(system).__name__, "take a scene of sympflow.systems, or H as text, 'p**2/2 + q**2/2'"
+    if callable(system):
+        of_scene = getattr(system, "__module__", "").startswith("sympflow.systems")
+        what = f"the function {getattr(system, '__name__', what)!r}"
+        remedy = (
+            f"call it, {system.__name__}()"
+            if of_scene
+            else "make a system of it by HamiltonianSystem(hamiltonian=f, ndof=d), f(q, p), or "
+            "HamiltonianSystem(potential=V, ndof=d) for H = ½|p|² + V(q)"
+        )
+    raise TypeError(f"`system` must be a HamiltonianSystem; got {what}: {remedy}.")

@@ -1,0 +1,130 @@
+"""solve() chooses a method where none is given, and a step for a tolerance."""
+
+import numpy as np
+import pytest
+
+import sympflow
+from sympflow import HamiltonianSystem, choose_step, solve, systems
+
+text = HamiltonianSystem.from_sympy
+KEPLER = "p1**2/2 + p2**2/2 - 1.1/sqrt(q1**2 + q2**2)"
+
+CHOSEN = {
+    "a flow that ships": (systems.henon_heiles, None, {}, "sympflow"),
+    "outside of its domain": (systems.henon_heiles, [0, 0.9, 0.4, 0], {}, "srkn11b"),
+    "a step is given": (systems.henon_heiles, None, {"dt": 0.1}, "srkn11b"),
+    "no flow has this tolerance": (systems.henon_heiles, None, {"tol": 1e-13}, "srkn11b"),
+    "½ pᵀM⁻¹p": (lambda: text("p**2/2 + q**4/4"), [1, 0], {}, "srkn11b"),
+    "separable": (lambda: text("sqrt(1 + p**2) + q**4/4"), [1, 0], {}, "kahan_li8"),
+    "not separable": (lambda: text("(1 + p**2)*(1 + q**2)/2"), [1, 0], {}, "gauss_legendre6"),
+    "attraction at 0": (lambda: text(KEPLER), [1, 0, 0, 0.8], {}, "log_kahan_li8"),
+    "repulsion at 0": (lambda: text("p**2/2 + 1/q**2 + q**2"), [1, 0], {}, "srkn11b"),
+    "events": (lambda: text(KEPLER), [1, 0, 0, 0.8], {"events": lambda t, y: y[0]}, "srkn11b"),
+    "tolerances": (lambda: text("p**2/2 + q**4/4"), [1, 0], {"rtol": 1e-8}, "dop853"),
+    "friction": (lambda: text("p**2/2 + q**2/2", damping=0.1), [1, 0], {}, "srkn11b"),
+    "parameters": (lambda: text("p**2/2 + k*q**2/2", params={"k": 1.0}), [1, 0], {"params": {"k": [1, 2]}}, "srkn11b"),
+}
+
+
+@pytest.mark.parametrize(("make", "y0", "options", "name"), CHOSEN.values(), ids=CHOSEN)
+def test_the_method_suits_the_system(make, y0, options, name):
+    sol = solve(make(), t_span=(0, 5), y0=y0, **options)
+    assert sol.success
+    assert sol.integrator.name == name
+    assert sol.stats["chosen"].startswith(f"{name}: ")
+    assert f"Method {name!r} was chosen" in sol.message
+
+
+def test_an_option_that_no_method_takes_is_refused():
+    with pytest.raises(TypeError, match=r"^`tolerance` is not an option"):
+        solve(text("p**2/2 + q**4/4"), t_span=(0, 1), y0=[1, 0], tolerance=1)
+
+
+METHODS = "verlet", "srkn11b", "kahan_li8", "omelyan4", "gauss_legendre6", "implicit_midpoint"
+
+
+@pytest.mark.parametrize("tol", [1e-4, 1e-8])
+@pytest.mark.parametrize("method", METHODS)
+def test_the_step_meets_the_tolerance(method, tol):
+    """Of a run over the whole interval, and not by far: a step 4 times longer does not, or is the whole interval."""
+    system, span = systems.henon_heiles(), (0, 40)
+    sol = solve(system, method, span, tol=tol)
+    assert sympflow.max_energy_error(sol) <= tol
+    assert sol.stats["energy_error"] == sympflow.max_energy_error(sol)
+    longer = solve(system, method, span, dt=4 * sol.stats["dt"], diagnose=False)
+    assert not sympflow.max_energy_error(longer) <= tol
+
+
+@pytest.mark.parametrize(
+    "system",
+    [text("p**2/2 + q**2/2 - q*cos(2*t)/9", time="t", y0=[1, 0]), text("p**2/2 + q**4/4", damping=0.1, y0=[1, 0])],
+    ids=["driven", "damped"],
+)
+def test_where_energy_is_not_conserved_it_is_compared_with_a_finer_run(system):
+    dt = choose_step(system, "kahan_li6", 1e-7, t_span=(0, 20))
+    coarse, fine = (solve(system, "kahan_li6", (0, 20), dt=h, t_eval=np.linspace(0, 20, 9)) for h in (dt, dt / 8))
+    scale = abs(float(system.hamiltonian(system.y0, 0.0)))
+    assert 1e-10 < np.abs(coarse.energy() - fine.energy()).max() / scale <= 1e-7
+
+
+def test_the_error_of_states_can_be_asked_for():
+    system = systems.henon_heiles()
+    dt = choose_step(system, "srkn11b", 1e-8, t_span=(0, 40), tol_of="state")
+    sol = solve(system, "srkn11b", (0, 40), dt=dt)
+    assert sympflow.reference_error(sol).max() <= 1e-8
+    assert dt < choose_step(system, "srkn11b", 1e-8, t_span=(0, 40))
+
+
+@pytest.mark.parametrize("unit", [1e-20, 1e12])
+def test_steps_scale_with_the_unit_of_time(unit):
+    """H = ½ p² + ½ (q/T)²: with times in units of T the steps are the same."""
+    steps = []
+    for T in (1.0, unit):
+        system = text("p**2/2 + q**2/(2*T**2)", params={"T": T}, y0=[1, 0.5 / T], t_span=(0, 100 * T))
+        steps.append([system.dt / T, choose_step(system, "kahan_li8", 1e-9) / T])
+    np.testing.assert_allclose(steps[1], steps[0], rtol=1e-2)
+
+
+DEFAULT_STEPS = {
+    "ω = 1": ("p**2/2 + q**2/2", [1, 0], 0.05),
+    "ω = 10": ("p**2/2 + 50*q**2", [1, 0], 0.005),
+    "the largest of two": ("(p1**2 + p2**2 + q1**2 + 25*q2**2)/2", [1, 0, 0, 0], 0.01),
+    "a free particle": ("p**2/2", [1, 0], 0.05),
+    "unstable": ("p**2/2 - 50*q**2", [1, 0], 0.005),
+}
+
+
+@pytest.mark.parametrize(("H", "y0", "dt"), DEFAULT_STEPS.values(), ids=DEFAULT_STEPS)
+def test_the_default_step_is_a_twentieth_of_a_radian(H, y0, dt):
+    assert text(H, y0=y0).dt == dt
+    assert text(H, y0=y0, dt=0.3).dt == 0.3
+    assert solve(text(H), "verlet", (0, 1), y0).stats["dt"] == dt
+
+
+REFUSED = {
+    "no tolerance": (
+        "verlet",
+        {"tol": 0.0},
+        ValueError,
+        r"^`tol` must be a positive number below 1, .*; got 0\.0",
+    ),
+    "of what": ("verlet", {"tol": 1e-6, "tol_of": "q"}, ValueError, r"^`tol_of` must be 'energy' or 'state'; got 'q'"),
+    "adaptive": ("rk45", {"tol": 1e-6}, TypeError, r"^`tol` .* 'rk45' has none: .*`rtol` and `atol`"),
+    "step too": ("verlet", {"tol": 1e-6, "dt": 0.1}, ValueError, r"^`tol` chooses the step, but `dt` is given, 0\.1"),
+    "below rounding": ("srkn11b", {"tol": 1e-18}, ValueError, r"^`tol` 1e-18 is not met .* rounding"),
+}
+
+
+@pytest.mark.parametrize(("method", "options", "kind", "message"), REFUSED.values(), ids=REFUSED)
+def test_refusals(method, options, kind, message):
+    with pytest.raises(kind, match=message):
+        solve(systems.henon_heiles(), method, (0, 10), **options)
+
+
+def test_a_missed_tolerance_is_told(monkeypatch):
+    """Of an orbit from its apocentre, of which trial runs are cut before the pericentre."""
+    monkeypatch.setattr("sympflow.integrators.choosing.TRIAL_STEPS", 8)
+    monkeypatch.setattr("sympflow.integrators.choosing.TRIAL_LENGTH", 1)
+    with pytest.warns(RuntimeWarning, match="more than `tol` 1e-06: pass a smaller one"):
+        sol = solve(text(KEPLER, y0=[1, 0, 0, 0.4]), "verlet", (0, 20), tol=1e-6)
+    assert "more than `tol`" in sol.message

@@ -1,0 +1,72 @@
+"""Compiled explicit Runge–Kutta steps and vector fields: those of arrays, to rounding, for H of every kind."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+from sympflow import HamiltonianSystem, doubled, solve, systems
+from sympflow.integrators.tableaux import FIXED
+from sympflow.kernels.explicit_loops import compiled_field, explicit_kernel
+from sympflow.kernels.protocol import Carry
+
+made, EPS = HamiltonianSystem.from_sympy, np.finfo(float).eps
+T, CHAIN = np.linspace(0, 9, 30), range(1, 20)
+TURNING = "(p1**2 + p2**2)*(1 + q1**2 + q2**2)/2 + k*(q1**2 + q2**2)**2/4"
+BONDS = "+".join(["p20**2/2", *(f"p{i}**2/2 + (q{i + 1} - q{i})**2/2 + 0.{i}*(q{i + 1} - q{i})**4" for i in CHAIN)])
+DRIVEN = made(
+    "p**2/2 + q**4/4 - a*q*cos(w*t) + p*q*sin(t)", params={"a": 0.3, "w": 1.3}, time="t", y0=[0.3, 0.1], dt=0.02
+)
+SYSTEMS = {
+    "separable": systems.henon_heiles(),
+    "not separable": made(TURNING, params={"k": 0.7}, y0=[0.6, 0.1, -0.2, 0.5], dt=0.02),
+    "driven": DRIVEN,
+    "sampled": made("p**2/2 + q**4/4 - q*b", params={"b": CubicSpline(T, np.sin(T))}, time="t", y0=[0.3, 0.1], dt=0.02),
+    "damped": made(TURNING, params={"k": 0.7}, y0=[0.6, 0.1, -0.2, 0.5], dt=0.02, damping=[[0.3, 0.1], [0.1, 0.2]]),
+    "forced": doubled(DRIVEN, "-0.1*p*abs(p) + cos(2*t)").physical,
+    "many terms": made(f"{BONDS} + cos(q1)", y0=np.linspace(-0.3, 0.3, 40), dt=0.02),
+    "many, driven and damped": made(
+        f"{BONDS} - q1*cos(1.3*t)", time="t", y0=np.linspace(-0.3, 0.3, 40), dt=0.02, damping=np.linspace(0, 0.2, 20)
+    ),
+}
+
+
+@pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
+def test_the_compiled_field_is_the_vector_field(system):
+    field, rng = compiled_field(system), np.random.default_rng(0)
+    for t in (0.0, 0.7, 5.3):
+        y = rng.normal(0, 0.5, 2 * system.ndof)
+        expected = system.vector_field(y, t)
+        np.testing.assert_allclose(field(t, y), expected, rtol=0, atol=50 * EPS * (1 + np.abs(expected).max()))
+
+
+@pytest.mark.parametrize(
+    ("name", "method"), [*((name, "rk4") for name in SYSTEMS), *(("driven", m) for m in FIXED if m != "rk4")]
+)
+def test_compiled_steps_are_those_of_arrays(name, method):
+    system, rng = SYSTEMS[name], np.random.default_rng(0)
+    y0 = system.y0 * (1 + 0.1 * rng.random((3, 2 * system.ndof)))
+    runs = [solve(system, method, (0, 2), y0=y0, t_eval=[0, 1.23, 2], backend=b) for b in ("compiled", "array")]
+    assert [run.stats["backend"] for run in runs] == ["compiled", "torchdiffeq"]
+    assert runs[0].stats["force_evaluations"] == runs[1].stats["force_evaluations"]
+    np.testing.assert_allclose(runs[0].y, runs[1].y, rtol=0, atol=100 * 20 * EPS)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_rows_pieces_and_single_steps_give_the_same_bits(name):
+    system, rng, save = SYSTEMS[name], np.random.default_rng(0), np.array([0, 1, 7, 30])
+    kernel, t = explicit_kernel(system, FIXED["rk4"]), {} if system.autonomous else {"t0": 0.5}
+    y0 = system.y0 * (1 + 0.1 * rng.random((11, 2 * system.ndof)))
+    batch, carry = kernel.run_batch(0.02, y0, 30, save, **t).states, Carry()
+    assert np.array_equal(batch, [kernel.run(0.02, y, 30, save, **t).states for y in y0])
+    pieces = [kernel.run_batch(0.02, y0, n, s, carry=carry, **t).states for n, s in ((7, save[:3]), (30, save[3:]))]
+    assert np.array_equal(batch, np.concatenate(pieces, axis=1))
+    times = (np.full(11, 0.5),) if t else ()
+    assert np.array_equal(kernel.step(np.full(11, 0.02), y0, *times).states, batch[:, 1])
+
+
+def test_a_run_that_ends_keeps_its_finite_states():
+    system = made("p**2/2 - q**4", y0=[1.0, 1.0], dt=0.01)
+    runs = [solve(system, "rk4", (0, 5), backend=b) for b in ("compiled", "array")]
+    assert [run.status for run in runs] == [-1, -1]
+    assert len(runs[0].t) == len(runs[1].t)
+    assert np.isfinite(runs[0].y).all()

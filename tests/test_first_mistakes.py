@@ -1,0 +1,99 @@
+"""Natural first calls: what is meant is done, or the error names the remedy."""
+
+import numpy as np
+import pytest
+import sympy as sp
+from sympy.physics.mechanics import dynamicsymbols
+
+import sympflow
+from sympflow import HamiltonianSystem, solve, systems
+
+H = HamiltonianSystem.from_sympy
+SPRING = "p**2/2 + q**2/2"
+x, y, px, py, k = sp.symbols("x y px py k")
+
+
+@pytest.mark.parametrize("system", ["harmonic-oscillator", "harmonic_oscillator", SPRING, sp.sympify(SPRING)])
+def test_a_name_and_a_formula_are_systems(system):
+    sol = solve(system, "verlet", (0, 1), [1, 0], dt=0.1)
+    np.testing.assert_array_equal(sol.y, solve(H(SPRING), "verlet", (0, 1), [1, 0], dt=0.1).y)
+
+
+SAME = {
+    "RK45": "rk45",
+    "Verlet": "verlet",
+    "DOP853": "dop853",
+    "Gauss-Legendre6": "gauss_legendre6",
+    "velocity_verlet": "verlet",
+    "stormer_verlet": "verlet",
+    "forest_ruth": "yoshida4",
+}
+
+
+@pytest.mark.parametrize(("word", "name"), SAME.items())
+def test_other_spellings_of_methods(word, name):
+    assert sympflow.get(word) is sympflow.get(name)
+
+
+NAMED = {
+    "x and px": (px**2 / 2 + x**2 / 2 + y**4 + py**2, [x, y], [px, py]),
+    "a text": ("px**2/2 + x**2/2 + y**4 + py**2", ["x", "y"], ["px", "py"]),
+    "from 0": ("p0**2/2 + q0**2/2 + q1**4 + p1**2", ["q0", "q1"], ["p0", "p1"]),
+}
+
+
+@pytest.mark.parametrize(("expression", "q", "p"), NAMED.values(), ids=NAMED)
+def test_coordinates_have_any_names(expression, q, p):
+    assert H(expression, q=q, p=p).expression == H("p1**2/2 + q1**2/2 + q2**4 + p2**2").expression
+
+
+def test_functions_of_the_time_are_coordinates():
+    r, pr = dynamicsymbols("r p_r")
+    assert H(pr**2 / 2 + k / r, q=[r], p=[pr], params={k: 2}).expression == H("p**2/2 + 2/q").expression
+
+
+ANSWERED = {
+    "lambda": (lambda: solve(lambda q, p: p**2), TypeError, r"`system` .* HamiltonianSystem\(hamiltonian=f, ndof=d\)"),
+    "factory": (lambda: solve(systems.pendulum), TypeError, r"`system` .* call it, pendulum\(\)"),
+    "no such scene": (lambda: solve("henon"), ValueError, "`system` 'henon' .*Did you mean 'henon-heiles'"),
+    "x, v": (lambda: H("v**2/2 + x**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
+    "x, px": (lambda: H("px**2/2 + x**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
+    "P, Q": (lambda: H("P**2/2 + Q**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
+    "q_1": (lambda: H("p_1**2/2 + q_1**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
+    "q0": (lambda: H("p0**2/2 + q0**2/2"), ValueError, "q1 … qd and p1 … pd: other names .* q="),
+    "uneven names": (
+        lambda: H("p**2/2", q=["q"], p=["p", "r"]),
+        ValueError,
+        "`q` and `p` must name d",
+    ),
+    "yoshida": (lambda: sympflow.get("yoshida"), ValueError, "'yoshida4' or 'yoshida6'"),
+    "ruth3": (lambda: sympflow.get("ruth3"), ValueError, "'yoshida4'"),
+    "whfast": (lambda: sympflow.get("whfast"), ValueError, "'log_kahan_li8'"),
+    "Radau": (lambda: sympflow.get("Radau"), ValueError, "'gauss_legendre6', which is implicit"),
+    "LSODA": (lambda: sympflow.get("LSODA"), ValueError, "'gauss_legendre6', which is implicit"),
+    "kinds": (lambda: sympflow.get("nothing"), ValueError, r"(?s)unknown.*separable H +'verlet'.*Runge–Kutta .*'rk45'"),
+    "args": (lambda: solve(H(SPRING), "verlet", y0=[1, 0], args=(1,)), TypeError, "`args` .* `params`"),
+    "q0=": (lambda: solve(H(SPRING), "verlet", q0=[1], p0=[0], y0=[1, 0]), TypeError, r"`q0` .*`y0`, \[q, p\]"),
+    "rtol": (
+        lambda: solve(H(SPRING), "verlet", y0=[1, 0], rtol=1e-9),
+        TypeError,
+        "`rtol` .*fixed steps: give",
+    ),
+    "tol": (lambda: solve(H(SPRING), "rk45", y0=[1, 0], tol=1e-9), TypeError, "`tol` .*`rtol` and `atol`"),
+    "keyword": (lambda: H("p**2/2 + lambda*q"), ValueError, "lambda is a word of Python"),
+    "2q": (lambda: H("p**2/2 + 2q"), ValueError, r"2q lacks a sign: write 2\*q"),
+    "²": (lambda: H("p²/2"), ValueError, r"² is not understood: write q\*\*2"),
+    "&": (lambda: H("p**2/2 + Piecewise((q, (q > 0) & (q < 1)), (0, True))"), ValueError, "single comparison: order"),
+    "text as potential": (lambda: HamiltonianSystem(SPRING), TypeError, "`potential` .*from_sympy"),
+    "scene": (lambda: systems.henon, AttributeError, "Did you mean 'henon_heiles'"),
+}
+
+
+@pytest.mark.parametrize(("call", "kind", "answer"), ANSWERED.values(), ids=ANSWERED)
+def test_the_answer_names_the_remedy(call, kind, answer):
+    with pytest.raises(kind, match=answer):
+        call()
+
+
+def test_rooms_are_attributes():
+    assert sympflow.metrics.__name__ == "sympflow.metrics"
