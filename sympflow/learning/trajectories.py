@@ -190,7 +190,7 @@ class Trajectories:
             if velocity_mass is not None:
                 y = np.concatenate([y[: width // 2], _momenta(velocity_mass, y[width // 2 :])])
             runs.append(Run(np.ascontiguousarray(t) * of_time, np.ascontiguousarray(y)))
-        for i, name in enumerate(names[: width // 2] if observed == "q" else names):
+        for i, name in enumerate(names if observed == "qp" else names[: width // 2]):
             if all(np.isnan(one.y[i]).all() for one in runs):
                 raise ValueError(
                     f"`data` has no value of {name} in any trajectory: drop the degree of freedom, or add it."
