@@ -147,7 +147,7 @@ else:
     shape = (round(size ** (1 / int(kind))),) * int(kind)
     system = sympflow.HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=shape)
 y0 = np.random.default_rng(0).uniform(-0.1, 0.1, 2 * system.ndof)
-import sympflow.solver, sympflow.integrators.splitting, sympflow.kernels.lattice_loops, sympflow.kernels.splitting_loops
+import sympflow.solver, sympflow.integrators.splitting, sympflow.kernels.lattices, sympflow.kernels.splitting_loops
 start = time.process_time()
 sympflow.solve(system, method, t_span=(0.0, 0.01), y0=y0, dt=0.01, t_eval=[0.01], backend="compiled")
 print(time.process_time() - start)

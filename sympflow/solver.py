@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.storage.runs import RunStore
 
-BACKENDS = ("auto", "compiled", "array", "cuda")
+BACKENDS = ("auto", "compiled", "array")
 MAX_EVENT_SAMPLES = 100_000_000
 MOST_DIAGNOSED = 16  # sets of values of parameters
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
@@ -129,11 +129,9 @@ def solve(
         Longest time between two samples of the event functions; two zeros of one between two samples are missed. It
         never changes the run: longer steps are sampled within, by the dense output, as `max_step` does inside
         `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and every step for adaptive methods.
-    backend : "auto", "compiled", "array" or "cuda"
-        "auto" runs splitting methods on symbolic systems (and on Numba functions) and float64 NumPy states compiled,
-        everything else with array operations. "cuda" runs a batch on an NVIDIA GPU, a thread for each trajectory: for
-        schemes on the splitting "kinetic" of autonomous symbolic systems without friction; results agree with compiled
-        ones to rounding. It has been run in Numba's simulator only. What ran is in `stats["backend"]`.
+    backend : "auto", "compiled" or "array"
+        "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states, everything
+        else with array operations; tensors on a GPU too. What ran is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
@@ -280,11 +278,8 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
 def check_backend(backend: Any, integrator: Integrator) -> None:
     """Raise ValueError if it is none, or none of the method."""
     if not isinstance(backend, str) or backend not in BACKENDS:
-        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
-    if backend == "cuda" and not integrator.runs_on_cuda:
         raise ValueError(
-            f"`backend` 'cuda' is for splitting methods on the splitting 'kinetic' and the clock 'physical'; "
-            f"{integrator.label!r} is none: use backend='auto'."
+            f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}: for a GPU pass tensors on it."
         )
     if backend == "compiled" and not integrator.compiles:
         raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")

@@ -88,6 +88,8 @@ class Arrangement:
         Names of what does not change in a run.
     expand : bool
         False leaves products of sums (`times`) as they are.
+    squares : bool
+        True takes out squares first, which several polynomials may share, where that costs as much.
 
     Attributes
     ----------
@@ -95,8 +97,14 @@ class Arrangement:
         The numbers, to be calculated with.
     """
 
-    def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = (), expand: bool = True) -> None:
-        self._expand = expand
+    def __init__(
+        self,
+        states: Sequence[tuple[str, int]],
+        constants: Sequence[str] = (),
+        expand: bool = True,
+        squares: bool = False,
+    ) -> None:
+        self._expand, self._squares = expand, squares
         self._table, self._body = Recording(), Recording()
         self._constants = [self._table.input(name) for name in constants]
         self._known: dict[int, int] = {}
@@ -231,7 +239,7 @@ class Arrangement:
         if len(a.terms) > 1:
             a = self.letter(self.written(a))
         ((m, c),) = a.terms.items()
-        return Polynomial(self, {self._reduced(tuple((x, int(e * n)) for x, e in m)): 1.0 if c == 1.0 else c**n})
+        return Polynomial(self, {self._reduced(tuple((x, int(e * n)) for x, e in m if n)): 1.0 if c == 1.0 else c**n})
 
     # the body -----------------------------------------------------------------------------------------------------
 
@@ -343,7 +351,8 @@ class Arrangement:
             shared = [m for m, n in counts.items() if n > 1 or (rich and all(counts[(x, 1),] > 1 for x, _ in m))]
             alone = [m for m in terms if m and not any(_divides(factor, m) for factor in shared)]
             last = max(((self._known[x], x) for m in alone for x, _ in m), default=None)
-            return shared if last is None else [*shared, ((last[1], 1),)]
+            squares = [((x, 2),) for m in terms for x, e in m if e > 1] if self._squares else []
+            return [*squares, *shared, *([] if last is None else [((last[1], 1),)])]
         return sorted((m for m in counts if m[0][1] == 1), key=lambda m: -counts[m])[:1]
 
     def _nested(self, terms: Terms, factor: Monomial) -> Iterator[Plan]:

@@ -14,7 +14,20 @@ from typing import Any, NamedTuple
 
 from sympflow.compiler.numbers import Number
 
-__all__ = ["BOOL", "DOUBLE", "INT", "LOWERED", "POINTER", "Code", "Module", "Rows", "Type", "Value", "Variable"]
+__all__ = [
+    "BOOL",
+    "DOUBLE",
+    "INT",
+    "LOWERED",
+    "POINTER",
+    "Code",
+    "Module",
+    "Rows",
+    "Sweep",
+    "Type",
+    "Value",
+    "Variable",
+]
 
 
 class Type(NamedTuple):
@@ -53,6 +66,9 @@ class Value(Number):
         self.code, self.type, self.name = code, type, name
 
     def apply(self, name: str, args: Sequence[Any]) -> Any:
+        for x in args:
+            if isinstance(x, Number) and not isinstance(x, Value):  # a kind that is made of values
+                return x.apply(name, args)
         return self.code.apply(name, args)
 
     @property
@@ -382,6 +398,14 @@ class Code:
         first = self._new(type, f"insertelement {type} poison, {x.type} {x.name}, i64 0")
         return self._new(type, f"shufflevector {type} {first.name}, {type} poison, <{width} x i32> zeroinitializer")
 
+    def shuffle(self, x: Value, y: Value, lanes: Sequence[int]) -> Value:
+        """Lanes of x, and behind them those of y, in another order."""
+        if x.type.width == 1:
+            return (x, y)[lanes[0]]
+        order = ", ".join(f"i32 {k}" for k in lanes)
+        pair = f"{x.type} {x.name}, {y.type} {y.name}"
+        return self._new(Type(x.type.scalar, len(lanes)), f"shufflevector {pair}, <{len(lanes)} x i32> <{order}>")
+
     def lane_numbers(self, width: int) -> Value:
         """0, 1, … in the lanes."""
         return Value(self, INT, "0") if width == 1 else Value(self, Type("i64", width), _vector("i64", range(width)))
@@ -513,6 +537,35 @@ class Code:
         self._begin(after, head)
         return values
 
+    @contextmanager
+    def sweep(self, first: Value, last: Value, read: Callable[[Any, Value], Value]) -> Iterator[Sweep]:
+        """Execute what is written inside for k = first … last − 1, at least once, with values of other turns."""
+        sweep = Sweep(self, first, read)
+        outside, self._lines = self._lines, []
+        head, after, before = self._label(), self._label(), self._block
+        self._block, self._before[head] = head, before
+        yield sweep
+        following = sweep.k + 1
+        again = following < last
+        end, body, self._lines = self._block, self._lines, outside
+        phis, begun, made = sweep.finished(before, end, following)
+        self._lines += begun
+        self._branch(head)
+        self._begin(head, before)
+        self._lines += [*phis, *made, *body, f"  br i1 {again.name}, label %{head}, label %{after}"]
+        self._begin(after, end)
+
+    @contextmanager
+    def elsewhere(self, lines: list[str]) -> Iterator[None]:
+        """Put what is written inside behind these lines."""
+        here, self._lines = self._lines, lines
+        yield
+        self._lines = here
+
+    def phi(self, value: Value, first: Value, before: str, following: Value, end: str) -> str:
+        """The line of a value that is `first` when a loop begins, and then that of the turn before."""
+        return f"  {value.name} = phi {value.type} [ {first.name}, %{before} ], [ {following.name}, %{end} ]"
+
     def repeat(self, carried: Sequence[Value], body: Callable[..., tuple[Value, Sequence[Value]]]) -> list[Value]:
         """Execute `body(values)`, which returns whether to go on and the new values, at least once."""
         head, after, before = self._label(), self._label(), self._block
@@ -586,6 +639,65 @@ class Code:
 
     def _branch(self, label: str) -> None:
         self._lines.append(f"  br label %{label}")
+
+
+class Sweep:
+    """Turns k of a loop over places, in which values of places further on stay in registers until their turn comes.
+
+    Attributes
+    ----------
+    k : Value
+    """
+
+    def __init__(self, code: Code, first: Value, read: Callable[[Any, Value], Value]) -> None:
+        self.code, self.k = code, code._name(INT)
+        self._first, self._read = first, read
+        self._values: dict[Any, dict[int, Value]] = {}
+        self._made: set[Any] = set()
+        self._begun: list[str] = []
+        self._types: dict[Any, Type] = {}
+
+    def get(self, key: Any, d: int, type: Type) -> Value:
+        """The value of a key at the place k + d: read from memory when that is met first, unless it is put there.
+
+        A value that is put is 0 for places before the first one where it was.
+        """
+        self._types[key] = type
+        values = self._values.setdefault(key, {})
+        if d not in values:
+            values[d] = self.code._name(type)
+        return values[d]
+
+    def put(self, key: Any, d: int, x: Value) -> None:
+        """Set the value of a key at the place k + d, the furthest one at which it is asked for."""
+        self._types[key] = x.type
+        self._values.setdefault(key, {})[d] = x
+        self._made.add(key)
+
+    @contextmanager
+    def before(self) -> Iterator[None]:
+        """Put what is written inside before the loop."""
+        with self.code.elsewhere(self._begun):
+            yield
+
+    def finished(self, before: str, end: str, following: Value) -> tuple[list[str], list[str], list[str]]:
+        """Lines that carry values over, lines before the loop, and those where a turn begins."""
+        code, made = self.code, list[str]()
+        phis = [code.phi(self.k, self._first, before, following, end)]
+        for key, values in self._values.items():
+            most, type = max(values), self._types[key]
+            if key not in self._made:
+                with code.elsewhere(made):
+                    x = self._read(key, self.k + most)
+                made.append(f"  {values[most].name} = bitcast {type} {x.name} to {type}")
+            for d in range(min(values), most):
+                value = self.get(key, d, type)
+                first = code.constant(0.0, type)
+                if key not in self._made:
+                    with code.elsewhere(self._begun):
+                        first = self._read(key, self._first + d)
+                phis.append(code.phi(value, first, before, self.get(key, d + 1, type), end))
+        return phis, self._begun, made
 
 
 _SIZES = {"double": 8, "float": 4, "i64": 8, "i32": 4, "i1": 1, "ptr": 8}

@@ -169,4 +169,3 @@ def _held_across_forks() -> None:
 
 
 _held_across_forks()
-VOID, REAL, WHOLE, ADDRESS = None, ctypes.c_double, ctypes.c_int64, ctypes.c_void_p

@@ -106,7 +106,7 @@ def ensemble(
         another, such as what a compiled library made, or where code was rewritten and means the same.
     progress : bool or callable
         True prints how far the ensemble is; a callable is called with the numbers of orbits done and in all.
-    backend : "auto", "compiled", "array" or "cuda"
+    backend : "auto", "compiled" or "array"
         As for `solve`.
     **options
         Options of the method.
@@ -144,11 +144,6 @@ def ensemble(
     if (resume or same) and store is None:
         raise ValueError(f"`{'resume' if resume else 'same'}` goes on with a `store`: name one.")
     kept = reduction(reduce)
-    if backend == "cuda" and kept.own_loops:
-        raise ValueError(
-            f"`backend` 'cuda' is for a `reduce` of states; {type(kept).__name__} runs loops of its own, which are "
-            "those of the CPU: use backend='auto'."
-        )
     orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
     check_own_parameters(system, {**fixed, **axes}, integrator)

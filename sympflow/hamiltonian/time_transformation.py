@@ -81,7 +81,7 @@ def time_transformed(
             "method such as 'gauss_legendre4'."
         )
     c = default_shift(system) if shift is None else checked_shift(shift)
-    if system.symbols is not None:
+    if system.written is not None:
         transformed = HamiltonianSystem.from_sympy(_expression(system, c), name=f"log_{system.name}", energy_scale=1.0)
         transformed._params = Parameters({**system.params, "shift": c})
     else:
@@ -156,7 +156,7 @@ def projected(x: Array) -> Array:
 def _expression(system: HamiltonianSystem, c: float) -> Any:
     import sympy as sp
 
-    symbols = system.symbols
+    symbols = system.written
     assert symbols is not None
     B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
     numbered = sp.nsimplify(c) if c.is_integer() else sp.Float(c)

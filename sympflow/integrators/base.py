@@ -57,7 +57,6 @@ __all__ = [
 ]
 
 FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
-COMPILED = ("compiled", "cuda")
 """The values of `stats["backend"]` of compiled loops."""
 MOST_SAMPLES = 65536  # of the events, in a chunk
 
@@ -182,7 +181,7 @@ class OwnStepper(FixedStep):
     def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str, t: Any = 0.0) -> Array:
         if self.overrides("step"):
             return super().substep(system, y, h, backend, t)
-        asked = "auto" if backend in COMPILED else "array"
+        asked = "auto" if backend == "compiled" else "array"
         return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter_from(t, y, h)
 
 
@@ -363,7 +362,7 @@ def compiled_loops(
     make : callable
         Raises a ValueError with the reason where there is no compiled form.
     y0 : array or tensor
-    backend : "auto", "compiled", "array" or "cuda"
+    backend : "auto", "compiled" or "array"
     compensated : bool
         Compiled loops are needed, for compensated sums.
     reason : str, optional
@@ -388,7 +387,7 @@ def compiled_loops(
             return make()
         except ValueError as error:
             reason = str(error)
-    if backend in COMPILED:
+    if backend == "compiled":
         raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
     if compensated:
         needed = "" if reason.startswith("`compensated`") else "`compensated` sums need compiled loops. "
@@ -821,7 +820,7 @@ class GridSolution:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         integrator, grid, states = state["integrator"], state["grid"], state["states"]
-        backend = "auto" if state["backend"] in COMPILED else "array"
+        backend = "auto" if state["backend"] == "compiled" else "array"
         problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend, letters=state.get("letters"))
         GridSolution.__init__(self, integrator.stepper(problem), grid, states)
 

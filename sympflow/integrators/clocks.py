@@ -278,7 +278,7 @@ class PhysicalRun:
         if self.length:
             Grid(problem.t0, problem.t1, clock.dt)  # refuses a dt of too many steps
         self.h = self.sign * clock.new_step
-        compiled = problem.backend != "array" and problem.y0.dtype == np.float64 and self.system.symbols is not None
+        compiled = problem.backend != "array" and problem.y0.dtype == np.float64 and self.system.written is not None
         self.most_steps = self._most_steps(COMPILED_FOR_ONE if compiled else 1)
         self.n_steps = np.zeros(len(rows), dtype=int)
         self.n_extra, self.backend = 0, ""
@@ -538,7 +538,7 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
     """
     system, y0, times = problem.system, problem.y0, problem.t_eval
     length, dt = abs(problem.t1 - problem.t0), clock.dt
-    if problem.dense_output or problem.backend == "array" or y0.dtype != np.float64 or system.symbols is None:
+    if problem.dense_output or problem.backend == "array" or y0.dtype != np.float64 or system.written is None:
         return None
     far = max(abs(problem.t0), abs(problem.t1))
     if not length or length > MOST_EXPECTED * dt or far + dt == far:

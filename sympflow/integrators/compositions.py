@@ -125,10 +125,6 @@ class Composition(ABC):
     def kernel(self, compensated: bool) -> Kernel:
         """The compiled loops; a ValueError says why there are none."""
 
-    def cuda_kernel(self, compensated: bool) -> Kernel:
-        """The same loops on a GPU; a ValueError says why there are none."""
-        raise ValueError("The splitting has no loops for a GPU: use backend='auto'.")
-
     @abstractmethod
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Evaluations of forces and their derivatives, as `FixedStep.evaluations`."""
@@ -286,11 +282,6 @@ class KineticPotential(Composition):
         if self.system.friction is None:
             return loops.kernel(self.scheme, compensated)
         return loops.damped_kernel(self.scheme, self.step)
-
-    def cuda_kernel(self, compensated: bool) -> Kernel:
-        from sympflow.kernels.cuda_loops import cuda_kernel
-
-        return cuda_kernel(self.system, self.scheme, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)

@@ -210,11 +210,6 @@ class Integrator:
         """True if every step holds the friction −Γp of a damped system; where it does not, the system is refused."""
         return False
 
-    @property
-    def runs_on_cuda(self) -> bool:
-        """True if ``backend="cuda"`` runs batches on a GPU."""
-        return False
-
     def takes_letters(self, problem: Problem) -> bool:
         """True if a run takes values of parameters for each trajectory, as numbers of one compiled run."""
         return False

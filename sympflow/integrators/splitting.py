@@ -382,16 +382,13 @@ class Splitting(OwnStepper):
         for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
             yield differentiated(jacobian, times, states, lengths, system)
 
-    @property
-    def runs_on_cuda(self) -> bool:
-        return self.kicks_and_drifts is not None
-
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
-        make = composition.cuda_kernel if problem.backend == "cuda" else composition.kernel
         told: list[str] = []
         compensated = bool(self.compensated)
-        kernel = compiled_loops(lambda: make(compensated), problem.y0, problem.backend, compensated, told=told)
+        kernel = compiled_loops(
+            lambda: composition.kernel(compensated), problem.y0, problem.backend, compensated, told=told
+        )
         if kernel is None:
             return ArrayComposition(self, problem, composition, told)
         if problem.letters is not None:

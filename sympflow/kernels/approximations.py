@@ -1,10 +1,10 @@
-"""Functions in a potential as polynomials on an interval, exact to rounding, and as letters that kicks share."""
+"""Functions of one position as polynomials on an interval, exact to rounding."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,10 @@ import sympy as sp
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
 
-__all__ = ["UNTOUCHED", "Letters", "OnInterval", "Ranges", "on_interval", "position_ranges", "range_of"]
+__all__ = ["UNTOUCHED", "OnInterval", "Ranges", "on_interval", "position_ranges"]
 
 Ranges = tuple[tuple[float, float], ...]
-"""Intervals of q1 … qd in which kicks are computed by polynomials; none for none."""
+"""The interval of q1 in which kicks are computed by polynomials; none for none."""
 
 NODES = 48  # of the interpolants whose coefficients say which degree is enough
 DIGITS = 40
@@ -132,83 +132,3 @@ def _powers(values: Sequence[Any], cosines: Sequence[Sequence[Any]], half: float
     if sum(map(abs, powers)) > AMPLIFIED * less * largest:
         return None
     return [float(c / mp.mpf(half) ** i) for i, c in enumerate(powers)]
-
-
-class Letters:
-    """Symbols for the functions of positions in expressions: one for each, and powers of it for exp(n·u).
-
-    Parameters
-    ----------
-    q : sequence of Symbol
-    split : bool
-        Take exp(u + v) for exp(u)·exp(v), functions of fewer positions each.
-
-    Attributes
-    ----------
-    functions : dict of Symbol to Expr
-        What the symbols stand for, each a function of one argument.
-    """
-
-    def __init__(self, q: Sequence[sp.Symbol], split: bool = True) -> None:
-        self.functions: dict[sp.Symbol, sp.Expr] = {}
-        self._q, self._split = set(q), split
-        self._exponents: dict[tuple[sp.Expr, bool], list[sp.Rational]] = {}
-
-    def put_into(self, expressions: Sequence[sp.Expr]) -> list[sp.Expr]:
-        """The expressions with symbols in place of functions."""
-        split = list(expressions)
-        if self._split:
-            split = [f.replace(lambda e: isinstance(e, sp.exp), _split_exponential) for f in expressions]
-        atoms = {a for f in split for a in f.atoms(sp.Function) if len(a.args) == 1 and a.free_symbols & self._q}
-        outer = [a for a in atoms if not a.args[0].atoms(sp.Function)]
-        for a in outer:
-            if isinstance(a, sp.exp):
-                number, u = _multiple(a.args[0])
-                if number.is_Rational:
-                    self._exponents.setdefault((u, bool(number > 0)), []).append(number)
-        places = {a: self._letter(a) for a in sorted(outer, key=sp.default_sort_key)}
-        return [f.xreplace(places) for f in split]
-
-    def _letter(self, atom: sp.Expr) -> sp.Expr:
-        if isinstance(atom, sp.exp):
-            number, u = _multiple(atom.args[0])
-            if number.is_Rational:
-                unit = sp.gcd_list([abs(n) for n in self._exponents[u, bool(number > 0)]])
-                unit = unit if number > 0 else -unit
-                return self._symbol(sp.exp(unit * u)) ** (number / unit)
-        return self._symbol(atom)
-
-    def _symbol(self, function: sp.Expr) -> sp.Symbol:
-        for symbol, known in self.functions.items():
-            if known == function:
-                return symbol
-        symbol = sp.Symbol(f"function_{len(self.functions)}", real=True)
-        self.functions[symbol] = function
-        return symbol
-
-    @cached_property
-    def symbols(self) -> tuple[sp.Symbol, ...]:
-        return tuple(self.functions)
-
-
-def _multiple(u: sp.Expr) -> tuple[sp.Expr, sp.Expr]:
-    """A number and what it multiplies; of a sum the number that divides all of it."""
-    return u.as_content_primitive() if u.is_Add else u.as_coeff_Mul()
-
-
-def _split_exponential(f: sp.Expr) -> sp.Expr:
-    """exp(u + v) as exp(u)·exp(v)."""
-    terms = sp.Add.make_args(sp.expand(f.args[0]))
-    return sp.Mul(*[sp.exp(u) for u in terms], evaluate=False) if len(terms) > 1 else f
-
-
-def range_of(u: sp.Expr, q: Sequence[sp.Symbol], ranges: Ranges) -> tuple[float, float] | None:
-    """The values of u on a box of positions, where it is affine in them; else None."""
-    slopes = [sp.diff(u, s) for s in q]
-    if any(slope.free_symbols for slope in slopes):
-        return None
-    start = float(u.xreplace(dict.fromkeys(q, sp.S.Zero)))
-    ends = [
-        sorted((float(slope) * low, float(slope) * high)) for slope, (low, high) in zip(slopes, ranges, strict=True)
-    ]
-    return start + sum(low for low, _ in ends), start + sum(high for _, high in ends)

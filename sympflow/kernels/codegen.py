@@ -1,8 +1,7 @@
-"""From a symbolic system to the source of its algebra: kicks and drifts on tuples of numbers."""
+"""Expressions as source text, and the algebra of tuples of numbers."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import sympy as sp
@@ -10,22 +9,13 @@ from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
 from sympflow.hamiltonian.driving import sampled
-from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, printable
+from sympflow.hamiltonian.symbolic import printable
 
 __all__ = [
-    "algebra_source",
-    "as_factor",
-    "curvature_kick_source",
-    "gradient_kick_source",
-    "parameter_lines",
-    "polynomial_kick_source",
-    "polynomial_slope_source",
     "printed",
     "sampled_name",
     "statements",
     "tuple_algebra",
-    "vectorised",
 ]
 
 _MAX_POWER = 16  # integer powers up to this are written as products
@@ -33,11 +23,6 @@ _MAX_POWER = 16  # integer powers up to this are written as products
 
 class fast_exp(sp.Function):  # as the compiled function of the text `elementary`
     """exp as arithmetic, in loops that are to become vector instructions."""
-
-
-def vectorised(expressions: Sequence[sp.Expr]) -> list[sp.Expr]:
-    """Expressions for loops over sites, whose exponentials are arithmetic too."""
-    return [f.replace(sp.exp, fast_exp) for f in expressions]
 
 
 class _KernelPrinter(PythonCodePrinter):
@@ -132,154 +117,6 @@ def _product(factor: str, power: int) -> str:
     half = _product(factor, power // 2)
     square = f"({half}*{half})" if power > 3 else f"{half}*{half}"
     return f"{square}*{factor}" if power % 2 else square
-
-
-def algebra_source(symbols: SymbolicHamiltonian) -> str:
-    """The kick and the drift that `loops` ask for, for H = T(p) + V(q), calling `elementary`; states are tuples.
-
-    Raises
-    ------
-    ValueError
-        If a function in H has no counterpart in compiled code.
-    """
-    q, p, d = symbols.q, symbols.p, symbols.ndof
-    velocity = [sp.diff(symbols.T, s) for s in p]
-    slope = [sp.diff(symbols.V, s) for s in q]
-    parts = [
-        _function(symbols, "kick", "q, numbers, work", [-s for s in slope], [f"b*{{{i}}}" for i in range(d)], "b"),
-        _drift(symbols, velocity),
-    ]
-    return "\n\n\n".join(parts) + "\n"
-
-
-def _drift(symbols: SymbolicHamiltonian, velocity: list[sp.Expr]) -> str:
-    numbers = "numbers, " if symbols.parameters else ""
-    results = [f"a*{{{i}}}" for i in range(symbols.ndof)]
-    return _function(symbols, "drift", f"p, a, {numbers}work", velocity, results)
-
-
-def gradient_kick_source(symbols: SymbolicHamiltonian) -> str:
-    """−b∇V + g ∇²V M⁻¹∇V in two parts, those of the Hessian's diagonal and of what is beside it.
-
-    The Hessian's upper triangle is computed, the products are taken with numbers: g times its entries does not wait
-    for ∇V, so that of what follows ∇V two fused operations are left.
-
-    Raises
-    ------
-    ValueError
-        As `algebra_source`.
-    """
-    q, d, M = symbols.q, symbols.ndof, symbols.inverse_mass
-    assert M is not None
-    slope = [sp.diff(symbols.V, s) for s in q]
-    triangle = [(i, j) for i in range(d) for j in range(i, d)]
-    entries = [sp.diff(slope[i], q[j]) for i, j in triangle]
-    position = {ij: d + n for n, ij in enumerate(triangle) if entries[n] != 0}
-
-    def velocity(j: int) -> str:
-        terms = [f"{as_factor(M[j, k])}*{{{k}}}" if M[j, k] != 1 else f"{{{k}}}" for k in range(d) if M[j, k] != 0]
-        return terms[0] if len(terms) == 1 else f"({' + '.join(terms)})"
-
-    own, other = [], []
-    for i in range(d):
-        row = {j: n for j in range(d) if (n := position.get((min(i, j), max(i, j)))) is not None}
-        if i not in row:
-            own.append(f"-b*{{{i}}}")
-        elif M[i, i] == 1 and velocity(i) == f"{{{i}}}":
-            own.append(f"(g*{{{row[i]}}} - b)*{{{i}}}")
-        else:
-            own.append(f"(g*{{{row[i]}}}*{velocity(i)} - b*{{{i}}})")
-        other.append(" + ".join(f"(g*{{{n}}})*{velocity(j)}" for j, n in row.items() if j != i) or "0.0")
-    results = [f"({', '.join(change)},)" for change in (own, other)]
-    coupled = f"COUPLED = {any(term != '0.0' for term in other)}"
-    return (
-        f"{coupled}\n\n\n"
-        + _function(symbols, "gradient_kick", "q, numbers, work", [*slope, *entries], results, "bg")
-        + "\n"
-    )
-
-
-def curvature_kick_source(symbols: SymbolicHamiltonian) -> str:
-    """−b∇V + g ∇²V v − c ∇(½ v·∇²V v), v = M⁻¹∇V.
-
-    Raises
-    ------
-    ValueError
-        As `algebra_source`.
-    """
-    q, d, M = symbols.q, symbols.ndof, symbols.inverse_mass
-    slope = sp.Matrix([sp.diff(symbols.V, s) for s in q])
-    products = sp.hessian(symbols.V, q) * M * slope
-    bent = [sp.diff(symbols.W, s) for s in q]
-    results = [f"((g*{{{d + i}}} - b*{{{i}}}) - c*{{{2 * d + i}}})" for i in range(d)]
-    return _function(symbols, "curvature_kick", "q, numbers, work", [*slope, *products, *bent], results, "bgc") + "\n"
-
-
-def polynomial_kick_source(symbols: SymbolicHamiltonian, monomials: Monomials) -> str:
-    """−b∇V − Σ_m e_m ∇q^m, e the coefficients of the polynomial.
-
-    Raises
-    ------
-    ValueError
-        As `algebra_source`.
-    """
-    q, d = symbols.q, symbols.ndof
-    products = [sp.Mul(*map(sp.Pow, q, m)) for m in monomials]
-    slopes = [sp.diff(symbols.V, s) for s in q]
-    places: list[list[str]] = [[f"-b*{{{i}}}"] for i in range(d)]
-    for i, s in enumerate(q):
-        for m, product in enumerate(products):
-            if (slope := sp.diff(product, s)) != 0:
-                places[i].append(f" - numbers[{m + 1}]*{{{len(slopes)}}}")
-                slopes.append(slope)
-    results = ["".join(terms) for terms in places]
-    return _function(symbols, "polynomial_kick", "q, numbers, work", slopes, results, "b") + "\n"
-
-
-def polynomial_slope_source(symbols: SymbolicHamiltonian, monomials: Monomials) -> str:
-    """``polynomial_slope(q, numbers, out)``: Σ_m e_m ∇q^m into out, of arrays."""
-    q = symbols.q
-    letters = [sp.Symbol(f"e_{m}", real=True) for m in range(len(monomials))]
-    P = sp.Add(*[e * sp.Mul(*map(sp.Pow, q, m)) for e, m in zip(letters, monomials, strict=True)])
-    lines = ["@njit(**OPTIONS)", "def polynomial_slope(q, numbers, out):"]
-    lines += [f"    {s} = q[{i}]" for i, s in enumerate(q) if P.has(s)]
-    lines += [f"    {e} = numbers[{m + 1}]" for m, e in enumerate(letters)]
-    slopes = statements([f"out[{i}]" for i in range(len(q))], [sp.diff(P, s) for s in q])
-    return "\n".join([*lines, *(f"    {line}" for line in slopes)])
-
-
-def as_factor(number: sp.Expr) -> str:
-    """Source text of a number, of M⁻¹ for instance, or of an expression in parameters, as a factor."""
-    return f"({printed(number)})" if number.free_symbols else repr(float(number))
-
-
-def parameter_lines(symbols: SymbolicHamiltonian, lines: Sequence[str]) -> list[str]:
-    """Assignments of the parameters that occur in lines of code; their values are the last ones of `numbers`."""
-    words, n = set(re.findall(r"\w+", " ".join(lines))), len(symbols.parameters)
-    return [f"{s} = numbers[-{n - i}]" for i, s in enumerate(symbols.parameters) if s.name in words]
-
-
-def _function(
-    symbols: SymbolicHamiltonian,
-    name: str,
-    arguments: str,
-    expressions: list[sp.Expr],
-    results: list[str],
-    letters: str = "",
-) -> str:
-    """A jitted function that returns the tuple `results`, ``{n}`` in them standing for the n-th expression.
-
-    Its first argument, q or p, holds the variables; `numbers` begin with those called by the `letters`.
-    """
-    variables = symbols.q if arguments[0] == "q" else symbols.p
-    names = [f"v_{n}" for n in range(len(expressions))]
-    lines = ["@njit(**OPTIONS)", f"def {name}({arguments}):"]
-    lines.append(f"    {', '.join(s.name for s in variables)}, = {arguments[0]}")
-    lines += [f"    {letter} = numbers[{i}]" for i, letter in enumerate(letters)]
-    body = statements(names, expressions)
-    body.append(f"return ({''.join(result.format(*names) + ', ' for result in results)})")
-    lines += [f"    {line}" for line in [*parameter_lines(symbols, body), *body]]
-    return "\n".join(lines)
 
 
 def tuple_algebra(d: int) -> str:

@@ -20,7 +20,7 @@ from sympflow.kernels.stages import StageTable, run_table, single_table, with_la
 from sympflow.schemes import CURVATURE, Scheme
 
 if TYPE_CHECKING:
-    from sympflow.kernels.splitting_loops import Functions
+    from sympflow.kernels.rollouts import Rollouts
 
 __all__ = [
     "ClockedFlowKernel",
@@ -214,7 +214,7 @@ class PrimedFlowKernel(Kernel):
             return self._splitting.damped_kernel(scheme, partial(_stepped_by, step))
         return self._splitting.kernel(scheme, self._compensated, self._ranges)
 
-    def _functions(self) -> Functions:
+    def _functions(self) -> Rollouts:
         """The compiled functions for the kicks of the flow."""
         tables = self._tables
         return self._splitting.functions(tables.level, self._compensated, tables.monomials, ranges=self._ranges)
@@ -222,7 +222,7 @@ class PrimedFlowKernel(Kernel):
     def _processed(self, h: float, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tables of χ⁻¹, of a run of K, and of χ, of steps |h|, or for h < 0 of their inverse.
 
-        That of χ begins with the last stage of K, unless the loops close their outputs. In a driven system the time
+        That of χ begins with the last stage of K. In a driven system the time
         moves with the drifts of χ⁻¹ too: K begins before t0 by those of χ.
         """
         loops = self._splitting
@@ -233,7 +233,7 @@ class PrimedFlowKernel(Kernel):
             before, after = (single_table(tables.scheme("primed processor", t, back=back), t) for back in (True, False))
             # The loops read the numbers of all terms, of maps that lack some too.
             before, kernel, after = (replace(table, level=tables.level) for table in (before, kernel, after))
-            return before, kernel, after if loops.closes else with_last_stage(kernel, after)
+            return before, kernel, with_last_stage(kernel, after)
 
         if loops.driven:
             before, kernel, after = self._tables.kept(("stages", h), stages)

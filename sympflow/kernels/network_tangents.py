@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sympflow.compiler.control import INT, POINTER, Code, Module, Rows, Type, Value
+from sympflow.compiler.dual import Dual, DualRows
 from sympflow.compiler.functions import fma
 from sympflow.compiler.machine import host
 from sympflow.kernels.activations import bent
@@ -184,15 +185,13 @@ class _Sizes(NamedTuple):
     def parts(self) -> dict[str, int]:
         """Numbers of what is kept of a sweep, of a direction, of the derivatives of what is fitted."""
         levels, h, d = self.n * self.h, self.h, self.ndof
-        sweep = ("z", "s", "u", "v", "dz", "da", "R", "r", "dR", "dr")
-        along = ("aj", "daj", "zj", "dzj")
-        rest = {"A": h, "C": h, "RA": h, "RC": h, "P": 4 * d * d, "M": 4 * d * d}
-        rest |= {"G": d * self.size, "dG": d * self.size, "H": d * d, "dH": d * d}
-        return dict.fromkeys((*sweep, *along), levels) | rest
+        return dict.fromkeys(("z", "s", "u", "R", "r", "aj", "zj"), levels) | {
+            "A": h, "RA": h, "G": d * self.size, "H": d * d, "P": 4 * d * d, "M": 4 * d * d,
+        }  # fmt: skip
 
     @property
     def work(self) -> int:
-        return sum(self.parts.values())
+        return 2 * sum(self.parts.values())  # with their rates
 
     def places(self, widths: Sequence[int]) -> np.ndarray:
         """Where each parameter of networks of these widths stands among the weights."""
@@ -219,141 +218,113 @@ class _Sweeps:
 
     def __init__(self, code: Code, sizes: _Sizes, activation: str, velocity: bool, theta: Value, work: Value) -> None:
         self.code, self.sizes, self.velocity, self.theta = code, sizes, velocity, theta
-        self.activation = bent(activation, 3 if velocity else 2)
+        self.activation = bent(activation, 2)
         self.K, self.k, self.w, self.b, self.W, _ = sizes.starts
-        self.rows, at = {}, 0
+        self.rows: dict[str, Any] = {}
+        at = 0
         for name, size in sizes.parts.items():
-            self.rows[name] = Rows(code.at(work, at * LANES), REGISTER)
-            at += size
+            place = Rows(code.at(work, at * LANES), REGISTER)
+            self.rows[name] = DualRows(place, place.part(size)) if velocity else place
+            at += 2 * size
 
     def weight(self, i: Any) -> Value:
         return self.code.splat(self.code.load(self.theta, i), LANES)
 
-    def product(self, count: int, weight: Callable[[Any], Value], start: Sequence[Value], *rows: Any) -> list[Value]:
-        """start + Σ_m weight(m) row(m) of each of the rows."""
+    def product(self, count: int, weight: Callable[[Any], Value], start: Any, row: Callable[[Any], Any]) -> Any:
+        """start + Σ_m weight(m) row(m)."""
+        if self.velocity and not isinstance(start, Dual):
+            start = Dual(start, self.code.constant(0.0, REGISTER))
 
-        def more(m: Value, totals: Sequence[Value]) -> list[Value]:
-            w = weight(m)
-            return [fma(w, row(m), total) for row, total in zip(rows, totals, strict=True)]
+        def number(x: Sequence[Value]) -> Any:
+            return Dual(*x) if self.velocity else x[0]
 
-        return self.code.loop(count, start[: len(rows)], more)
+        def more(m: Value, total: Sequence[Value]) -> list[Value]:
+            return _flat(fma(weight(m), row(m), number(total)))
 
-    def sweep(self, x: Rows, dx: Rows, t: Value, rate: Value) -> None:
-        """z, σ', σ'', σ''', ż, ȧ, and back R = Wᵀr', r, Ṙ = Wᵀṙ', ṙ of all levels, at times t."""
-        code, h, n, inputs, velocity = self.code, self.sizes.h, self.sizes.n, self.sizes.inputs, self.velocity
-        z, s, u, v, dz, da, R, r, dR, dr = (
-            self.rows[name] for name in ("z", "s", "u", "v", "dz", "da", "R", "r", "dR", "dr")
-        )
+        return number(self.code.loop(count, _flat(start), more))
+
+    def sweep(self, x: Any, t: Any) -> None:
+        """z, σ', σ'', and back R = Wᵀr' and r of all levels, at times t."""
+        code, h, n, inputs = self.code, self.sizes.h, self.sizes.n, self.sizes.inputs
+        z, s, u, R, r = (self.rows[name] for name in ("z", "s", "u", "R", "r"))
         zero = code.constant(0.0, REGISTER)
 
-        def activated(at: Value, a: Value, change: Value | None = None) -> None:
-            z[at], s[at], u[at], *twist = self.activation(a)
-            if change is not None:
-                v[at], da[at], dz[at] = twist[0], change, s[at] * change
+        def activated(at: Value, a: Any) -> None:
+            z[at], s[at], u[at] = self.activation(a)
 
-        def weighted(at: Value, total: Value, change: Value) -> None:
+        def weighted(at: Value, total: Any) -> None:
             R[at], r[at] = total, total * s[at]
-            if velocity:
-                dR[at], dr[at] = change, fma(total * u[at], da[at], change * s[at])
 
         with code.over(h) as i:
-            k = self.weight(i + self.k)
-            start = [fma(k, t, self.weight(i + self.b)), k * code.splat(rate, LANES)]
-            given = [x.__getitem__, dx.__getitem__][: 1 + velocity]
-            activated(i, *self.product(inputs, lambda m: self.weight(i * inputs + m), start, *given))
+            start = fma(self.weight(i + self.k), t, self.weight(i + self.b))
+            activated(i, self.product(inputs, lambda m: self.weight(i * inputs + m), start, x.__getitem__))
         with code.over(n - 1) as level, code.over(h) as i:
-            row, below = (level * h + i) * h + self.W, level * h
-            start = [self.weight((level + 1) * h + i + self.b), zero]
-            given = [lambda m: z[below + m], lambda m: dz[below + m]][: 1 + velocity]
-            activated((level + 1) * h + i, *self.product(h, lambda m: self.weight(row + m), start, *given))
+            row, below, start = (level * h + i) * h + self.W, level * h, self.weight((level + 1) * h + i + self.b)
+            a = self.product(h, lambda m: self.weight(row + m), start, lambda m: z[below + m])
+            activated((level + 1) * h + i, a)
         with code.over(h) as i:
-            weighted(i + (n - 1) * h, self.weight(i + self.w), zero)
+            weighted(i + (n - 1) * h, self.weight(i + self.w))
         with code.over(n - 1) as down:
             level = (n - 2) - down
             with code.over(h) as m:
                 column, above = level * (h * h) + m + self.W, (level + 1) * h
-                given = [lambda i: r[above + i], lambda i: dr[above + i]][: 1 + velocity]
-                total = self.product(h, lambda i: self.weight(column + i * h), [zero, zero], *given)
-                weighted(level * h + m, total[0], total[-1])
+                total = self.product(h, lambda i: self.weight(column + i * h), zero, lambda i: r[above + i])
+                weighted(level * h + m, total)
 
-    def add_moved(self, r: Rows, sign: Value, target: Rows) -> None:
+    def add_moved(self, r: Any, sign: Value, target: Any) -> None:
         """target += sign · Kᵀ r."""
-        code, h, inputs = self.code, self.sizes.h, self.sizes.inputs
-        with code.over(self.sizes.ndof) as j:
-            zero = code.constant(0.0, REGISTER)
-            total = self.product(h, lambda i: self.weight(i * inputs + j), [zero], r.__getitem__)
-            target.add(j, (sign, total[0]))
+        h, inputs = self.sizes.h, self.sizes.inputs
+        with self.code.over(self.sizes.ndof) as j:
+            zero = self.code.constant(0.0, REGISTER)
+            target.add(j, (sign, self.product(h, lambda i: self.weight(i * inputs + j), zero, r.__getitem__)))
 
-    def add_sensitivities(
-        self, x: Rows, dx: Rows, t: Value, rate: Value, sign: Value, j: Value, G: Rows, dG: Rows
-    ) -> None:
-        """Add sign times the derivatives of ∂_jV and d/dt ∂_jV by the weights to G and dG, by x to H and dH."""
-        code, sizes, velocity, rows = self.code, self.sizes, self.velocity, self.rows
+    def add_sensitivities(self, x: Any, t: Any, sign: Value, j: Value) -> None:
+        """Add sign times the derivatives of ∂_jV by the weights to G, by x to H."""
+        code, sizes, rows = self.code, self.sizes, self.rows
         h, n, inputs, d = sizes.h, sizes.n, sizes.inputs, sizes.ndof
-        z, s, u, v, dz, da = (rows[name] for name in ("z", "s", "u", "v", "dz", "da"))
-        R, r, dR, dr = (rows[name] for name in ("R", "r", "dR", "dr"))
-        aj, daj, zj, dzj = (rows[name] for name in ("aj", "daj", "zj", "dzj"))
-        A, C, RA, RC = (rows[name] for name in ("A", "C", "RA", "RC"))
-        zero = code.constant(0.0, REGISTER)
+        z, s, u, R, r, aj, zj, A, RA = (rows[name] for name in ("z", "s", "u", "R", "r", "aj", "zj", "A", "RA"))
+        G, zero = rows["G"].part(j * sizes.size), code.constant(0.0, REGISTER)
 
-        def along(at: Value, a: Value, change: Value) -> None:
+        def along(at: Value, a: Any) -> None:
             aj[at], zj[at] = a, s[at] * a
-            if velocity:
-                daj[at], dzj[at] = change, fma(u[at] * a, da[at], s[at] * change)
 
         with code.over(h) as i:
-            along(i, self.weight(i * inputs + j), zero)
-            RA[i] = RC[i] = zero
+            along(i, self.weight(i * inputs + j))
+            RA[i] = zero
         with code.over(n - 1) as level, code.over(h) as i:
             row, below = (level * h + i) * h + self.W, level * h
-            given = [lambda m: zj[below + m], lambda m: dzj[below + m]][: 1 + velocity]
-            total = self.product(h, lambda m: self.weight(row + m), [zero, zero], *given)
-            along((level + 1) * h + i, total[0], total[-1])
+            along((level + 1) * h + i, self.product(h, lambda m: self.weight(row + m), zero, lambda m: zj[below + m]))
         with code.over(n) as down:
             level = (n - 1) - down
             with code.over(h) as i:
                 at = level * h + i
-                bend = u[at] * aj[at]
-                A[i] = a = fma(R[at], bend, RA[i] * s[at])
+                A[i] = a = fma(R[at], u[at] * aj[at], RA[i] * s[at])
                 G.add(at + self.b, (sign, a))
-                if velocity:
-                    twist = fma(v[at] * aj[at], da[at], u[at] * daj[at])
-                    c = fma(RA[i] * u[at], da[at], RC[i] * s[at])
-                    C[i] = c = fma(R[at], twist, fma(dR[at], bend, c))
-                    dG.add(at + self.b, (sign, c))
             with code.given(level > 0):
                 below = (level - 1) * h
                 with code.over(h) as i:
-                    at = level * h + i
-                    row, r_i, A_i = (below + i) * h + self.W, sign * r[at], sign * A[i]
-                    dr_i, C_i = (sign * dr[at], sign * C[i]) if velocity else (zero, zero)
+                    row, r_i, A_i = (below + i) * h + self.W, sign * r[level * h + i], sign * A[i]
                     with code.over(h) as m:
-                        z_m, zj_m = z[below + m], zj[below + m]
-                        G.add(row + m, (r_i, zj_m), (A_i, z_m))
-                        if velocity:
-                            back = (r_i, dzj[below + m]), (A_i, dz[below + m]), (dr_i, zj_m), (C_i, z_m)
-                            dG.add(row + m, *back)
+                        G.add(row + m, (r_i, zj[below + m]), (A_i, z[below + m]))
                 with code.over(h) as m:
                     column = below * h + m + self.W
-                    given = [A.__getitem__, C.__getitem__][: 1 + velocity]
-                    total = self.product(h, lambda i: self.weight(column + i * h), [zero, zero], *given)
-                    RA[m], RC[m] = total[0], total[-1]
+                    RA[m] = self.product(h, lambda i: self.weight(column + i * h), zero, A.__getitem__)
         with code.over(h) as i:
-            A_i, C_i = sign * A[i], sign * C[i] if velocity else zero
+            A_i = sign * A[i]
             with code.over(inputs) as m:
                 G.add(i * inputs + m, (A_i, x[m]))
-                if velocity:
-                    dG.add(i * inputs + m, (C_i, x[m]), (A_i, dx[m]))
             G.add(i * inputs + j, (sign, r[i]))
             G.add(i + self.k, (A_i, t))
             G.add(i + self.w, (sign, zj[i + (n - 1) * h]))
-            if velocity:
-                dG.add(i * inputs + j, (sign, dr[i]))
-                dG.add(i + self.k, (C_i, t), (A_i, code.splat(rate, LANES)))
-                dG.add(i + self.w, (sign, dzj[i + (n - 1) * h]))
         self.add_moved(A, sign, rows["H"].part(j * d))
-        if velocity:
-            self.add_moved(C, sign, rows["dH"].part(j * d))
+
+
+def _values(x: Any) -> Rows:
+    return x.values if isinstance(x, DualRows) else x
+
+
+def _flat(x: Any) -> list[Value]:
+    return [x.value, x.rate] if isinstance(x, Dual) else [x]
 
 
 class _Points:
@@ -380,15 +351,23 @@ class _Points:
     def sweeps(self, code: Code, theta: Value, work: Value) -> _Sweeps:
         return _Sweeps(code, *self._given, theta, work)
 
-    def swept(self, theta: Value, x: Rows, dx: Rows, t: Value, rate: Value) -> _Sweeps:
-        """Call the sweep, which stands in the module once."""
+    def swept(self, theta: Value, states: Rows, x: Value, k: Value, t: Value) -> tuple[_Sweeps, Any, Any]:
+        """Call the sweep of a column, which stands in the module once; with its coordinates and times."""
+        code = self.code
+        rate = code.select(code.apply("eq", (k, 0)), code.constant(1.0), code.constant(0.0))
+        place = states.part(x).place
 
-        def body(theta: Value, x: Value, dx: Value, t: Value, rate: Value, work: Value) -> None:
-            code = theta.code
-            self.sweeps(code, theta, work).sweep(Rows(x, REGISTER), Rows(dx, REGISTER), t, rate)
+        def given(x: Value, t: Value, rate: Value) -> tuple[Any, Any]:
+            coordinates, times, rate = Rows(x, REGISTER), t, x.code.splat(rate, LANES)
+            if not self.velocity:
+                return coordinates, times * rate
+            return DualRows(coordinates, coordinates.part(2 * self.sizes.inputs)), Dual(times * rate, rate)
 
-        self.code.outlined("sweep", [theta, x.place, dx.place, t, rate, self.work], body)
-        return self.sweeps(self.code, theta, self.work)
+        def body(theta: Value, x: Value, t: Value, rate: Value, work: Value) -> None:
+            self.sweeps(theta.code, theta, work).sweep(*given(x, t, rate))
+
+        code.outlined("sweep", [theta, place, t, rate, self.work], body)
+        return self.sweeps(code, theta, self.work), *given(place, t, rate)
 
     def column(self, place: Value, i: Any, begin: Value) -> Value:
         """The numbers of a row of an array (…, N) at the points from `begin` on."""
@@ -412,12 +391,10 @@ class _Points:
         """The columns t and 0."""
         return self.code.over(2)
 
-    def side(self, k: Value) -> tuple[Value, Value]:
-        """The rate of time in a column, and its sign."""
+    def share(self, k: Value) -> Value:
+        """The sign of a column."""
         code = self.code
-        of_time = code.apply("eq", (k, 0))
-        one = code.constant(1.0)
-        return code.select(of_time, one, code.constant(0.0)), code.select(of_time, one, code.constant(-1.0))
+        return code.select(code.apply("eq", (k, 0)), code.constant(1.0), code.constant(-1.0))
 
     def forward(self, begin: Value) -> Value:
         """The states q, p, q̇, ṗ before each layer and after the last one, and the times."""
@@ -437,13 +414,10 @@ class _Points:
                 after[m] = before[m]
             x, target = code.select(kick, 0 * i, 0 * i + inputs), code.select(kick, 0 * i + inputs, 0 * i)
             with self.sides() as k:
-                rate, share = self.side(k)
-                times = t * code.splat(rate, LANES)
-                sweeps = self.swept(theta, before.part(x), before.part(x + 2 * inputs), times, rate)
-                change = code.splat(sign * share, LANES)
-                sweeps.add_moved(sweeps.rows["r"], change, after.part(target))
-                if self.velocity:
-                    sweeps.add_moved(sweeps.rows["dr"], change, after.part(target + 2 * inputs))
+                sweeps, _, _ = self.swept(theta, before, x, k, t)
+                end = after.part(target)
+                moved = DualRows(end, end.part(2 * inputs)) if self.velocity else end
+                sweeps.add_moved(sweeps.rows["r"], code.splat(sign * self.share(k), LANES), moved)
         return t
 
     def values(self) -> None:
@@ -464,7 +438,7 @@ class _Points:
         by_state, by_velocity, units, places, J, by_start = self.more
         n_own, starts = self.flags
         rows = self.sweeps(code, self.theta, self.work).rows
-        P, M, G, dG, H, dH = (rows[name] for name in ("P", "M", "G", "dG", "H", "dH"))
+        G, H, P, M = rows["G"], rows["H"], _values(rows["P"]), _values(rows["M"])
         zero = code.constant(0.0, REGISTER)
         with self.blocks() as block:
             begin = self.begin(block)
@@ -482,27 +456,21 @@ class _Points:
                 old, new = code.select(kick, 0 * i + d, 0 * i), code.select(kick, 0 * i, 0 * i + d)
                 with code.over(d * size) as m:
                     G[m] = zero
-                    if self.velocity:
-                        dG[m] = zero
                 with code.over(d * d) as m:
-                    H[m] = dH[m] = zero
+                    H[m] = zero
                 with self.sides() as k:
-                    rate, share = self.side(k)
-                    times = t * code.splat(rate, LANES)
-                    given = before.part(x), before.part(x + 2 * inputs), times, rate
-                    sweeps = self.swept(theta, *given)
+                    sweeps, coordinates, times = self.swept(theta, before, x, k, t)
                     with code.over(d) as j:
-                        part = G.part(j * size), dG.part(j * size)
-                        sweeps.add_sensitivities(*given, code.splat(share, LANES), j, *part)
+                        sweeps.add_sensitivities(coordinates, times, code.splat(self.share(k), LANES), j)
                 with code.over(n_own) as parameter:
                     place, number = code.load(places, parameter, INT), i * n_own + parameter
                     unit = code.splat(sign * code.load(units, number), LANES)
                     with code.over(2 * d) as row:
 
                         def more(j: Value, total: Sequence[Value]) -> list[Value]:
-                            at = row * (2 * d) + old + j
-                            found = fma(P[at], G[j * size + place], total[0])
-                            return [fma(M[at], dG[j * size + place], found) if self.velocity else found]
+                            at, slope = row * (2 * d) + old + j, _flat(G[j * size + place])
+                            found = fma(P[at], slope[0], total[0])
+                            return [fma(M[at], slope[1], found) if self.velocity else found]
 
                         (total,) = code.loop(d, [zero], more)
                         code.store(unit * total, J, (number * (2 * d) + row) * self.n_points + begin)
@@ -510,11 +478,10 @@ class _Points:
                 with code.over(2 * d) as row, code.over(d) as m:
 
                     def back(j: Value, totals: Sequence[Value]) -> list[Value]:
-                        at = row * (2 * d) + old + j
-                        found = [fma(P[at], H[j * d + m], totals[0])]
+                        at, slope = row * (2 * d) + old + j, _flat(H[j * d + m])
+                        found = [fma(P[at], slope[0], totals[0])]
                         if self.velocity:
-                            found[0] = fma(M[at], dH[j * d + m], found[0])
-                            found.append(fma(M[at], H[j * d + m], totals[1]))
+                            found = [fma(M[at], slope[1], found[0]), fma(M[at], slope[0], totals[1])]
                         return found
 
                     at = row * (2 * d) + new + m

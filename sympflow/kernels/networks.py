@@ -91,7 +91,11 @@ class MLPFlowKernel(Kernel):
                 f"{', '.join(SLOPES)}, or one that was registered with `compiled`, to be compiled: use "
                 "backend='array'."
             )
+        self._given = ndof, layers
         self._rollouts = _NetworkRollouts(ndof, layers)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return MLPFlowKernel, self._given
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` times ψ̄_h from one state: see `Kernel`."""

@@ -24,11 +24,10 @@ from sympflow.compiler.machine import address, host
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
-from sympflow.kernels.rollouts import Columns, Rollouts, aligned
+from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room, finished
 from sympflow.kernels.splittings import Shape, Splitting, WithinRange
-from sympflow.kernels.teams import Team, meet
-from sympflow.kernels.threads import NEVER, threads_for
+from sympflow.kernels.teams import Member, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
@@ -46,8 +45,6 @@ LANES = 1 << SHIFT
 CHUNKS, WORTH_CHUNKS = 8, 100_000
 """Chunks of a sum, which threads share, and about how many nanoseconds a sum takes from which there are more than one:
 threads wait for each other after each sum."""
-BLOCK, MOMENT = 1024, 200_000_000
-"""Most steps between two looks for an interrupt, and about how many nanoseconds they may take."""
 
 
 def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Arranged:
@@ -328,13 +325,6 @@ class FewShape(Shape):
         if local.cutoff is None:
             return slope
         return made.operation("where", made.operation("lt", s, made.written(self.number["end"])), slope, 0.0)
-
-
-def zeros(n: int) -> np.ndarray:
-    """Numbers 0 that begin with a line of memory."""
-    x = aligned(n)
-    x[:] = 0.0
-    return x
 
 
 # more bodies than a few: states in memory ---------------------------------------------------------------------------
@@ -623,7 +613,7 @@ def _check_level(level: int) -> None:
         raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
 
 
-class PairCode(Rollouts):
+class PairCode(SharedRollouts):
     """The compiled functions of splitting schemes on bodies in pairs, of which only the potential is part of the code.
 
     Parameters
@@ -636,15 +626,15 @@ class PairCode(Rollouts):
         True if there is friction −γp, whose numbers are the last two rows of a table.
     """
 
-    lanes = 1
-    room = 0
-
     def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
         _check_level(level)
         self._given = local, level, compensated, damped
         self._local = local
         self._stages = PairStages(local, level, compensated, damped)
-        self.memory = partial(BodiesInMemory, local.dim, 4 if compensated else 2)
+        self._sets = 4 if compensated else 2
+        self.memory = partial(BodiesInMemory, local.dim, self._sets)
+        self.work, self.terms = local.work, self._stages.helpers
+        self.pieces = CHUNKS if local.work >= WORTH_CHUNKS else 1
         self._numbers = self._stages.numbers()
         n = local.n_bodies
         self._sites = zeros((1 + len(local.columns)) * (-(-n // LANES) * LANES)).reshape(1 + len(local.columns), -1)
@@ -661,58 +651,24 @@ class PairCode(Rollouts):
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         self._stages.stage(room.places, room.state, kind, [numbers(i) for i in range(self.size)])
 
-    def prepared(self, table: np.ndarray) -> Columns:
-        """The columns of a table, and which sums their kicks have."""
-        kinds = np.zeros(table.shape[1], dtype=np.int64)
-        for k in range(1, 1 + self._stages.helpers):
-            kinds[table[k] != 0] = k
-        return np.ascontiguousarray(table.T), kinds
-
-    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
-        """Call a compiled run or map; one state is shared by several threads where that pays."""
+    def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
         local, stages = self._local, self._stages
-        n, dim = local.n_bodies, local.dim
-        if name == "run":
-            n_rows, n_columns = arguments[5], arguments[2] * (arguments[7] - arguments[6])
-        else:
-            n_rows, n_columns = arguments[6], arguments[2]
-        stop = np.zeros(1, dtype=np.int64)
-        if name == "run" and arguments[-1] is not NEVER:
-            stop = arguments[-1]
-        elif name == "run":
-            arguments = *arguments[:-1], stop
-        size, chunks = self._sites.shape[1], CHUNKS if local.work >= WORTH_CHUNKS else 1
-        team = Team(threads_for(chunks, n_columns * local.work, None) if n_rows == 1 else 1)
-        sums, meeting = aligned(2 * chunks * dim * size), np.zeros(16, dtype=np.int64)
-        sets, sorts = 4 if stages.compensated else 2, stages.cells is not None
-        function = self.function(name, width)
+        n, dim, size, chunks = local.n_bodies, local.dim, self._sites.shape[1], self.pieces
+        sums, sets, sorts = aligned(2 * chunks * dim * size), self._sets, stages.cells is not None
         shared = {"sites": self._sites, "numbers": self._numbers, "sums": sums, "meeting": meeting, "stop": stop}
-        sizes = {"bodies": n, "size": size, "chunks": chunks, "members": team.threads, "turn": 0}
-        sizes |= {"most_cells": most_along(n, dim), "block": max(1, min(BLOCK, MOMENT // local.work))}
-        given = [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
+        sizes = {"bodies": n, "size": size, "chunks": chunks, "members": threads, "turn": 0}
+        sizes |= {"most_cells": most_along(n, dim), "block": block}
 
-        def member(k: int) -> None:
-            room, work = aligned(3 * sets * dim * size), zeros(stages.helpers * dim * size)
+        def member(k: int) -> Member:
             ready = zeros((2 * dim + stages.columns) * size * sorts)
             order, cells = np.arange(n), np.zeros(most_cells(n, dim) * sorts, dtype=np.int64)
-            arrays = shared | {"work": work, "sorted": ready, "order": order, "cells": cells}
+            arrays = shared | {"sorted": ready, "order": order, "cells": cells}
+            arrays["work"] = zeros(stages.helpers * dim * size)
             numbers = sizes | {"member": k} | {name: address(x) for name, x in arrays.items()}
             context = np.array([numbers[name] for name in FIELDS], dtype=np.int64)
-            function(*given, sets * dim * size, 2 * dim * n, address(room), address(context))
+            return Member(aligned(3 * sets * dim * size), context, arrays)
 
-        team(member, stop)
-
-    def step_rows(
-        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
-    ) -> None:
-        """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
-        numbers = np.zeros((*table.shape[:2], len(h)))
-        for k in range(table.shape[2] - 1, -1, -1):
-            numbers = numbers * x + table[:, :, k, None]
-        powers = np.array([1, 1, 3, 5])[: len(table)]
-        tables = (numbers * h ** powers[:, None, None]).transpose(2, 0, 1)
-        for i, each in enumerate(tables):
-            self.mapped(each, y[i : i + 1], out[i : i + 1])
+        return member
 
 
 # forces at many states ------------------------------------------------------------------------------------------------

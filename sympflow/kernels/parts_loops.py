@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
-from sympflow.kernels.loop_functions import states_source
-from sympflow.kernels.modules import load_algebra
+from sympflow.kernels.codegen import tuple_algebra
+from sympflow.kernels.modules import constants_source, load_algebra, template
 from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
 from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import NOTHING, Carry, Kernel, Run, Steps, run_state, run_states
@@ -28,6 +28,13 @@ KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
 
 Maps = Callable[[np.ndarray], Sequence[Map]]
 """The maps of a step of length h (...), their entries of that batch shape."""
+
+
+def states_source(ndof: int) -> str:
+    """The source of states that are tuples, one by one and in lanes, which systems share."""
+    constants = constants_source(COMPENSATED=False, NDOF=ndof, N_VALUES=0)
+    texts = map(template, ("running_states", "aligned", "lane_blocks"))
+    return "\n\n\n".join([constants, tuple_algebra(ndof), *texts])
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
 
-__all__ = ["Columns", "Rollouts", "aligned", "filled"]
+__all__ = ["Columns", "Rollouts", "aligned", "filled", "zeros"]
 
 NONE = np.empty(0)
 LINE = 8  # numbers in a line of memory
@@ -29,6 +29,13 @@ def aligned(n: int) -> np.ndarray:
     memory = np.empty(n + LINE)
     begin = -(address(memory) // 8) % LINE
     return memory[begin : begin + n]
+
+
+def zeros(n: int) -> np.ndarray:
+    """The same, of 0."""
+    x = aligned(n)
+    x[:] = 0.0
+    return x
 
 
 def filled(x: np.ndarray, lanes: int, times: int = 1) -> np.ndarray:

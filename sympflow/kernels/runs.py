@@ -9,7 +9,8 @@ closing column is applied. One function is the run of a single trajectory, and o
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -468,7 +469,14 @@ class Memory:
     """The same in memory: the state, its end, and the state before a block of steps.
 
     A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`.
+
+    Attributes
+    ----------
+    at_once : int
+        Numbers that are copied at a time: a state has a multiple of these.
     """
+
+    at_once = 1
 
     def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
         self.code, self.width, self._remembers = code, width, before
@@ -507,16 +515,24 @@ class Memory:
     def end(self) -> None:
         self._copy(self._running, self._end)
 
+    @contextmanager
+    def _blocks(self) -> Iterator[tuple[Value, Type]]:
+        """Places of blocks of numbers, which are copied at a time, and the type of each."""
+        size = self.at_once * self.width
+        with self.code.over(self.code.op("udiv", INT, self.n_values, self.code.constant(self.at_once, INT))) as i:
+            yield i * size, Type("double", size)
+
     def _copy(self, source: Room, target: Room) -> None:
-        with self.code.over(self.n_values) as i:
-            target.store(source.load(i), i)
+        with self._blocks() as (i, type):
+            self.code.store(self.code.load(source.state, i, type), target.state, i)
 
     def finite(self) -> Value:
-        zero = self.code.constant(0.0, self._end.type)
+        zero = self.code.constant(0.0, Type("double", self.at_once * self.width))
         total = self.code.variable(zero)
-        with self.code.over(self.n_values) as i:
-            total.value = self.code.fma(self._end.load(i), zero, total.value)
-        return self.code.apply("eq", (total.value, 0.0))
+        with self._blocks() as (i, type):
+            total.value = self.code.fma(self.code.load(self._end.state, i, type), zero, total.value)
+        good = self.code.apply("eq", (total.value, 0.0))
+        return good if self.at_once == 1 else ~self.code.any(~good)
 
     def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
         self._write(self._end, self.n_out, out, begin, n_rows, stride, at)

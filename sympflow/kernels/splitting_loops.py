@@ -14,19 +14,16 @@ from numpy.typing import ArrayLike
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
-from sympflow.kernels.stages import StageTable, damped_drift, run_table, step_table
+from sympflow.kernels.stages import StageTable, check_damping, run_table, step_table
 from sympflow.kernels.threads import given
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.kernels.approximations import Ranges
-    from sympflow.kernels.loop_functions import LoopFunctions
     from sympflow.kernels.rollouts import Rollouts
     from sympflow.kernels.splittings import Splitting
     from sympflow.kernels.stage_times import Driving
-
-    Functions = LoopFunctions | Rollouts
 
 
 def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
@@ -72,21 +69,19 @@ class SplittingLoops:
         By how much less it takes in a batch, whose lanes run side by side.
     driven : bool
         True if H depends on t.
-    closes : bool
-        True if runs in other coordinates hand closed outputs to χ, not those before the last stage of K.
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
-        self._has_ranges = self.closes = self.traced = self._large = False
+        self._has_ranges = self.traced = self._large = False
         self._symbols: Any = system.symbols
         self._form: Any = system.symbols
         self._driving: Driving | None = None
         self._written: Callable[..., Splitting] | None = None
-        self._compile: Callable[..., Functions]
-        self._codes: dict[Any, Functions] = {}
+        self._compile: Callable[..., Rollouts]
+        self._codes: dict[Any, Rollouts] = {}
         self._longs: dict[int, bool] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
@@ -98,7 +93,7 @@ class SplittingLoops:
 
             self._has_force_gradient = system.quadratic_kinetic
             self._large = is_large(system.symbols)
-            damped_drift(system, self._large)
+            check_damping(system, self._large)
             if self.driven:
                 from sympflow.kernels.stage_times import driven_form
 
@@ -121,7 +116,7 @@ class SplittingLoops:
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
-            damped_drift(system, True)
+            check_damping(system, True)
             from sympflow.kernels.array_splittings import function_code
 
             given = gradient, hessian_vector, system.inverse_mass, self.driven
@@ -139,10 +134,9 @@ class SplittingLoops:
                 self._written, self.values = few(system.local)
                 self._compile = partial(pair_code, system.local, system.friction is not None)
             else:
-                from sympflow.kernels.loop_functions import local_loops
+                from sympflow.kernels.lattices import lattice_code
 
-                self.closes = True
-                self._compile = partial(local_loops, system)
+                self._compile = partial(lattice_code, system.local, system.friction is not None)
             self._has_force_gradient = system.quadratic_kinetic
             self.traced = self._written is not None
         else:
@@ -152,7 +146,7 @@ class SplittingLoops:
             )
         self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops
         self._has_curvature = system.symbols is not None or system.local is not None
-        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], Functions] = {}
+        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], Rollouts] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, with the ranges, for which the system would be asked."""
@@ -195,7 +189,7 @@ class SplittingLoops:
         monomials: Monomials = (),
         varied: bool = False,
         ranges: Ranges | None = None,
-    ) -> Functions:
+    ) -> Rollouts:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
         Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
@@ -220,7 +214,7 @@ class SplittingLoops:
 
     def _made(
         self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges | None
-    ) -> Functions:
+    ) -> Rollouts:
         if not self.traced:
             more: dict[str, Any] = {"varied": True} if varied else {}
             return self._compile(level, compensated, monomials, **more)
@@ -236,7 +230,7 @@ class SplittingLoops:
             self._longs[level] = is_long(self._form, level)
         return self._longs[level]
 
-    def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges) -> Functions:
+    def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges) -> Rollouts:
         """The functions over traced numbers, which serve batches with own values too."""
         from sympflow.kernels.splittings import SplittingCode, shared
 
@@ -266,6 +260,12 @@ class SplittingLoops:
             return self._written(level, monomials, compensated, ndim)
         symbols = self._form.parametric if parametric and driving is None and not ranges else self._form
         return Splitting(symbols, level, monomials, compensated, ndim, driving, ranges)
+
+    def kick_cycles(self, level: int, ranges: Ranges = ()) -> float:
+        """About how long a single trajectory takes for a kick of a level and a drift, in cycles."""
+        if self._long(level):
+            return float(self._form.V.count_ops() * (1 + level))
+        return self.splitting(level, ranges=ranges).cycles
 
     def ranges(self, level: int, compensated: bool) -> Ranges | None:
         """The positions of the system's domain, for `functions` of a flow: none where they would change nothing."""
@@ -407,7 +407,7 @@ class SplittingKernel(Kernel):
         """The states of a batch (N, 2d) as the loops read them; a run that goes on reads no states from them."""
         return given(y)
 
-    def _functions(self) -> Functions:
+    def _functions(self) -> Rollouts:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, ranges=self._ranges)
 
 
@@ -466,7 +466,7 @@ class VariedKernel(SplittingKernel):
             values[:] = self._values
         return self._latest
 
-    def _functions(self) -> Functions:
+    def _functions(self) -> Rollouts:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)
 
 
@@ -498,6 +498,6 @@ def _damped_stages(scheme: Scheme, h: float, friction: Friction) -> StageTable:
 
 
 def _with_friction(table: StageTable, friction: Friction) -> StageTable:
-    """A table with the rows of `DampedDrift`."""
+    """A table with the rows of a drift with friction."""
     mean, decay = friction.factors(table.drifts)
     return replace(table, more=np.concatenate([mean.T, decay.T]))

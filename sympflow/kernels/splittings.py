@@ -16,8 +16,8 @@ import numpy as np
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Type, Value
-from sympflow.compiler.functions import times
-from sympflow.compiler.program import Program, derivatives, gradient, traced
+from sympflow.compiler.functions import FUNCTIONS, times
+from sympflow.compiler.program import Program, Traced, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.approximations import OnInterval, Ranges, on_interval
@@ -100,6 +100,17 @@ class Splitting:
     def kinds(self) -> Sequence[Arranged | WithinRange]:
         """The stages, those with the fewest terms first."""
         return [self._within_range(terms) if self.ranges else self._arranged(terms) for terms in self.terms]
+
+    @property
+    def cycles(self) -> float:
+        """About how long a single trajectory takes for a stage with all terms, in cycles."""
+        stage = self.kinds()[-1]
+        body = stage.near.body if isinstance(stage, WithinRange) else stage.body
+        known: dict[int, int] = {}
+        for x in body.operations:
+            ready = max((known.get(a.order, 0) for a in x.args if isinstance(a, Traced)), default=0)
+            known[x.order] = ready + FUNCTIONS[x.name].cost
+        return max(known.values(), default=0) + len(body) / 2
 
     def _within_range(self, terms: int) -> Arranged | WithinRange:
         """The stage as a polynomial in its range, if there is one."""
@@ -263,21 +274,22 @@ class WithinRange:
 
     Attributes
     ----------
+    near : Arranged
     table : callable
         From the constants of a run to the numbers that both read.
     """
 
     def __init__(self, near: Arranged, exact: Arranged, low: float, high: float) -> None:
-        self._near, self._exact, self._low, self._high = near, exact, low, high
+        self.near, self._exact, self._low, self._high = near, exact, low, high
         self.table = _Both(near.table, exact.table)
 
     def body(self, q: Value, *rest: Value) -> list[Value]:
         """The state after the stage."""
-        n, code = len(self._near.body.inputs) - len(self._near.table.outputs) - 1, q.code
+        n, code = len(self.near.body.inputs) - len(self.near.table.outputs) - 1, q.code
         state, column = (q, *rest[:n]), rest[n:]
-        here = len(self._near.table.outputs)
+        here = len(self.near.table.outputs)
         inside = (self._low <= q) & (q <= self._high)
-        near = self._near.body(*state, *column[:here])
+        near = self.near.body(*state, *column[:here])
 
         def exact() -> list[Value]:
             values = self._exact.body(*state, *column[here:])

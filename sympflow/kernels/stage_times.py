@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,8 @@ from sympflow.compiler.functions import apply, where
 from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled, with_letters
 from sympflow.hamiltonian.recorded import check_recorded, evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.codegen import printed, sampled_name, statements
+from sympflow.kernels.codegen import sampled_name
 from sympflow.kernels.samples import check_samples, sampled_value
-from sympflow.kernels.stages import Kick, numbers_of_kicks, time_lines
 
 __all__ = ["Driving", "driven_form", "in_code", "letters_of_time", "sampled_sources"]
 
@@ -86,80 +84,6 @@ class Driving:
             check_recorded(f)
         for samples in self.samples.values():
             check_samples(samples)
-
-    def source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        """``numbers_of(table, j, k)`` and ``numbers_at(table, j, x, h, t)``: see `stages.TimedNumbers`."""
-        numbers, scaled = numbers_of_kicks(kinds)
-        fixed = self.form.parameters[: len(self.form.values)]
-        rows = range(n_rows, n_rows + len(fixed))
-        run, one = ([line] for line in time_lines(rows.stop))
-        run += ["length = table[0, j]", *(f"{s} = table[{i}, j]" for s, i in zip(fixed, rows, strict=True))]
-        one += [
-            "length = h * polynomial(table[0, j], x)",
-            *(f"{s} = table[{i}, j, 0]" for s, i in zip(fixed, rows, strict=True)),
-        ]
-        letters = [s.name for s in (*self.letters, *self.means)]
-        given = ", ".join(["time", "length", *map(str, fixed)])
-        drawn = f"{', '.join(letters)}, = letters_at({given})"
-        names = [s.name for s in self.form.parameters]
-        sources = [
-            *self._sampled_sources,
-            _function(f"letters_at({given})", self._letter_lines, letters),
-            _function("numbers_of(table, j, k=0)", [*run, drawn], [*numbers, *names]),
-            _function("numbers_at(table, j, x, h, t)", [*one, drawn], [*scaled, *names]),
-        ]
-        return "\n\n\n".join(sources)
-
-    def lane_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        """``common_of(table, j, k)`` and ``numbers_of_lane(Y, common, lane)``: see `stages.LaneNumbers`."""
-        numbers, _ = numbers_of_kicks(kinds)
-        fixed = self.form.parameters[: len(self.form.values)]
-        run, _ = time_lines(n_rows + len(fixed))
-        given = [f"common_{i}" for i in range(len(numbers))]
-        letters = [s.name for s in (*self.letters, *self.means)]
-        lines = [
-            f"{', '.join([*given, 'time', 'length'])} = common",
-            *(f"{s} = Y[2 * NDOF + {i}, lane]" for i, s in enumerate(fixed)),
-            f"{', '.join(letters)}, = letters_at({', '.join(['time', 'length', *map(str, fixed)])})",
-        ]
-        common = _function("common_of(table, j, k=0)", [run], [*numbers, "time", "table[0, j]"])
-        names = [s.name for s in self.form.parameters]
-        return f"{common}\n\n\n{_function('numbers_of_lane(Y, common, lane)', lines, [*given, *names])}"
-
-    def later_source(self, kinds: Sequence[Kick], n_rows: int) -> str:
-        """``timed_numbers(table, j)`` and ``numbers_after(common, k)``: see `stages.LaneNumbers`."""
-        numbers, _ = numbers_of_kicks(kinds)
-        fixed = [s.name for s in self.form.parameters[: len(self.form.values)]]
-        kept = [f"common_{i}" for i in range(len(numbers))]
-        rows = range(n_rows, n_rows + len(fixed) + 3)
-        common = [*numbers, *(f"table[{i}, j]" for i in rows), "table[0, j]"]
-        letters = [s.name for s in (*self.letters, *self.means)]
-        lines = [
-            f"{', '.join([*kept, *fixed, 'before', 'first', 'step', 'length'])} = common",
-            "time = first + (k * step + before)",
-            f"{', '.join(letters)}, = letters_at({', '.join(['time', 'length', *fixed])})",
-        ]
-        names = [s.name for s in self.form.parameters]
-        of_stage = _function("timed_numbers(table, j)", [], common)
-        return f"{of_stage}\n\n\n{_function('numbers_after(common, k)', lines, [*kept, *names])}"
-
-    @cached_property
-    def _letter_lines(self) -> list[str]:
-        """The letters at `time`, and their means over the `length` from there."""
-        names = [s.name for s in self.letters]
-        integrals = [f"integral_{i}" for i in range(len(self.means))]
-        wanted = [*self.letters.values(), *(integral for _, integral in self.means.values())]
-        lines = statements([*names, *integrals], [in_code(f, self.time, "time") for f in wanted])
-        for (mean, (f, _)), integral in zip(self.means.items(), integrals, strict=True):
-            now = printed(in_code(f, self.time, "time"))
-            lines.append(f"{mean} = {integral} / length if length != 0.0 else {now}")
-        return lines
-
-    @property
-    def _sampled_sources(self) -> list[str]:
-        return sampled_sources(
-            [*self.letters.values(), *(f for pair in self.means.values() for f in pair)], self.samples
-        )
 
 
 def driven_form(symbols: SymbolicHamiltonian) -> Driving:
@@ -268,8 +192,3 @@ def _sampled_source(name: str, order: int, samples: Samples) -> str:
     return "\n    ".join(
         [f"import numpy as np\n\n{constants}\n\n\n@njit(**OPTIONS)\ndef {called}(t):", *lines, f"return total{rest}"]
     )
-
-
-def _function(head: str, lines: Sequence[str], results: Sequence[str]) -> str:
-    returned = f"return ({''.join(f'{result}, ' for result in results)})"
-    return "\n    ".join([f"@njit(**OPTIONS)\ndef {head}:", *lines, returned])

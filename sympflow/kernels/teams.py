@@ -10,17 +10,24 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sympflow.compiler.control import INT, Type, Value
+from sympflow.compiler.machine import address
+from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.runs import BLOCK
+from sympflow.kernels.threads import NEVER, threads_for
 
-__all__ = ["Team", "meet"]
+__all__ = ["Member", "SharedRollouts", "Team", "meet"]
 
 ARRIVED, TURN = 0, 8
 """Places in `meeting` (16,), in lines of the cache of their own: threads that are here, and times that all were."""
-SPINS, YIELDS = 20_000, 200  # looks before a thread lets others run, and before it sleeps
+SPINS, YIELDS = 1_000, 2_000  # looks before a thread lets others run, and before it sleeps
 PAUSE = 20  # µs
+MOMENT = 200_000_000  # about how many nanoseconds pass between two looks for an interrupt
 _I32 = Type("i32")
 
 
@@ -87,3 +94,88 @@ def _waited(meeting: Value, members: Value, stop: Value) -> None:
                 code.external("usleep", (code.constant(PAUSE, _I32),), _I32)
         stopped = code.apply("eq", (code.load(stop, 0, INT, shared=True), 0))
         going.value = code.apply("eq", (seen(TURN), turn)) & stopped
+
+
+@dataclass(frozen=True)
+class Member:
+    """What one thread of a team has.
+
+    Attributes
+    ----------
+    room : ndarray
+        For three states.
+    context : ndarray of int64
+        Numbers and addresses that stages read.
+    others : tuple
+        What is kept for these addresses.
+    """
+
+    room: np.ndarray
+    context: np.ndarray
+    others: Any = ()
+
+
+class SharedRollouts(Rollouts):
+    """The compiled functions of systems of any size, whose states are in memory and which threads may share.
+
+    Attributes
+    ----------
+    work : int
+        About how many nanoseconds a stage takes.
+    pieces : int
+        Most threads that it is worth to share.
+    terms : int
+        Numbers of a kick.
+    """
+
+    lanes = 1
+    room = 0
+    work: int
+    pieces: int
+    terms: int
+
+    def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
+        """What makes the members of a team: by the numbers where it meets and what ends it, the threads, and the most
+        steps between two looks for an interrupt."""
+        raise NotImplementedError
+
+    def prepared(self, table: np.ndarray) -> Columns:
+        """The columns of a table; their kinds tell the last of b, g and c that is not 0, from 1 on."""
+        kinds = np.zeros(table.shape[1], dtype=np.int64)
+        for k in range(1, 1 + self.terms):
+            kinds[table[k] != 0] = k
+        return np.ascontiguousarray(table.T), kinds
+
+    def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
+        """Call a compiled run or map; one state is shared by several threads where that pays."""
+        if name == "run":
+            n_rows, n_columns = arguments[5], arguments[2] * (arguments[7] - arguments[6])
+        else:
+            n_rows, n_columns = arguments[6], arguments[2]
+        stop = np.zeros(1, dtype=np.int64)
+        if name == "run" and arguments[-1] is not NEVER:
+            stop = arguments[-1]
+        elif name == "run":
+            arguments = *arguments[:-1], stop
+        team = Team(threads_for(self.pieces, n_columns * self.work, None) if n_rows == 1 else 1)
+        function, meeting = self.function(name, width), np.zeros(16, dtype=np.int64)
+        given = [address(x) if isinstance(x, np.ndarray) else x for x in arguments]
+        members = self.members(meeting, stop, team.threads, max(1, min(BLOCK, MOMENT // max(1, self.work))))
+
+        def run(k: int) -> None:
+            own = members(k)
+            function(*given, len(own.room) // 3, self.n_out, address(own.room), address(own.context))
+
+        team(run, stop)
+
+    def step_rows(
+        self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
+        numbers = np.zeros((*table.shape[:2], len(h)))
+        for k in range(table.shape[2] - 1, -1, -1):
+            numbers = numbers * x + table[:, :, k, None]
+        powers = np.array([1, 1, 3, 5])[: len(table)]
+        tables = (numbers * h ** powers[:, None, None]).transpose(2, 0, 1)
+        for i, each in enumerate(tables):
+            self.mapped(each, y[i : i + 1], out[i : i + 1])

@@ -90,7 +90,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     (of a system with friction: the difference from the energy along the exact orbit) is e, the work of a classical
     scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take the least time in a unit of
     time, times e^(1/p), p = 6. Curvature terms are tried with the best Δt, unless they make kicks twice as dear. What
-    kicks with and without them take is estimated in cycles (`kick_cycles`), and where that does not decide, by a
+    kicks with and without them take is estimated in cycles, and where that does not decide, by a
     quarter, measured: the loops of both flows are compiled and run, as they will be by `solve`. Then `SHAPES` are tried
     with kicks of the better kind, some of which have fewer terms or none: about as many in a unit of time as at that Δt
     and at the next shorter one; a larger processor must gain a twentieth. Where all errors are above 1e-5 it is the
@@ -114,14 +114,14 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         If the time that the session has for trials ended them.
     """
     from sympflow.kernels.approximations import position_ranges
-    from sympflow.kernels.kicks import kick_cycles
+    from sympflow.kernels.splitting_loops import splitting_loops
 
     assert system.symbols is not None
     starts = tried_starts(system, domain, curvature=False)
     try:
         ranges = position_ranges(system.symbols, domain) if system.autonomous else ()
-        joined = system.autonomous and system.friction is None
-        costs = [kick_cycles(system.symbols, level, ranges, joined) for level in (0, FORCE_GRADIENT, CURVATURE)]
+        loops = splitting_loops(system)
+        costs = [loops.kick_cycles(level, ranges if level else ()) for level in (0, FORCE_GRADIENT, CURVATURE)]
     except ValueError:  # H has no compiled form
         return Trial(starts[0], math.inf)
     session, found = Session() if session is None else session, dict[Primed, Trial]()

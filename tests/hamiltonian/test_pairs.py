@@ -107,6 +107,17 @@ class TestRuns:
         assert np.abs(p - p[:, :1]).max() < 8 * steps * eps * size
         assert np.abs(L - L[:, :1]).max() < 32 * steps * eps * size
 
+    @pytest.mark.parametrize("method", ["gauss_legendre4", "log_leapfrog"])
+    def test_methods_that_need_symbols_take_those_of_a_few_bodies(self, method):
+        system = gravity(3)
+        sol = solve(system, method, (0, 0.5))
+        assert sol.stats["backend"] == "compiled"
+        np.testing.assert_allclose(sol.y, solve(system, method, (0, 0.5), backend="array").y, rtol=0, atol=1e-12)
+        assert gravity(7).written is None
+        heavier = system.with_params(G=0.5)
+        q = system.y0[:9]
+        np.testing.assert_allclose(heavier.written.potential(q), heavier.potential(q), rtol=1e-13)
+
     @pytest.mark.parametrize("dim", [1, 2, 3])
     @pytest.mark.parametrize("n", [5, 20], ids=["written out", "in memory"])
     def test_kinds_of_bodies_in_a_box_with_a_cut_off(self, n, dim):

@@ -1,5 +1,7 @@
 """The compiled SympFlow against the torch one."""
 
+import pickle
+
 import numpy as np
 import pytest
 import torch
@@ -140,6 +142,11 @@ def test_states_that_are_not_finite(flow):
     assert (n_finite[~harmed] == 4).all()
     fine = ~harmed & (np.arange(40) != 8)
     assert step_errors(flow, 0.8, Y[fine].swapaxes(0, 1)).max() < ROUNDING
+
+
+def test_kernels_can_be_pickled(flow):
+    kernel, y = flow.kernel_for(None), states(3, 2)
+    assert np.array_equal(pickle.loads(pickle.dumps(kernel)).step(0.3, y).states, kernel.step(0.3, y).states)
 
 
 def test_refusals():

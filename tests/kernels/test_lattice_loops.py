@@ -1,4 +1,4 @@
-"""Compiled loops of lattices: the steps of the array operations, whatever the size, the tiles and the threads."""
+"""Compiled loops of lattices: the steps of the array operations, whatever the size, the lanes and the threads."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, solve
-from sympflow.kernels import lattice_loops
+from sympflow.kernels import lattices
+from sympflow.kernels.protocol import Carry
 from sympflow.kernels.splitting_loops import splitting_loops
+from sympflow.kernels.stages import single_table
 from sympflow.kernels.threads import at_most
 from sympflow.schemes import SCHEMES
 
@@ -54,7 +56,7 @@ def compared(system, method, y0, **more):
     return loops.stats["backend"], arrays.stats["backend"]
 
 
-@pytest.mark.parametrize("method", [pytest.param("srkn6b", marks=pytest.mark.slow), "chin4c"])
+@pytest.mark.parametrize("method", ["srkn6b", "chin4c"])
 def test_loops_make_the_steps_of_array_operations(method):
     system = chain()
     assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
@@ -69,9 +71,9 @@ def test_loops_make_the_steps_of_array_operations(method):
     ("boundary", "method"),
     [
         ("free", "chin4c"),
-        pytest.param("fixed", "chin4c", marks=pytest.mark.slow),
-        pytest.param("periodic", "chin4c", marks=pytest.mark.slow),
-        pytest.param("free", "verlet", marks=pytest.mark.slow),
+        ("fixed", "chin4c"),
+        ("periodic", "chin4c"),
+        ("free", "verlet"),
     ],
 )
 def test_chains_in_vector_registers(boundary, method):
@@ -92,7 +94,6 @@ def test_chains_in_vector_registers(boundary, method):
         assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("boundary", ["free", "periodic"])
 def test_two_fields_in_vector_registers(boundary):
     system = HamiltonianSystem.lattice(
@@ -109,10 +110,10 @@ def test_two_fields_in_vector_registers(boundary):
     ("boundary", "method"),
     [
         (("free", "fixed"), "chin4c"),
-        pytest.param(("fixed", "free"), "chin4c", marks=pytest.mark.slow),
-        pytest.param(("periodic", "periodic"), "chin4c", marks=pytest.mark.slow),
-        pytest.param(("fixed", "periodic"), "verlet", marks=pytest.mark.slow),
-        pytest.param(("periodic", "free"), "verlet", marks=pytest.mark.slow),
+        (("fixed", "free"), "chin4c"),
+        (("periodic", "periodic"), "chin4c"),
+        (("fixed", "periodic"), "verlet"),
+        (("periodic", "free"), "verlet"),
     ],
 )
 def test_sheets_in_vector_registers(boundary, method):
@@ -134,11 +135,9 @@ def test_sheets_in_vector_registers(boundary, method):
     ("definition", "shape"),
     [
         ({"onsite": "q", "bond": "r"}, (3, 8)),
-        pytest.param(
-            {"onsite": "q**2/2", "bond": "r", "boundary": ("free", "periodic")}, (3, 8), marks=pytest.mark.slow
-        ),
+        ({"onsite": "q**2/2", "bond": "r", "boundary": ("free", "periodic")}, (3, 8)),
         ({"onsite": "cos(q)", "bond": "r", "boundary": "free"}, 12),
-        pytest.param({"bond": {1: "r", 2: "r**2/2"}, "boundary": "free"}, 12, marks=pytest.mark.slow),
+        ({"bond": {1: "r", 2: "r**2/2"}, "boundary": "free"}, 12),
     ],
 )
 def test_bonds_of_constant_force(definition, shape):
@@ -147,7 +146,7 @@ def test_bonds_of_constant_force(definition, shape):
     assert compared(system, "chin4c", start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.parametrize("power", [pytest.param(14, marks=pytest.mark.slow), 15])
+@pytest.mark.parametrize("power", [14, 15])
 def test_powers_that_only_derivatives_have(power):
     system = HamiltonianSystem.lattice(bond=f"1/(2 + r)**{power} + r**2", shape=13, boundary="free")
     assert compared(system, "chin4c", start(system)) == LOOPS_AND_ARRAYS
@@ -161,7 +160,6 @@ def test_a_bond_that_is_not_there_may_be_infinite():
     assert compared(system, "verlet", y0) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damping", [None, 0.3])
 def test_two_fields_on_a_sheet_in_vector_registers(damping):
     system = HamiltonianSystem.lattice(
@@ -176,53 +174,12 @@ def test_two_fields_on_a_sheet_in_vector_registers(damping):
     assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.parametrize("boundary", ["free", pytest.param("fixed", marks=pytest.mark.slow)])
-def test_tiles_of_chains_with_ends(boundary, monkeypatch):
-    """What is computed of a site is the same in tiles, to the bit: no loop has a rest that is computed otherwise."""
-
-    def make():
-        return HamiltonianSystem.lattice(
-            bond="r**2/2 + r**4/4", kinetic="m*p**2", shape=270, boundary=boundary, params=params
-        )
-
-    params = {"m": np.random.default_rng(5).uniform(0.5, 1.5, 270)}
-    y0, options = start(make()), {"t_span": (0.0, 3.0), "dt": 0.05, "t_eval": np.array([0.0, 1.5, 3.0])}
-    whole = solve(make(), "chin4c", y0=y0, **options)
-    monkeypatch.setattr(lattice_loops, "TILE", 25)
-    monkeypatch.setattr(lattice_loops, "MARGIN", 5)
-    np.testing.assert_array_equal(solve(make(), "chin4c", y0=y0, backend="compiled", **options).y, whole.y)
-
-
-@pytest.mark.parametrize(
-    "boundary",
-    [("free", "periodic"), *(pytest.param((b, "free"), marks=pytest.mark.slow) for b in ("periodic", "fixed"))],
-)
-def test_tiles_of_sheets(boundary, monkeypatch):
-    def make():
-        return HamiltonianSystem.lattice(
-            bond="r**2/2 + r**4/4", kinetic="m*p**2", shape=(180, 9), boundary=boundary, params=params
-        )
-
-    params = {"m": np.random.default_rng(5).uniform(0.5, 1.5, (180, 9))}
-    y0, options = start(make()), {"t_span": (0.0, 3.0), "dt": 0.05, "t_eval": np.array([0.0, 1.5, 3.0])}
-    whole = solve(make(), "chin4c", y0=y0, **options)
-    monkeypatch.setattr(lattice_loops, "LARGER_TILE", 90)
-    monkeypatch.setattr(lattice_loops, "MARGIN", 3)
-    for threads in (1, 2):
-        with at_most(threads):
-            found = solve(make(), "chin4c", y0=y0, backend="compiled", **options)
-        assert splitting_loops(found.system).functions(SCHEMES["chin4c"].level, False).rollout.__self__._tiled
-        np.testing.assert_allclose(found.y, whole.y, rtol=0, atol=1e-12)  # in passes, the whole in registers
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("boundary", [("fixed", "free"), ("periodic", "periodic")])
 def test_lattices_of_two_axes(boundary):
     system = sheet(boundary)
     assert compared(system, "verlet", start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("boundary", "method"),
     [("periodic", "chin4c"), ("fixed", "verlet"), (("free", "periodic", "fixed"), "verlet")],
@@ -238,54 +195,66 @@ def test_several_fields_in_three_dimensions(boundary, method):
     assert compared(system, method, start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.parametrize(("make", "method"), [(ring, "srkn6b"), (chain, "chin4c")])
-def test_tiles_and_threads_change_nothing(make, method, monkeypatch):
-    """One module runs a lattice in one piece and in tiles; a site's arithmetic is the same up to fused products.
+@pytest.fixture
+def pieces(monkeypatch):
+    """Lattices that threads share however small they are."""
+    monkeypatch.setattr(lattices, "WORTH_A_PIECE", 16)
 
-    Force gradients read accelerations beyond walls, where the tile before had sites.
-    """
-    n, y0, options = 270, start(make(270)), {"t_span": (0.0, 3.0), "dt": 0.05, "t_eval": np.array([0.0, 1.5, 3.0])}
-    whole = solve(make(n), method, y0=y0, **options)
-    monkeypatch.setattr(lattice_loops, "TILE", 25)
-    monkeypatch.setattr(lattice_loops, "MARGIN", 5)
-    tiles = []
+
+@pytest.mark.parametrize("method", ["verlet", "chin4c"])
+@pytest.mark.parametrize("shape", [270, 271, (40, 9), (9, 40), (9, 8, 5)])
+@pytest.mark.parametrize("boundary", ["periodic", "fixed", "free"])
+def test_pieces_and_threads_change_nothing(method, shape, boundary, pieces):
+    """What is computed of a site is the same in all lanes and pieces, to the bit."""
+    values = np.random.default_rng(5).uniform(0.5, 1.5, shape)
+    system = HamiltonianSystem.lattice(
+        bond="r**2/2 + r**4/4", kinetic="m*p**2", shape=shape, boundary=boundary, params={"m": values}
+    )
+    y0, options = start(system), {"t_span": (0.0, 1.0), "dt": 0.05, "t_eval": np.array([0.0, 0.5, 1.0])}
+    runs = []
     for threads in (1, 2, 3):
         with at_most(threads):
-            tiles.append(solve(make(n), method, y0=y0, backend="compiled", **options))
-    assert splitting_loops(tiles[0].system).functions(SCHEMES[method].level, False).rollout.__self__._tiled
-    np.testing.assert_allclose(tiles[0].y, whole.y, rtol=1e-12, atol=1e-13)
-    for other in tiles[1:]:
-        np.testing.assert_array_equal(other.y, tiles[0].y)
-    batch = solve(make(n), method, y0=np.stack([y0, y0]), **options)
-    np.testing.assert_array_equal(batch.y[1], tiles[0].y)
+            runs.append(solve(system, method, y0=y0, backend="compiled", **options).y)
+    assert splitting_loops(system).functions(SCHEMES[method].level, False).rollout.__self__.pieces > 1
+    batch = solve(system, method, y0=np.stack([y0, y0]), backend="compiled", **options).y
+    for other in (*runs[1:], batch[1]):
+        np.testing.assert_array_equal(other, runs[0])
 
 
-@pytest.mark.parametrize("tile", [25, 4096])
-def test_a_run_that_becomes_infinite_keeps_what_it_has(tile, monkeypatch):
-    monkeypatch.setattr(lattice_loops, "TILE", tile)
-    monkeypatch.setattr(lattice_loops, "MARGIN", 5)
+def test_widths_change_nothing(monkeypatch):
+    system, runs = chain(48), []
+    for width in (1, 2, 4, 8):
+        monkeypatch.setattr(lattices, "arrangement", lambda lattice, width=width: ([0], width))
+        code = lattices.LatticeCode(system.local, SCHEMES["chin4c"].level, False, False)
+        runs.append(np.empty((1, 96)))
+        code.mapped(single_table(SCHEMES["chin4c"], 0.1).packed, start(system, 1), runs[-1])
+        np.testing.assert_array_equal(runs[-1], runs[0])
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_run_that_becomes_infinite_keeps_what_it_has(threads, pieces):
     system = ring(230)
     y0 = start(system)
     y0[7] = 60.0
-    loops, arrays = (
-        solve(system, "srkn6b", t_span=(0.0, 10.0), y0=y0, dt=0.2, backend=backend) for backend in ("compiled", "array")
-    )
+    with at_most(threads):
+        loops, arrays = (
+            solve(system, "srkn6b", t_span=(0.0, 10.0), y0=y0, dt=0.2, backend=backend)
+            for backend in ("compiled", "array")
+        )
     assert loops.status == arrays.status == -1
     np.testing.assert_array_equal(loops.t, arrays.t)
 
 
-def test_a_run_in_pieces_has_the_bits_of_one(monkeypatch):
-    from sympflow.kernels.protocol import Carry
-
-    for tile in (25, 4096):
-        monkeypatch.setattr(lattice_loops, "TILE", tile)
-        monkeypatch.setattr(lattice_loops, "MARGIN", 5)
-        system = ring(230)
-        y0, kernel = start(system), splitting_loops(system).kernel(SCHEMES["srkn6b"])
-        whole = kernel.run(0.05, y0, 90, np.array([20, 90])).states
-        carry = Carry()
-        pieces = [kernel.run(0.05, y0, n, np.array([n]), carry).states[0] for n in (20, 90)]
-        np.testing.assert_array_equal(np.stack(pieces), whole)
+@pytest.mark.parametrize("compensated", [False, True])
+def test_a_run_in_pieces_has_the_bits_of_one(compensated, pieces):
+    system = ring(230)
+    y0, kernel = start(system), splitting_loops(system).kernel(SCHEMES["srkn6b"], compensated)
+    for threads in (1, 2):
+        with at_most(threads):
+            whole = kernel.run(0.05, y0, 90, np.array([20, 90])).states
+            carry = Carry()
+            parts = [kernel.run(0.05, y0, n, np.array([n]), carry).states[0] for n in (20, 90)]
+        np.testing.assert_array_equal(np.stack(parts), whole)
 
 
 def test_events_and_dense_output_go_by_the_one_driver():
@@ -299,13 +268,11 @@ def test_events_and_dense_output_go_by_the_one_driver():
         assert abs(sol.sol(t)[0]) < 1e-10
 
 
-@pytest.mark.slow
 def test_friction_is_the_same_in_loops():
     system = ring(damping=0.2)
     assert compared(system, "srkn6b", start(system)) == LOOPS_AND_ARRAYS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("shape", [48, (6, 9)])
 def test_compensated_sums_lower_the_rounding(shape):
     """There and back by a symmetric scheme: what is left is rounding, whatever the error of the method."""
@@ -320,8 +287,8 @@ def test_compensated_sums_lower_the_rounding(shape):
 
 
 def test_the_code_does_not_depend_on_the_size():
-    few, many = (splitting_loops(ring(n)).functions(0, False).rollout.__self__._module for n in (16, 100_000))
-    assert few is many
+    few, many = (splitting_loops(ring(n)).functions(0, False).rollout.__self__ for n in (64, 6400))
+    assert few.function("run", 1) is many.function("run", 1)
 
 
 def test_what_has_no_loops_runs_on_arrays():

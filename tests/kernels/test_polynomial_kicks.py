@@ -1,7 +1,5 @@
 """Kicks with a polynomial in q: its monomials, their derivatives, and tables that carry it."""
 
-import itertools
-
 import numpy as np
 import pytest
 import sympy as sp
@@ -11,7 +9,6 @@ import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.hamiltonian.monomials import gradient, in_monomials, monomials, value
 from sympflow.integrators.splitting import Splitting
-from sympflow.kernels.kicks import _function, _scheduled, shapes
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import Scheme
 from sympflow.training.starts import Primed
@@ -114,36 +111,6 @@ def test_values_and_gradients(each):
     for numbers, at in ((c, q), (t, torch.tensor(q))):
         np.testing.assert_allclose(np.asarray(value(MONOMIALS, numbers, at)), written.detach(), rtol=1e-13, atol=1e-14)
         np.testing.assert_allclose(np.asarray(gradient(MONOMIALS, numbers, at)), slope, rtol=1e-13, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("V", "of_kicks", "multiplications"),
-    [
-        ("q1**4/4 + 3*q1**2*q2**2/10 + q1**2/5 + q2**4/4", ((2, 0), (0, 6), (2, 4), (4, 2), (6, 0)), 12),
-        ("q1**2*q2 - q2**3/3", MONOMIALS, None),  # other powers of q1 than of q2
-        ("q1**2*q2**2", ((2, 4), (4, 2)), 8),  # each coordinate alone has no term
-        ("q1*q2", ((1, 1), (2, 1)), None),
-        ("q1**2*q2**2 + q1 + q2**2", ((2, 2),), None),  # a force that q1 is no factor of
-        ("q1**2 + q2**4", ((4, 0), (0, 6)), None),  # the coordinates do not mix
-    ],
-)
-def test_every_shape_of_a_polynomial_gives_the_same_momenta(V, of_kicks, multiplications):
-    """And by the products that both momenta share there are fewer multiplications, with the squares."""
-    symbols = of(V)
-    letters = sp.symbols(" ".join(f"e_{m}" for m in range(len(of_kicks))), real=True, seq=True)
-    fewest, rng = 1000, np.random.default_rng(2)
-    for shape, common in itertools.product(shapes(symbols, 1, of_kicks), (True, False)):
-        kick = _scheduled(symbols, shape, "s_", common)
-        functions = {"fused_multiply_add": lambda a, b, c: a * b + c, "njit": lambda **_: lambda f: f, "OPTIONS": {}}
-        arguments = ", ".join(["q, p, b", *map(str, letters)])
-        exec(_function(symbols, "kick", arguments, [*kick.coefficients, *kick.lines], kick.results), functions)
-        q, p, b, e = rng.uniform(-1, 1, 2), rng.normal(size=2), rng.normal(), rng.normal(size=len(letters))
-        force = [float(sp.diff(symbols.V, s).subs(dict(zip(symbols.q, q, strict=True)))) for s in symbols.q]
-        expected = p - b * np.array(force) - gradient(of_kicks, e, q)
-        found = functions["kick"](q.tolist(), p.tolist(), b, *e.tolist())
-        np.testing.assert_allclose(found, expected, atol=1e-14 * (1 + np.abs(expected).max()))
-        fewest = min(fewest, sum("*" in line or "fused" in line for line in kick.lines))
-    assert multiplications is None or fewest == multiplications
 
 
 def scheme(seed=0, last=0.3):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sympflow import SympFlow, max_energy_error, solve, systems, train
-from sympflow.kernels.kicks import kick_cycles
+from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import timing, trials
 from sympflow.training.least_squares import Minimum
@@ -38,9 +38,8 @@ def test_trials_that_the_time_ended_are_warned_of(monkeypatch, seconds):
 
 @pytest.mark.parametrize("system", [HH, PENDULUM, systems.quartic()], ids=lambda s: s.name)
 def test_each_term_makes_a_kick_dearer(system):
-    for joined in (False, True):
-        cycles = [kick_cycles(system.symbols, level, joined=joined) for level in range(3)]
-        assert 0 < cycles[0] < cycles[1] < cycles[2]
+    cycles = [splitting_loops(system).kick_cycles(level) for level in range(3)]
+    assert 0 < cycles[0] < cycles[1] < cycles[2]
 
 
 def law(monkeypatch, error):
@@ -86,7 +85,7 @@ def test_a_map_that_keeps_the_energy_alone_is_no_candidate(monkeypatch):
 
 def test_curvature_is_taken_where_its_error_is_worth_its_cycles(monkeypatch):
     """Kicks that are r times dearer must make the error r⁶ times less."""
-    plain, bent = (kick_cycles(HH.symbols, level, joined=True) for level in (1, 2))
+    plain, bent = (splitting_loops(HH).kick_cycles(level) for level in (1, 2))
     needed = (bent / plain) ** trials.ORDER
     for gain, taken in ((1.1 * needed, True), (0.9 * needed, False)):
         chosen = law(monkeypatch, lambda x, c, gain=gain: 1e-9 * x**12 / (gain if c else 1.0))
@@ -124,7 +123,7 @@ def test_steps_divide_round_times(unit):
 @pytest.mark.parametrize("seconds", [1e-8, 3e-8])
 def test_what_kicks_take_is_measured_where_estimates_do_not_decide(monkeypatch, seconds):
     """Errors by which the estimates are equal: curvature terms that take longer than that are left, others taken."""
-    plain, bent = (kick_cycles(HH.symbols, level, joined=True) for level in (1, 2))
+    plain, bent = (splitting_loops(HH).kick_cycles(level) for level in (1, 2))
     measured = {False: 1e-8, True: seconds}
     monkeypatch.setattr(trials, "kick_seconds", lambda flows, *_: [measured[flow] for flow in flows])
     monkeypatch.setattr(trials, "NEAREST", 1)
