@@ -32,6 +32,21 @@ def test_a_verlet_solve_loads_sympy_only(backend):
     assert loaded_after(code) == {"sympy"}
 
 
+@pytest.mark.parametrize(
+    "code",
+    [
+        "sympflow.lyapunov(sympflow.systems.henon_heiles(), 'verlet', (0, 1), dt=0.1, backend='compiled')",
+        "sympflow.volume_error(sympflow.solve(sympflow.systems.henon_heiles(), 'srkn11b', (0, 1), dt=0.1))",
+        "H = ' + '.join(f'p{i}**2/2 + cos(q{i}) + (q{i} - q{i + 1})**4/4' for i in range(1, 150)) + ' + p150**2'\n"
+        "system = sympflow.HamiltonianSystem.from_sympy(H, y0=[0.1]*300)\n"
+        "assert sympflow.solve(system, 'verlet', (0, 1), dt=0.1).stats['backend'] == 'compiled'",
+    ],
+    ids=["deviation vectors", "volume", "many terms"],
+)
+def test_derivatives_and_systems_of_many_terms_load_no_numba(code):
+    assert not {"numba", "torch"} & loaded_after(f"import sympflow\n{code}")
+
+
 @pytest.mark.parametrize("scene", ["henon_heiles", "harmonic_oscillator"])
 def test_runs_of_primed_flows_and_networks_load_no_numba(scene):
     code = f"import sympflow\nsympflow.solve(sympflow.systems.{scene}(), 'sympflow', (0, 10))"

@@ -171,8 +171,8 @@ def check_continuous(
     for border in borders(f, states):
         try:
             found = _jump_in_states(border, states, values or {})
-        except (NameError, TypeError, AttributeError):
-            continue  # what NumPy has no function for cannot run either
+        except (NameError, TypeError, AttributeError, KeyError):
+            continue  # what NumPy has no function for cannot run either, and what is infinite there is a pole
         if found is None:
             continue
         x, at, below, above = found

@@ -341,8 +341,16 @@ def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
             yield from _of_polynomial(factor.as_expr(), x)
     else:
         yield Place(g, sp.sign(g))
-        if len(g.free_symbols) == 1 and g.subs(s := min(g.free_symbols, key=str), 0).is_zero:  # which it may touch
+        if len(g.free_symbols) == 1 and _vanishes(g, s := min(g.free_symbols, key=str)):  # which it may touch
             yield Place(g, sp.sign(s))
+
+
+def _vanishes(g: sp.Expr, s: sp.Symbol) -> bool:
+    """Return True if g is 0 where s is."""
+    try:
+        return bool(g.subs(s, 0).is_zero)
+    except ValueError:  # of Max and Min, with something infinite in them
+        return False
 
 
 def _touched(g: sp.Expr) -> Place | None:
@@ -430,11 +438,34 @@ def infinite_between(
     return False
 
 
+def _bounded(name: str) -> Callable[[Any], Any]:
+    """A function of mpmath for which numbers beyond double precision are infinite: of them it would need hours."""
+    function, limits = getattr(mpmath, name), _LIMITS.get(name)
+
+    def value(x: Any) -> Any:
+        x = mpmath.mpmathify(x)
+        if mpmath.im(x) != 0 or not mpmath.isfinite(x) or abs(x) < LARGEST:
+            return function(x)
+        if limits is None or (limit := limits[x > 0]) is None:
+            raise OverflowError(name)
+        return mpmath.mpf(limit)
+
+    return value
+
+
+_LIMITS: dict[str, tuple[float | None, float | None]] = {
+    "exp": (0.0, None), "tanh": (-1.0, 1.0), "coth": (-1.0, 1.0), "sech": (0.0, 0.0), "csch": (0.0, 0.0),
+}  # fmt: skip
+"""Limits at −∞ and ∞; None is infinite."""
+LARGEST = mpmath.mpf(2) ** 1024
+_BOUNDED = {name: _bounded(name) for name in ("sin", "cos", "tan", "cot", "sec", "csc", "sinh", "cosh", *_LIMITS)}
+
+
 @lru_cache(maxsize=256)
 def _precise(f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...]) -> tuple[Any, Any]:
     """f and the number of the cell, in the arithmetic of mpmath; samples, which are bounded, are left out."""
     f = f.replace(lambda e: type(e).__name__ == "sampled", lambda _: sp.S.One)
-    function, number = (sp.lambdify(letters, e, "mpmath") for e in (f, cell))
+    function, number = (sp.lambdify(letters, e, [_BOUNDED, "mpmath"]) for e in (f, cell))
     return function, number
 
 
@@ -442,4 +473,4 @@ def _precise(f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...]) -> tuple
 def _slopes(f: sp.Expr, s: sp.Symbol) -> tuple[Any, Any]:
     """The derivative of f in double precision, and in the arithmetic of mpmath."""
     slope = sp.diff(f, s).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
-    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", "numpy"], "mpmath"))
+    return tuple(sp.lambdify(s, slope, modules) for modules in (["scipy", "numpy"], [_BOUNDED, "mpmath"]))

@@ -857,13 +857,13 @@ def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], lib
     TypeError
         If the library has no function for something in the expressions.
     """
-    written = _by_products if library == "numpy" else _by_tensor_functions
-    code = [written(_of_machine_numbers(f)) for f in expressions]
+    written = _by_products if library == "numpy" else _with_tensor_functions
+    code = [written(_by_reciprocals(_of_machine_numbers(f))) for f in expressions]
     sums = [_in_pieces(f) for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
         function = sp.lambdify(variables, pieces, modules=_modules(library, code), cse=True)
-    except (PrintMethodNotImplementedError, ValueError) as error:
+    except (PrintMethodNotImplementedError, ValueError, KeyError) as error:
         raise TypeError(
             f"`expression` has no derivative that {library} could evaluate: write it with smooth functions."
         ) from error
@@ -904,7 +904,7 @@ class tensor_erfc(sp.Function):
         return f"tensor_erfc({printer._print(self.args[0])})"
 
 
-_OF_TENSORS: dict[Any, Callable[[Any], Any]] = {
+_RECIPROCALS: dict[Any, Callable[[Any], Any]] = {
     sp.sec: lambda x: 1 / sp.cos(x),
     sp.csc: lambda x: 1 / sp.sin(x),
     sp.cot: lambda x: 1 / sp.tan(x),
@@ -912,15 +912,19 @@ _OF_TENSORS: dict[Any, Callable[[Any], Any]] = {
     sp.csch: lambda x: 1 / sp.sinh(x),
     sp.coth: lambda x: 1 / sp.tanh(x),
     sp.acot: lambda x: sp.atan(1 / x, evaluate=False),
-    sp.erfc: tensor_erfc,
 }
-"""Functions that SymPy does not write for torch, by those that it does."""
+"""Functions that torch has not, and that SymPy writes for NumPy by exponentials, which cancel near 0 and overflow."""
 
 
-def _by_tensor_functions(f: sp.Expr) -> sp.Expr:
-    for function, written in _OF_TENSORS.items():
-        f = f.replace(function, written)
+def _by_reciprocals(f: sp.Expr) -> sp.Expr:
+    for function, written in _RECIPROCALS.items():
+        if f.has(function):
+            f = f.replace(function, written)
     return f
+
+
+def _with_tensor_functions(f: sp.Expr) -> sp.Expr:
+    return f.replace(sp.erfc, tensor_erfc)
 
 
 def _integer_power(x: np.ndarray, n: int) -> np.ndarray:

@@ -148,10 +148,11 @@ def term_code(splitting: Splitting) -> ArrayCode:
 
     symbols = splitting.symbols
     M = symbols.inverse_mass
-    T: Any = Terms(symbols.T, symbols.p, symbols.parameters)
-    if M is not None and M.is_diagonal() and not M.free_symbols:
-        masses = np.array([float(x) for x in M.diagonal()])
-        T = None if (masses == 1).all() else masses
+    T: Terms | np.ndarray | None = None
+    if M is None or not M.is_diagonal() or M.free_symbols:
+        T = Terms(symbols.T, symbols.p, symbols.parameters)
+    elif any(x != 1 for x in M.diagonal()):
+        T = np.array([float(x) for x in M.diagonal()])
     return ArrayCode(splitting, TermForces(Terms(symbols.V, symbols.q, symbols.parameters), T))
 
 
@@ -186,8 +187,6 @@ class Sizes(NamedTuple):
     ndof: int
     parameters: tuple[Letter, ...]
     values: tuple[()] = ()
-    V: None = None
-    T: None = None
 
 
 class Clock:
@@ -233,8 +232,8 @@ class ArrayCode(SplittingCode):
     """
 
     def __init__(self, splitting: Splitting, forces: Forces) -> None:
-        super().__init__(splitting)
-        self._forces, self.data, self.lanes, self.chunked = forces, forces.data, forces.lanes, False
+        super().__init__(splitting, chunked=False)
+        self._forces, self.data, self.lanes = forces, forces.data, forces.lanes
         self.room = ARRAYS * splitting.symbols.ndof
 
     def __reduce__(self) -> tuple[Any, ...]:

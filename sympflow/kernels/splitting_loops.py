@@ -112,7 +112,8 @@ class SplittingLoops:
                 check_recorded(system.symbols.T)
                 self.values = system.symbols.parametric.values
                 self._has_ranges, self.traced = not self._large, True
-                self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial(*system.symbols.q) else LANES
+                sums = V is not None and not self._large and V.is_polynomial(*system.symbols.q)
+                self.abreast = LANES_OF_SUMS if sums else LANES
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None

@@ -370,15 +370,17 @@ class SplittingCode(Rollouts):
     Parameters
     ----------
     splitting : Splitting
+    chunked : bool, optional
+        See `Rollouts`; by default where stages are not polynomials.
     """
 
-    def __init__(self, splitting: Splitting) -> None:
+    def __init__(self, splitting: Splitting, chunked: bool | None = None) -> None:
         self._splitting = splitting
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         symbols = splitting.symbols
         super().__init__(2 * symbols.ndof * (1 + splitting.compensated), 2 * symbols.ndof)
         self.timed = splitting.driving is not None
-        self.chunked = self.timed or not splitting.polynomial
+        self.chunked = self.timed or not splitting.polynomial if chunked is None else chunked
         self.lanes = 8 if self.chunked else 16  # chunks need not wait for each other, registers side by side do
         self._own = len(symbols.values if self.timed else symbols.parameters)
 

@@ -27,7 +27,7 @@ from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import EARLY, Splitting, SplittingCode, shared
 from sympflow.kernels.stages import StageTable, run_table
 from sympflow.kernels.threads import given
-from sympflow.schemes import POLYNOMIAL, Scheme
+from sympflow.schemes import FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 __all__ = ["TangentCode", "TangentKernel", "TangentRun", "step_tangents", "tangent_kernel"]
 
@@ -238,14 +238,13 @@ class TangentCode(SplittingCode):
     """
 
     def __init__(self, splitting: Splitting, vectors: int, grows: bool) -> None:
-        super().__init__(splitting)
+        super().__init__(splitting, chunked=False)
         self.vectors, self._grows, self._linearised = vectors, grows, Linearised(splitting)
         self._d = d = splitting.symbols.ndof
         self.n_values = self.n_out = 2 * d * (1 + vectors) + (vectors if grows else 0)
         products = d * d + (d if splitting.symbols.inverse_mass is not None else d * d)
         self.room = 0 if vectors * products > MOST_WRITTEN_OUT else None
         self.every = EVERY if grows else None
-        self.lanes, self.chunked = 16, False
 
     def __reduce__(self) -> tuple[Any, ...]:
         return TangentCode, (self._splitting, self.vectors, self._grows)
@@ -459,12 +458,12 @@ def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, ve
 
 def _lacks(system: HamiltonianSystem) -> str:
     """The reason why a system has no compiled vectors, "" if it has."""
-    from sympflow.kernels.terms import is_large
+    from sympflow.kernels.terms import is_long
 
     if not system.autonomous:
         return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
     symbols = system.symbols
-    given = system.local is not None if symbols is None else not is_large(symbols)
+    given = system.local is not None if symbols is None else not is_long(symbols, FORCE_GRADIENT)
     if not given or not splitting_loops(system).traced:
         return (
             f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "

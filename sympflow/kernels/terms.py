@@ -7,7 +7,6 @@ however many there are.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,20 +16,19 @@ import sympy as sp
 
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import INT, Value
-from sympflow.compiler.program import Program, derivatives, gradient, tangent, traced
+from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.runs import Room
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
-__all__ = ["Family", "Terms", "families", "is_large", "is_long", "warn_if_long", "written_out"]
+__all__ = ["Family", "Terms", "families", "is_large", "is_long", "written_out"]
 
 MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more than a few seconds
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
-MOST_COMPILED = 5000  # operations of all formulas, before a warning
-MOST_SEPARATE = 8  # slopes of a formula that have nothing in common
+MOST_COMPILED = 50_000  # operations of the slopes of all formulas, which take some ten seconds
 MOST_TOGETHER = 75  # operations of terms that stand alone in one loop
-MOST_OPERATIONS = 1000  # of derivatives that are written out
+MOST_OPERATIONS = 600  # of V, of which the slopes are written out
 
 
 def is_large(symbols: SymbolicHamiltonian) -> bool:
@@ -39,41 +37,22 @@ def is_large(symbols: SymbolicHamiltonian) -> bool:
 
 
 def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
-    """True where the derivatives of V that kicks of a level need have more operations than are written out."""
-    n = {FORCE_GRADIENT: 2, CURVATURE: 3}.get(level, 1)
-    known = set(symbols.q)
-    roughly = sum(sp.count_ops(f) * len(f.free_symbols & known) ** n for f in sp.Add.make_args(symbols.V))
-    if not MOST_OPERATIONS < roughly < 20 * MOST_OPERATIONS:
-        return bool(roughly > MOST_OPERATIONS)
-
-    given = (*symbols.q, *symbols.parameters)
-
-    def orders(*numbers: Any) -> list[Any]:
-        q = numbers[: symbols.ndof]
-        found = [gradient(evaluator(dict(zip(given, numbers, strict=True)))(symbols.V), q)]
-        for _ in range(1, n):
-            found.append([x for row in derivatives(found[-1], q) for x in row])
-        return [x for order in found for x in order]
-
-    return len(traced(orders, *(s.name for s in given))) > MOST_OPERATIONS
+    """True where kicks of a level have more operations than are written out, common subexpressions counted once."""
+    known, operations, variables, terms = set(symbols.q), set(), 0, sp.Add.make_args(symbols.V)
+    for term in terms:
+        nodes = set(sp.preorder_traversal(term))
+        variables += len(nodes & known)
+        operations |= {node for node in nodes if node.args}
+        if len(operations) > MOST_OPERATIONS:
+            return True
+    each = 4 * variables / len(terms)  # by how much a further derivative is longer
+    return bool(len(operations) * each ** {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0) > MOST_OPERATIONS)
 
 
 def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
     """Operations of ∇f, roughly: those of each term as often as it has variables."""
     known = set(variables)
     return sum(sp.count_ops(term) * len(term.free_symbols & known) for term in sp.Add.make_args(f))
-
-
-def warn_if_long(f: sp.Expr, variables: Sequence[sp.Symbol], name: str) -> None:
-    """Warn of a function whose formulas, one for each kind of term, take Numba more than half a minute."""
-    n = sum(sp.count_ops(family.f) * min(len(family.x), MOST_SEPARATE) for family in families(f, variables))
-    if n > MOST_COMPILED:
-        warnings.warn(
-            f"`system` {name!r} has so many terms of different kinds, about {n:,} operations, that compiling takes "
-            "minutes. Give it by Numba functions that loop over its terms: HamiltonianSystem(V, ndof=…, gradient=…, "
-            "hessian_vector=…).",
-            stacklevel=2,
-        )
 
 
 class Family(NamedTuple):
@@ -211,11 +190,23 @@ class Terms:
     ----------
     data : list of ndarray
         How many terms each kind has, then the coordinates and the constants of each kind.
+
+    Raises
+    ------
+    ValueError
+        If the formulas of all kinds have too many operations.
     """
 
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
         self._given = f, tuple(variables), tuple(letters)
         self._families, self._letters = families(f, variables), tuple(letters)
+        n = sum(4 * sp.count_ops(family.f) for family in self._families)
+        if n > MOST_COMPILED:
+            raise ValueError(
+                f"`system` has so many terms of different kinds, about {n:,} operations, that it is not compiled. Give "
+                "it by Numba functions that loop over its terms: HamiltonianSystem(V, ndof=…, gradient=…, "
+                "hessian_vector=…), or use backend='array'."
+            )
         self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
         for family in self._families:
             self.data += [family.coordinates.astype(np.int64), family.constants]

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
 from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.systems.pairs import OPTIONS, pair_functions
 
 _WIDEST = 0.9  # above it a uniform draw hardly ever meets the thin shell of the family
 
@@ -295,28 +292,16 @@ def outer_solar_system() -> HamiltonianSystem:
     """
     q, v = (x - PLANET_MASSES @ x / PLANET_MASSES.sum() for x in (POSITIONS, VELOCITIES))
     y0 = np.concatenate([q.ravel(), (PLANET_MASSES[:, None] * v).ravel()])
-    return HamiltonianSystem(
-        **_gravity(),
-        mass=np.repeat(PLANET_MASSES, 3),
+    return HamiltonianSystem.pairs(
+        "-G*m1*m2/r",
+        masses=PLANET_MASSES,
+        params={"G": G},
         name="outer_solar_system",
         domain=_tube(q, v),
         y0=y0,
         t_span=(0.0, 200_000.0),
         dt=50.0,
-        check=False,
     )
-
-
-@cache
-def _gravity() -> dict[str, Any]:
-    from numba import njit
-
-    @njit(**OPTIONS)
-    def attraction(s: Any) -> Any:
-        r = np.sqrt(s)
-        return -1 / r, 0.5 / (s * r), -0.75 / (s * s * r)
-
-    return pair_functions(attraction, G * np.outer(PLANET_MASSES, PLANET_MASSES), 3)
 
 
 def _tube(q: np.ndarray, v: np.ndarray) -> Tube:

@@ -86,6 +86,37 @@ def test_special_functions_have_their_values_and_are_undefined_elsewhere():
     assert np.isnan(W[1])
 
 
+FAR_AND_NEAR = {
+    "coth(q)": lambda x: 1 / mpmath.tanh(x),
+    "csch(q)": lambda x: 1 / mpmath.sinh(x),
+    "sech(q)": lambda x: 1 / mpmath.cosh(x),
+    "cot(q)": lambda x: 1 / mpmath.tan(x),
+    "Abs(csch(q))": lambda x: abs(1 / mpmath.sinh(x)),
+}
+
+
+@pytest.mark.parametrize("V", FAR_AND_NEAR)
+@pytest.mark.parametrize("q", [1e-9, -0.3, 700.0, 1e5])
+def test_reciprocals_have_their_values_near_zero_and_far_from_it(V, q):
+    with mpmath.workdps(30):
+        right = float(FAR_AND_NEAR[V](mpmath.mpf(q)))
+    system = made(f"p**2/2 + {V}")
+    with np.errstate(over="ignore"):
+        found = [
+            system.potential(np.array([[q]]))[0],
+            system.potential(torch.tensor([[q]], dtype=torch.float64))[0].item(),
+        ]
+    np.testing.assert_allclose(found, right, rtol=1e-9 if V == "cot(q)" else 1e-14)
+
+
+@pytest.mark.parametrize(
+    "V",
+    ["gamma(Abs(erfc(q**-3)))", "q/(1 + Max(q**-3, pi))", "csch(Max(0.3, 1/q) + Piecewise((1/q, q > 2), (0.5, True)))"],
+)
+def test_what_is_infinite_within_a_function_is_no_raw_error(V):
+    assert solve(made(f"p**2/2 + {V}"), "verlet", (0, 0.03), [2.6, 0.1], dt=0.01).success
+
+
 OF_ARRAYS = {
     **dict.fromkeys(["erf(q)", "erfc(q)", "sec(q/3)", "csc(q + 2)", "cot(q + 2)", "acot(q)*q"], True),
     **dict.fromkeys(["sech(q)", "csch(q + 2)", "coth(q + 2)", "sinc(q)"], True),

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from watchdog import watched
 
 import sympflow as sf
 from sympflow import HamiltonianSystem
@@ -68,6 +69,15 @@ def test_a_run_over_a_pole_ends_before_it(V):
     assert sol.stats["failed_at"] == pytest.approx(last.stats["failed_at"])
     assert sol.t[-1] == sol.stats["failed_at"]
     assert last.t.size == 0
+
+
+@pytest.mark.parametrize(
+    "V", ["tan(sinh(2 - 1/q))", "exp(-exp(1/q))*log(q)**2", "sin(exp(exp(q**-2)))", "sech(exp(q**-2))"]
+)
+def test_functions_of_numbers_beyond_all_others_are_judged_at_once(V):
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + {V}")
+    with watched(30):
+        assert sf.solve(system, "verlet", (0, 0.03), [2.6, 0.1], dt=0.01).success
 
 
 @pytest.mark.parametrize("V", SILENT)

@@ -1,7 +1,6 @@
 """Systems of many terms: loops over the terms of each kind, against the functions of arrays."""
 
 import itertools
-import warnings
 
 import numpy as np
 import pytest
@@ -172,17 +171,18 @@ def test_kicks_are_arranged_without_factoring_what_takes_minutes(expression):
         assert 0 < splitting_loops(system).kick_cycles(1) < splitting_loops(system).kick_cycles(2)
 
 
-def test_a_warning_names_the_door_for_systems_of_very_many_kinds_of_terms(monkeypatch):
+def test_systems_of_very_many_kinds_of_terms_run_as_arrays_and_say_why(monkeypatch):
     powers = [(a, b, c) for a in range(1, 5) for b in range(1, 5) for c in range(1, 4)]
     products = [f"q{1 + n % 3}**{a}*cos(q{1 + (n + 1) % 3})**{b}*sin(q4)**{c}" for n, (a, b, c) in enumerate(powers)]
-    system = HamiltonianSystem.from_sympy(f"p1**2 + p2**2 + p3**2 + p4**2 + {' + '.join(products)}")
+    H = f"p1**2 + p2**2 + p3**2 + p4**2 + {' + '.join(products)}"
+    system = HamiltonianSystem.from_sympy(H, y0=np.full(8, 0.1))
     assert terms.is_large(system.symbols)
+    monkeypatch.setattr(terms, "MOST_OPERATIONS", 10)
     monkeypatch.setattr(terms, "MOST_COMPILED", 500)
-    with pytest.warns(UserWarning, match=r"compiling takes minutes\. Give it by Numba functions"):
-        terms.warn_if_long(system.symbols.V, system.symbols.q, system.name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        terms.warn_if_long(SYSTEM.symbols.V, SYSTEM.symbols.q, SYSTEM.name)
+    with pytest.raises(ValueError, match=r"`system` has so many terms of different kinds.*Give it by Numba functions"):
+        solve(system, "verlet", (0, 0.1), dt=0.05, backend="compiled")
+    assert solve(system, "verlet", (0, 0.1), dt=0.05).stats["backend"] != "compiled"
+    assert solve(SYSTEM, "verlet", (0, 0.1), dt=0.05).stats["backend"] == "compiled"
 
 
 @pytest.mark.slow
