@@ -186,9 +186,10 @@ def solve(
         check_not_traced("solve")
     system = given_system(system)
     given, chosen = options, None
-    if tol is not None:
+    if tol is not None and isinstance(method, str) and "tol" in get(method).options():
+        given = {**options, "tol": tol}
+    elif tol is not None:
         check_tolerance(tol, tol_of)
-        given = {**options, "tol": tol} if isinstance(method, str) and "tol" in get(method).options() else options
     integrator = None if method is None else build(method, given)
     search = check_events(events, event_step)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
@@ -233,12 +234,20 @@ def solve(
             "`resume` and `checkpoint_every` are for runs with a `store`, and `same` with them: give one, or leave "
             "them out."
         )
-    if tol is not None and "tol" not in integrator.options():
+    steps_chosen = tol is not None and "tol" not in integrator.options()
+    if tol is not None and steps_chosen:
         integrator = replace(integrator, dt=step_for(integrator, problem, tol, tol_of))  # type: ignore[type-var]
     elif system.step_is_open and isinstance(integrator, FixedStep) and not integrator.trained and readable(y_start):
         integrator = replace(integrator, dt=integrator.dt or default_step(system, to_numpy(y_start)))
     sol = _shown(integrator, problem, action, rows, progress)
-    if tol is not None and store is None and system.autonomous and system.conservative and tol_of == "energy":
+    if (
+        tol is not None
+        and steps_chosen
+        and store is None
+        and tol_of == "energy"
+        and system.autonomous
+        and system.conservative
+    ):
         _check_tolerance_met(sol, tol)
     if chosen is not None:
         sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"

@@ -93,22 +93,32 @@ class TermForces:
 
 
 class Functions:
-    """Forces by functions at addresses, as a user's Numba functions have them; one trajectory after the other.
+    """Forces by a user's Numba functions, called at their addresses; one trajectory after the other.
 
     Parameters
     ----------
-    functions : sequence
-        With an `address`, see `addressed`: of ∇V, and of ∇²V v.
+    gradient, hessian_vector : functions
+        The latter may be None.
     inverse_mass : ndarray, optional
         (d,) or (d, d).
+    driven : bool
+        True if functions take the time first.
     """
 
     lanes = 1
 
-    def __init__(self, functions: Sequence[Any], inverse_mass: np.ndarray | None) -> None:
-        self._functions, self._mass = functions, inverse_mass  # functions are kept alive
-        addresses = np.array([f.address for f in functions], dtype=np.int64)
+    def __init__(
+        self, gradient: Any, hessian_vector: Any | None, inverse_mass: np.ndarray | None, driven: bool
+    ) -> None:
+        self._given = gradient, hessian_vector, inverse_mass, driven
+        self._mass, self._functions = inverse_mass, [addressed(gradient, False, driven)]
+        if hessian_vector is not None:
+            self._functions.append(addressed(hessian_vector, True, driven))
+        addresses = np.array([f.address for f in self._functions], dtype=np.int64)
         self.data = [addresses, *([] if inverse_mass is None else [np.ascontiguousarray(inverse_mass)])]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Functions, self._given
 
     def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         self._called(room, 0, [q], out, d, letters)
@@ -168,8 +178,7 @@ def function_code(
     monomials: Monomials,
 ) -> ArrayCode:
     """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
-    functions = [addressed(gradient, False, driven), *([addressed(hessian_vector, True, driven)] if level else [])]
-    forces = Functions(functions, inverse_mass)
+    forces = Functions(gradient, hessian_vector if level else None, inverse_mass, driven)
     sizes: Any = Sizes(ndof, (Letter("time"),) if driven else ())
     clock: Any = Clock() if driven else None
     return ArrayCode(Splitting(sizes, level, monomials, compensated, friction, clock), forces)

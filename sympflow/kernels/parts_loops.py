@@ -1,28 +1,42 @@
-"""Compiled loops of splittings into exactly solvable parts, in the normal modes of the linear one."""
+"""Compiled loops of splittings into exactly solvable parts, in the normal modes of the linear one.
+
+A step is a list of maps. A column has the numbers of one: six that turn each frequency; or a weight, a force gradient
+and the filters of the modes, and what is made of these and of no state; then of a driven system when the map acts.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler.arrange import Arranged, Arrangement
+from sympflow.compiler.control import Value
+from sympflow.compiler.functions import fma, times
+from sympflow.compiler.program import Program, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
-from sympflow.kernels.codegen import tuple_algebra
-from sympflow.kernels.modules import constants_source, load_algebra, template
-from sympflow.kernels.parts_codegen import IDLE, TURN_WIDTH, WITH_GRADIENT, parts_source
+from sympflow.kernels.one_steps import Lettered, recorded
 from sympflow.kernels.passes import row_products
-from sympflow.kernels.protocol import NOTHING, Carry, Kernel, Run, Steps, run_state, run_states
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
+from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.runs import Numbers
 from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 from sympflow.kernels.threads import NEVER, given
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
+IDLE = -1  # code of no map
+WITH_GRADIENT = 100  # added to the code of a part that carries a force gradient
 ONE = np.ones(1, dtype=np.int64)
-TIME_WIDTH = 3  # numbers of a row for its time
+TURN_WIDTH = 6  # numbers that turn a frequency
+TIME_WIDTH = 3  # numbers of a column for its time
+EARLY = -4  # when momenta are known before the positions, in cycles
+MOST_OPERATIONS = 300  # of all kinds of columns
 SAME_TIME = 1e-12  # of a step: rounding of sums of weights
 KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
 
@@ -30,23 +44,217 @@ Maps = Callable[[np.ndarray], Sequence[Map]]
 """The maps of a step of length h (...), their entries of that batch shape."""
 
 
-def states_source(ndof: int) -> str:
-    """The source of states that are tuples, one by one and in lanes, which systems share."""
-    constants = constants_source(COMPENSATED=False, NDOF=ndof, N_VALUES=0)
-    texts = map(template, ("running_states", "aligned", "lane_blocks"))
-    return "\n\n\n".join([constants, tuple_algebra(ndof), *texts])
+class PartMaps:
+    """The maps of the parts of a system as code.
+
+    Parameters
+    ----------
+    parts : ExactParts
+        Of symbols.
+    filters : bool
+        True if the maps have some.
+
+    Raises
+    ------
+    ValueError
+        If H holds a function that has no compiled form.
+    """
+
+    def __init__(self, parts: ExactParts, filters: bool) -> None:
+        self.parts, self.ndof, self.filters = parts, parts.ndof, filters
+        self.lettered = [Lettered(part, [part.H]) for part in parts.rest]
+        self._arranged: dict[int, Arranged] = {}
+
+    def arranged(self, code: int) -> Arranged:
+        """The map of a part, from x, y and letters of the time and what its table makes of a column's numbers."""
+        if code not in self._arranged:
+            bends = code >= WITH_GRADIENT
+            shapes = [self._part(code % WITH_GRADIENT, bends, expand) for expand in (True, False)[: 1 + bends]]
+            self._arranged[code] = min(shapes, key=lambda shape: shape[0])[1]
+        return self._arranged[code]
+
+    def _part(self, number: int, bends: bool, expand: bool) -> tuple[int, Arranged]:
+        """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y; its cost before it."""
+        parts, d, lettered = self.parts, self.ndof, self.lettered[number - 1]
+        filtered = [f"phi_{j}" for j in range(d) if self.filters]
+        states = [*((f"x_{j}", 0) for j in range(d)), *((f"y_{j}", EARLY) for j in range(d))]
+        made = Arrangement([*states, *((s.name, EARLY) for s in lettered.letters)], ["b", "g", *filtered], expand)
+        x, y, letters = made.states[:d], made.states[d : 2 * d], made.states[2 * d :]
+        b, g, *phi = made.constants
+        C, inverse = parts.C.tolist(), parts.inverse_C.tolist()
+        by_phi = [f * v for f, v in zip(phi, x, strict=True)] if phi else x
+        q = [_combined(C[i], by_phi) + float(parts.center[i]) for i in range(d)]
+        p = [_combined([row[i] for row in inverse], y) for i in range(d)]
+        slope, velocity, hessian = self._slopes(number, bends)
+        force, *rest = ([made.number(v) for v in program(*q, *p, *letters)] for program in (slope, velocity))
+        forces = [_combined([row[j] for row in C], force) for j in range(d)]
+        moved = [_combined(inverse[j], rest[0]) for j in range(d)]
+        if phi:
+            forces = [f * v for f, v in zip(phi, forces, strict=True)]
+        changes = [-times(b, v) for v in forces]
+        if bends:
+            rates = parts.inverse_masses(np.zeros(d))
+            direction = [float(rate) * v for rate, v in zip(rates, forces, strict=True)]
+            if phi:
+                direction = [f * v for f, v in zip(phi, direction, strict=True)]
+            z = [_combined(C[i], direction) for i in range(d)]
+            rows = [made.number(v) for v in hessian(*q, *p, *letters)]
+            bent = [_combined(z, rows[d * i : d * (i + 1)]) for i in range(d)]
+            added = [_combined([row[j] for row in C], bent) for j in range(d)]
+            if phi:
+                added = [f * v for f, v in zip(phi, added, strict=True)]
+            changes = [v + times(g, w) for v, w in zip(changes, added, strict=True)]
+        new_x = [made.written(v + times(b, w)) for v, w in zip(x, moved, strict=True)]
+        new_y = [made.written(v + w) for v, w in zip(y, changes, strict=True)]
+        arranged = made.finish([*new_x, *new_y])
+        return 2 * max(made.depth(v) for v in (*new_x, *new_y)) + 3 * len(arranged.body), arranged
+
+    def _slopes(self, number: int, bends: bool) -> tuple[Program, Program, Program]:
+        """∂H_k/∂q, ∂H_k/∂p and, where it is needed, ∂²H_k/∂q², from q, p and the letters."""
+        part, lettered, d = self.parts.rest[number - 1], self.lettered[number - 1], self.ndof
+        program = recorded(lettered.expressions, (*part.q, *part.p, *lettered.letters))
+        q = program.inputs[:d]
+        slope = gradient(program.outputs[0], program.inputs[: 2 * d])
+        hessian = [x for s in slope[:d] for x in gradient(s, q)] if bends else []
+        return tuple(Program(program.inputs, x) for x in (slope[:d], slope[d:], hessian))  # type: ignore[return-value]
+
+    @cached_property
+    def size(self) -> int:
+        """Numbers of a map."""
+        numbers = range(1, len(self.parts.rest) + 1)
+        codes = [*numbers, *(WITH_GRADIENT + k for k in numbers if self.parts.has_force_gradient)]
+        made = [len(self.arranged(code).table.outputs) for code in codes]
+        return max([TURN_WIDTH * self.parts.n_classes, *made]) + TIME_WIDTH * self.parts.driven
+
+    def operations(self, code: int) -> int:
+        """Operations of a map."""
+        return TURN_WIDTH * self.ndof if code == LINEAR else 0 if code == IDLE else len(self.arranged(code).body)
+
+    def entries(self, codes: np.ndarray, raw: np.ndarray) -> np.ndarray:
+        """The numbers (n, m, size) of maps, of given ones (n, m, ·): turns; or weights, gradients and filters."""
+        entries = np.zeros((*raw.shape[:2], self.size))
+        for code in np.unique(codes):
+            here = codes == code
+            if code == LINEAR:
+                rows = raw[:, here, : TURN_WIDTH * self.parts.n_classes]
+            elif code == IDLE:
+                continue
+            else:
+                table = self.arranged(int(code)).table
+                numbers = [raw[:, here, i] for i in range(len(table.inputs))]
+                with np.errstate(all="ignore"):
+                    outputs = [np.broadcast_to(x, numbers[0].shape) for x in table(*numbers)]
+                rows = np.stack(outputs, axis=-1) if outputs else raw[:, here, :0]
+            entries[:, here, : rows.shape[-1]] = rows
+        return entries
+
+    def apply(self, code: int, values: list[Value], numbers: Numbers, step: Value) -> list[Value]:
+        """The values after a map."""
+        if code == IDLE:
+            return values
+        new = self._linear(values, numbers) if code == LINEAR else self._moved(code, values, numbers, step)
+        return [values[0].code.operand(x, values[0].type) for x in new]
+
+    def _moved(self, k: int, values: list[Value], numbers: Numbers, step: Value) -> list[Any]:
+        body, letters = self.arranged(k), []
+        lettered = self.lettered[k % WITH_GRADIENT - 1]
+        if lettered.letters:
+            code, at, width = values[0].code, self.size - TIME_WIDTH, values[0].type.width
+            whole = code.splat(code.convert("sitofp", step, "double"), width)
+            letters = lettered.at(numbers(at + 1) + (whole * numbers(at + 2) + numbers(at)), [])
+        return body.body(*values, *letters, *(numbers(i) for i in range(len(body.table.outputs))))
+
+    def _linear(self, values: list[Value], numbers: Numbers) -> list[Value]:
+        """Rotations by three shears after exact quarter turns, hyperbolic ones by shears alone, drifts."""
+        linear, d = self.parts.linear, self.ndof
+        assert linear is not None
+        x, y = values[:d], values[d:]
+        for j, (kind, f) in enumerate(zip(linear.kinds, linear.classes.tolist(), strict=True)):
+            if kind == "idle":
+                continue
+            t, s, c, e, a, b = (numbers(TURN_WIDTH * f + i) for i in range(TURN_WIDTH))
+            if kind == "free":
+                x[j] = fma(2.0 * t, y[j], x[j])
+            elif kind == "hyperbolic":
+                x[j] = fma(t, y[j], x[j])
+                y[j] = fma(-s, x[j], y[j])
+                x[j] = fma(t, y[j], x[j])
+            elif kind == "oscillator":  # of each pair of products that are added first, one is 0 and the other exact
+                turned = fma(c, y[j], -(e * x[j]))
+                x[j] = fma(b, y[j], a * x[j])  # y comes from a kick, later than x
+                y[j] = fma(-s, x[j], turned)
+                x[j] = fma(t, y[j], x[j])
+        return [*x, *y]
 
 
-@dataclass(frozen=True)
-class LoopFunctions:
-    """The compiled functions of one variant (with or without filters and force gradients)."""
+class PartsCode(Rollouts):
+    """Groups of maps as stages: a column has the numbers of one map after the other.
 
-    rollout: Callable[..., int]
-    rollout_batch: Callable[..., None]
-    step_each: Callable[..., None]
-    step_lanes: Callable[..., None]
-    fill_rows: Callable[..., None]
-    row_width: int
+    Parameters
+    ----------
+    maps : PartMaps
+    groups : sequence of tuple of int
+        The codes of the maps of each kind of column.
+    """
+
+    lanes = 16
+
+    def __init__(self, maps: PartMaps, groups: Sequence[tuple[int, ...]]) -> None:
+        super().__init__(2 * maps.ndof, 2 * maps.ndof)
+        self.maps, self.groups = maps, tuple(groups)
+        self.size = maps.size * max(map(len, groups))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return PartsCode, (self.maps, self.groups)
+
+    def prepared(self, table: Columns) -> Columns:
+        return table
+
+    def own_columns(self, table: Columns, values: np.ndarray, width: int) -> Columns:
+        """The columns (n, m, size) of the rows whose numbers are `values` (n, 1), for every `width` of them."""
+        entries, kinds = table
+        own = entries[values[:, 0].astype(int)]
+        groups = -(-len(own) // width)
+        full = np.concatenate([own, np.repeat(own[-1:], groups * width - len(own), axis=0)])
+        return np.ascontiguousarray(full.reshape(groups, width, *own.shape[1:]).transpose(0, 2, 3, 1)), kinds
+
+    def columns(self, groups: Sequence[Sequence[int]], entries: np.ndarray) -> Columns:
+        """The columns (n, k, size) of groups of maps, whose numbers are (n, m, size), and their kinds (k,)."""
+        n, _, size = entries.shape
+        columns, at = np.zeros((n, len(groups), self.size)), 0
+        for k, codes in enumerate(groups):
+            columns[:, k, : len(codes) * size] = entries[:, at : at + len(codes)].reshape(n, -1)
+            at += len(codes)
+        return columns, np.array([self.groups.index(tuple(codes)) for codes in groups], dtype=np.int64)
+
+    def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
+        """The maps that a column has."""
+        code = values[0].code
+
+        def one_of(kinds: Sequence[int]) -> list[Value]:
+            k, *rest = kinds
+            if not rest:
+                return self._executed(k, values, numbers, step)
+            this = code.apply("eq", (kind, k))
+            return code.when(this, lambda: self._executed(k, values, numbers, step), lambda: one_of(rest))
+
+        return one_of(range(len(self.groups)))
+
+    def _executed(self, k: int, values: list[Value], numbers: Numbers, step: Value) -> list[Value]:
+        for i, code in enumerate(self.groups[k]):
+            values = self.maps.apply(code, values, lambda j, i=i: numbers(i * self.maps.size + j), step)
+        return values
+
+
+def _combined(weights: Sequence[Any], values: Sequence[Any]) -> Any:
+    """Σ weights_i values_i, without those that are 0."""
+    total: Any = 0.0
+    for w, x in zip(weights, values, strict=True):
+        if isinstance(w, float) and w == 0:
+            continue
+        term = x if isinstance(w, float) and w == 1 else times(w, x)
+        total = term if isinstance(total, float) else total + term
+    return total
 
 
 def parts_loops(parts: ExactParts) -> PartsLoops:
@@ -96,13 +304,10 @@ class PartsLoops:
                 f"`system` is too large for compiled normal modes: {parts.ndof} degrees of freedom, about {rest:,} "
                 f"operations in its gradient, at most {MOST_IN_REGISTERS} and {MOST_WRITTEN_OUT}. Use backend='array'."
             )
-        parts_source(parts, False, False)
-        self.parts = parts
-        self._variants: dict[tuple[bool, bool], LoopFunctions] = {}
-        self.driven = parts.driven
-        self.mixed = not parts.diagonal  # modes that are sums of coordinates: transformed outside the loops
-        self._coefficients: dict[int, tuple[Sequence[Map], np.ndarray, np.ndarray]] = {}
-        self._tables: dict[int, tuple[Sequence[Map], tuple[np.ndarray, np.ndarray], LoopFunctions]] = {}
+        self.parts, self.driven = parts, parts.driven
+        self._maps: dict[bool, PartMaps] = {False: PartMaps(parts, False)}
+        self._codes: dict[tuple[bool, tuple[tuple[int, ...], ...]], PartsCode] = {}
+        self._tables: dict[int, tuple[Sequence[Map], _Table]] = {}
 
     def kernel(self, maps: Maps) -> PartsKernel:
         """The loops of one splitting, whose step of length h is `maps(h)`.
@@ -120,93 +325,107 @@ class PartsLoops:
             With coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
             are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
         """
-        known = self._coefficients.get(id(sequence))
-        if known is None or known[0] is not sequence:
-            if len(self._coefficients) >= KNOWN_TABLES:
-                self._coefficients.clear()
-            known = self._coefficients[id(sequence)] = sequence, *self._coefficient_table(sequence)
-        out = np.empty(y.shape)
-        functions, t = self.functions(sequence), given(t)
-        functions.step_lanes(*known[1:], dt, t, self.modes(y), self.mixed, out)
-        return self.states(out)
+        square = (t / dt) ** 2
+        terms = max(len(sequence[0].length), 3)
+        basis = np.empty((terms, len(t)))
+        basis[0], basis[1], basis[2] = 1.0, square, square * (2.0 * square - 1.0)
+        for k in range(3, terms):
+            basis[k] = 2.0 * (2.0 * square - 1.0) * basis[k - 1] - basis[k - 2]
 
-    def _coefficient_table(self, sequence: Sequence[Map]) -> tuple[np.ndarray, np.ndarray]:
-        """Codes (m,) and coefficients (m, 2 + F, K): lengths, or a weight, a force gradient and filters."""
-        F, terms = self.parts.n_classes, len(sequence[0].length)
-        codes, table = np.empty(len(sequence), dtype=np.int64), np.zeros((len(sequence), 2 + F, terms))
-        for j, m in enumerate(sequence):
-            codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
-            if m.part == LINEAR:
-                table[j, :F] = m.length.T
-                continue
-            table[j, 0], table[j, 1] = m.length, m.gradient
-            if m.filters is not None:
-                table[j, 2:] = m.filters.T
-        return codes, table
+        def valued(c: Any, power: int) -> np.ndarray:
+            c = np.asarray(c)
+            total = np.zeros((len(t), *c.shape[1:]))
+            for k, each in enumerate(c):  # in this order for any number of rows
+                total += np.multiply.outer(basis[k], each)
+            return total * (t**power).reshape(-1, *[1] * (c.ndim - 1))
+
+        maps = []
+        for m in sequence:
+            g = valued(m.gradient, 3) if has_gradient(m) else 0.0
+            maps.append(Map(m.part, valued(m.length, 1), g, None if m.filters is None else valued(m.filters, 0)))
+        return self.stepped(maps, y)
+
+    def stepped(self, sequence: Sequence[Map], y: np.ndarray, t: Any = 0.0, h: Any = 0.0) -> np.ndarray:
+        """The maps applied once to every row of `y` (N, 2d), their entries of its own, at the time t in steps h."""
+        maps, start = self._of(sequence), self.modes(y)
+        codes, entries = self.table(sequence, len(y), maps)
+        entries = self.timed(sequence, entries, t, h)
+        code, groups = self._singles(maps), [*((k,) for k in codes.tolist()), (IDLE,), (IDLE,)]
+        columns = code.columns(groups, np.concatenate([entries, 0 * entries[:, :1], 0 * entries[:, :1]], axis=1))
+        rows = np.concatenate([start, np.arange(len(y), dtype=float)[:, None]], axis=1)
+        out, n_finite = np.empty((len(y), 1, start.shape[1])), np.empty(len(y), dtype=np.int64)
+        code.rollout_batch(columns, rows, 1, ONE, out, n_finite, NEVER, 0, np.empty((len(y), 0)), False)
+        return self.states(out[:, 0])
 
     def step_modes(self, sequence: Sequence[Map], modes: np.ndarray) -> np.ndarray:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
-        functions = self.functions(sequence)
-        out, n_finite = np.empty((len(modes), 1, modes.shape[1])), np.empty(len(modes), dtype=np.int64)
-        functions.rollout_batch(*self.run_table(sequence), modes, True, 1, ONE, out, n_finite, NEVER, 0, NOTHING[1])
-        return out[:, 0]
+        maps, out = self._of(sequence), np.empty_like(modes)
+        codes, entries = self.table(sequence, 1, maps)
+        code = self._singles(maps)
+        columns, kinds = code.columns([(k,) for k in codes.tolist()], entries)
+        code.mapped((columns[0], kinds), given(modes), out)
+        return out
 
     def modes(self, y: np.ndarray) -> np.ndarray:
-        """The input of the loops: modes where these are mixed, else states."""
-        y = given(y)
-        if not self.mixed:
-            return y
-        parts, d = self.parts, self.parts.ndof
+        """The modes (N, 2d) of states."""
+        y, parts, d = given(y), self.parts, self.parts.ndof
+        if parts.diagonal:
+            C, inverse = np.diag(parts.C), np.diag(parts.inverse_C)
+            return np.concatenate([(y[..., :d] - parts.center) * inverse, y[..., d:] * C], axis=-1)
         X = row_products(parts.inverse_C, y[..., :d] - parts.center)
         return np.concatenate([X, row_products(parts.C.T, y[..., d:])], axis=-1)
 
     def states(self, out: np.ndarray, save: np.ndarray | None = None, y0: np.ndarray | None = None) -> np.ndarray:
-        """The output of the loops as states."""
-        if not self.mixed:
-            return out
+        """The states of modes; those after no step are `y0`."""
         parts, d = self.parts, self.parts.ndof
-        X, Y = row_products(parts.C, out[..., :d]), row_products(parts.inverse_C.T, out[..., d:])
+        if parts.diagonal:
+            X, Y = out[..., :d] * np.diag(parts.C), out[..., d:] * np.diag(parts.inverse_C)
+        else:
+            X, Y = row_products(parts.C, out[..., :d]), row_products(parts.inverse_C.T, out[..., d:])
         states = np.concatenate([parts.center + X, Y], axis=-1)
         if save is not None and len(save) and save[0] <= 0:
             states[..., : np.searchsorted(save, 0, "right"), :] = y0
         return states
 
-    def functions(self, sequence: Sequence[Map]) -> LoopFunctions:
-        known = self._tables.get(id(sequence))
-        if known is not None and known[0] is sequence:
-            return known[2]
-        filters, gradients = any(m.filters is not None for m in sequence), any(map(has_gradient, sequence))
-        if gradients and not self.parts.has_force_gradient:
+    def _of(self, sequence: Sequence[Map]) -> PartMaps:
+        """The code of maps with what these have."""
+        if any(map(has_gradient, sequence)) and not self.parts.has_force_gradient:
             raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
-        if (filters, gradients) not in self._variants:
-            algebra = parts_source(self.parts, filters, gradients)
-            module = load_algebra(algebra, ["part_maps"], [states_source(self.parts.ndof)])
-            self._variants[filters, gradients] = LoopFunctions(
-                module.rollout,
-                module.rollout_lanes,
-                module.step_each,
-                module.step_lanes,
-                module.fill_rows,
-                module.ROW_WIDTH,
-            )
-        return self._variants[filters, gradients]
+        filters = any(m.filters is not None for m in sequence)
+        if filters not in self._maps:
+            self._maps[filters] = PartMaps(self.parts, filters)
+        return self._maps[filters]
 
-    def table(self, sequence: Sequence[Map], n: int, functions: LoopFunctions) -> tuple[np.ndarray, np.ndarray]:
-        """Codes (m,) and coefficients (n, m, W), those of the time, of a driven system, still 0: see `timed`."""
-        width = functions.row_width + TIME_WIDTH * self.driven
-        codes, tables = np.empty(len(sequence), dtype=np.int64), np.zeros((n, len(sequence), width))
-        F = TURN_WIDTH * self.parts.n_classes
-        for j, m in enumerate(sequence):
-            codes[j] = m.part + WITH_GRADIENT * has_gradient(m)
-            if m.part == LINEAR:
-                tables[:, j, :F] = self._turns(np.asarray(m.length)).reshape(-1, F)
-                continue
-            tables[:, j, 0], tables[:, j, 1] = m.length, m.gradient
+    def _code(self, maps: PartMaps, groups: Iterable[tuple[int, ...]]) -> PartsCode:
+        key = maps.filters, tuple(sorted({*groups}))
+        if key not in self._codes:
+            self._codes[key] = PartsCode(maps, key[1])
+        return self._codes[key]
+
+    def _singles(self, maps: PartMaps) -> PartsCode:
+        """The code of one map a column."""
+        numbers = range(1, len(self.parts.rest) + 1)
+        bent = [WITH_GRADIENT + k for k in numbers if self.parts.has_force_gradient]
+        return self._code(maps, [(k,) for k in (IDLE, *([LINEAR] if self.parts.linear else []), *numbers, *bent)])
+
+    def table(self, sequence: Sequence[Map], n: int, maps: PartMaps) -> tuple[np.ndarray, np.ndarray]:
+        """Codes (m,) and numbers (n, m, size), those of the time, of a driven system, still 0: see `timed`."""
+        d, F = self.parts.ndof, self.parts.n_classes
+        codes = np.array([*map(_code_of, sequence)], dtype=np.int64)
+        raw = np.zeros((n, len(sequence), max(TURN_WIDTH * F, 2 + d)))
+        raw[..., 2 : 2 + d] = 1.0
+        turning = np.flatnonzero(codes == LINEAR).tolist()
+        if len(turning):
+            lengths = np.empty((n, len(turning), F))
+            for k, j in enumerate(turning):
+                lengths[:, k] = sequence[j].length
+            raw[:, turning, : TURN_WIDTH * F] = self._turns(lengths).reshape(n, len(turning), -1)
+        for j in np.flatnonzero(codes > LINEAR).tolist():
+            m = sequence[j]
+            raw[:, j, 0], raw[:, j, 1] = m.length, m.gradient
             if m.filters is not None:
-                scale = np.diag(self.parts.C) if self.parts.diagonal else 1.0
-                tables[:, j, 2 : 2 + self.parts.ndof] = self.parts.by_class(np.asarray(m.filters)) * scale
-        functions.fill_rows(codes, tables)
-        return codes, tables
+                raw[:, j, 2 : 2 + d] = self.parts.by_class(np.asarray(m.filters))
+        return codes, maps.entries(codes, raw)
 
     def timed(self, sequence: Sequence[Map], tables: np.ndarray, t: Any, h: Any) -> np.ndarray:
         """Tables (..., m, W) of steps h (...) that begin at t (...): a copy with the times, if the system is driven."""
@@ -225,31 +444,53 @@ class PartsLoops:
         t, sigma, c, d = shears(kinds, linear.rates[linear.representatives], s)
         return np.stack([t, sigma, c, d, c - t * d, d + t * c], axis=-1)
 
-    def run_table(self, sequence: Sequence[Map], h: float = 0.0, t0: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Codes and rows of [opening, inner …, link, closing], of steps h from t0 on: see `text/part_maps.py`."""
+    def run_table(self, sequence: Sequence[Map], h: float = 0.0, t0: float = 0.0) -> tuple[PartsCode, Columns]:
+        """The code and the columns of a run, of steps h from t0 on."""
         known = self._tables.get(id(sequence))
         if known is None or known[0] is not sequence:
-            rows, functions = self._rows(sequence), self.functions(sequence)
-            codes, table = self.table(rows, 1, functions)
             if len(self._tables) >= KNOWN_TABLES:
                 self._tables.clear()
-            known = self._tables[id(sequence)] = sequence, (codes, np.ascontiguousarray(table[0])), functions
+            known = self._tables[id(sequence)] = sequence, self._table(sequence)
+        table = known[1]
         if not self.driven:
-            return known[1]
-        codes, table = known[1]
-        return codes, self.timed(self._rows(sequence), table, t0, h)
+            return table.code, table.columns
+        columns, kinds = table.code.columns(table.groups, self.timed(table.maps, table.entries, t0, h))
+        return table.code, (columns[0], kinds)
 
-    def _rows(self, sequence: Sequence[Map]) -> list[Map]:
-        """The maps of a step in the order of `run_table`."""
-        idle = Map(IDLE, 0.0)
-        first, last = sequence[0], sequence[-1]
+    def _table(self, sequence: Sequence[Map]) -> _Table:
+        """The columns [opening, inner …, link, closing], of as many maps each as the code may hold."""
+        of, first, last = self._of(sequence), sequence[0], sequence[-1]
         merged = self._merged(last, first) if len(sequence) > 1 else None
-        return [idle, *sequence, idle, idle] if merged is None else [first, *sequence[1:-1], merged, last]
+        rest, link, closing = [*sequence[1:]], first, Map(IDLE, 0.0)
+        if merged is not None:  # what closes a step is executed after it
+            rest, link, closing = [*sequence[1:-1]], merged, replace(last, at=last.at - 1)
+        for size in range(len(rest) + 1, 0, -1):
+            head, inner = rest[: size - 1], [rest[i : i + size] for i in range(size - 1, len(rest), size)]
+            groups = [[first, *head], *inner, [link, *head], [closing]]
+            kinds = {tuple(map(_code_of, group)) for group in groups}
+            if sum(of.operations(k) for kind in kinds for k in kind) <= MOST_OPERATIONS:
+                break
+        maps = [m for group in groups for m in group]
+        _, entries = self.table(maps, 1, of)
+        code, codes = self._code(of, kinds), [tuple(map(_code_of, group)) for group in groups]
+        columns, numbers = code.columns(codes, entries)
+        return _Table(code, maps, codes, entries, (columns[0], numbers))
 
     def _merged(self, last: Map, first: Map) -> Map | None:
         """The last map of a step and the first of the next, if they are one: of parts that move at the same time."""
         together = not self.parts.timed(last.part) or abs(last.at - 1 - first.at) < SAME_TIME
-        return merge(last, first) if together else None
+        merged = merge(last, first) if together else None
+        return None if merged is None else replace(merged, at=first.at)
+
+
+class _Table(NamedTuple):
+    """What a run of a sequence of maps reads: the maps in groups, their numbers, and the columns of these."""
+
+    code: PartsCode
+    maps: list[Map]
+    groups: list[tuple[int, ...]]
+    entries: np.ndarray
+    columns: Columns
 
 
 class PartsKernel(Kernel):
@@ -271,15 +512,9 @@ class PartsKernel(Kernel):
     ) -> Run:
         """`n_steps` steps of length `h` from one state: see `Kernel`."""
         loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
-        rollout, mixed = loops.functions(sequence).rollout, loops.mixed
-        codes, table = loops.run_table(sequence, h, t0)
-
-        def steps(start: np.ndarray, n_steps: int, save: np.ndarray, out: np.ndarray, *rest: Any) -> int:
-            return rollout(codes, table, start, mixed, n_steps, save, out.T, *rest)  # one type, of a single output too
-
-        out = np.empty((len(y0), len(save))).T  # each component in one piece, as a solution has them
-        start, work = loops.modes(y0), len(codes) * loops.parts.ndof
-        Y, n_finite, _ = run_state(steps, start, n_steps, save, carry, len(start), work, out)
+        (code, columns), start = loops.run_table(sequence, h, t0), loops.modes(y0[None])[0]
+        rollout, work = partial(code.rollout, columns), len(sequence) * loops.parts.ndof
+        Y, n_finite, _ = run_state(rollout, start, n_steps, save, carry, len(start), work)
         return Run(loops.states(Y, save, y0), n_finite)
 
     def run_batch(
@@ -294,30 +529,28 @@ class PartsKernel(Kernel):
     ) -> Run:
         """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
         loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
-        rollout, mixed = loops.functions(sequence).rollout_batch, loops.mixed
-        codes, table = loops.run_table(sequence, h, t0)
+        (code, columns), start = loops.run_table(sequence, h, t0), loops.modes(y0)
 
-        def rows(_: slice, start: np.ndarray, *rest: Any) -> None:
-            rollout(codes, table, start, mixed, *rest)
+        def rows(_: slice, *rest: Any) -> None:
+            code.rollout_batch(columns, *rest)
 
-        start, work = loops.modes(y0), len(codes) * loops.parts.ndof
+        work = len(sequence) * loops.parts.ndof
         Y, n_finite, _ = run_states(rows, start, n_steps, save, threads, carry, start.shape[1], work)
         return Run(loops.states(Y, save, y0[:, None]), n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
-        loops, sequence = self.loops, self.maps(lengths)
-        functions = loops.functions(sequence)
-        out = np.empty(y.shape)
-        codes, tables = loops.table(sequence, len(y), functions)
-        tables = loops.timed(sequence, tables, t, lengths)
-        functions.step_each(codes, tables, loops.modes(y), loops.mixed, out)
-        return Steps(loops.states(out))
+        return Steps(self.loops.stepped(self.maps(lengths), y, t, lengths))
+
+
+def _code_of(m: Map) -> int:
+    return m.part + WITH_GRADIENT * has_gradient(m)
 
 
 def has_gradient(m: Map) -> bool:
-    return bool(np.any(m.gradient))
+    plain = isinstance(m.gradient, float) and m.gradient == 0.0
+    return not plain and bool(np.any(m.gradient))
 
 
 def merge(one: Map, other: Map) -> Map | None:

@@ -12,6 +12,7 @@ import numpy as np
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
+from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "aligned", "filled", "zeros"]
 
@@ -264,18 +265,19 @@ class Rollouts:
             start = np.concatenate([start, np.zeros((len(states), self.n_values - start.shape[1]))], axis=1)
         keeps = running.shape[-1] > 0
         left = np.empty((len(y0), self.n_values)) if keeps or self.counted else running
-        given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps, later, len(later)
-        self.call(name, width, *given, outputs, n_finite, left, int(keeps or self.counted), stop)
+        given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps
+        outlets = later if len(later) else NEVER, len(later), outputs  # an empty array has no address
+        self.call(name, width, *given, *outlets, n_finite, left, int(keeps or self.counted), stop)
         if apart:
             out[:, begun:] = outputs
         if self.counted:
             counts[:], left = left[:, -1], left[:, :-1]
         if keeps:
             running[:] = left
-        if width == 1 and n_finite[0] < n_steps:
-            out[0, np.searchsorted(save, n_finite[0], side="right") :] = np.nan
+        for i in np.flatnonzero(n_finite < n_steps) if width == 1 else ():
+            out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
             if keeps:
-                running[0] = np.nan
+                running[i] = np.nan
 
     def rollout_processed(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> int:
         """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""

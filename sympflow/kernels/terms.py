@@ -28,7 +28,7 @@ MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more 
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
 MOST_COMPILED = 50_000  # operations of the slopes of all formulas, which take some ten seconds
 MOST_TOGETHER = 75  # operations of terms that stand alone in one loop
-MOST_OPERATIONS = 600  # of V, of which the slopes are written out
+MOST_OPERATIONS = 450  # of V, of which the slopes are written out
 
 
 def is_large(symbols: SymbolicHamiltonian) -> bool:

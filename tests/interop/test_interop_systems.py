@@ -30,7 +30,9 @@ class Relativistic(torch.nn.Module):
         return torch.stack([p / torch.sqrt(1 + p**2) + q / 10, -(q**3) - p / 10], -1)
 
 
-@pytest.mark.parametrize("system", [from_hamiltonian(henon_heiles, 2, y0=HH.y0), from_module(Field(), 2, y0=HH.y0)])
+@pytest.mark.parametrize(
+    "system", [from_hamiltonian(henon_heiles, 2, y0=HH.y0, dt=HH.dt), from_module(Field(), 2, y0=HH.y0, dt=HH.dt)]
+)
 def test_a_separable_one_is_recognised_and_moves_as_ours(system):
     assert system.separable
     assert system.quadratic_kinetic

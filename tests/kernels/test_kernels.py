@@ -1,6 +1,7 @@
 """The splitting kernel against plain NumPy loops, and what it promises about saves, blow-ups, lanes and caches."""
 
 import os
+import pickle
 import subprocess
 import sys
 
@@ -209,6 +210,14 @@ def test_batch_agrees_with_single_runs(systems, scheme, n_states, compensated):
     for i in {0, n_states // 2, n_states - 1}:
         single, *_ = loops.kernel(scheme, compensated).run(0.1, y0[i], 600, save)
         assert np.abs(Y[i] - single).max() < 1e-12
+
+
+def test_loops_around_functions_are_pickled_by_these(systems):
+    system = systems["numba_chain"]
+    kernel = splitting_loops(system).kernel(VERLET)
+    again = pickle.loads(pickle.dumps(kernel))
+    found = [k.run(0.1, system.y0, 10, np.array([10])).states for k in (kernel, again)]
+    np.testing.assert_array_equal(*found)
 
 
 def test_batch_of_a_numba_system(systems):

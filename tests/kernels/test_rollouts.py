@@ -54,3 +54,13 @@ def test_states_in_memory_run_as_those_in_registers(name, compensated):
     for a, b in zip(*found, strict=True):
         assert np.array_equal(a, b, equal_nan=True)
     assert found[0][1][5] == found[0][5] < 40
+
+
+def test_runs_without_outputs_reach_their_end():
+    code = SplittingCode(Splitting(systems.henon_heiles().symbols.parametric, 0))
+    values = systems.henon_heiles().symbols.parametric.values
+    table, y0 = run_table(scheme_named("verlet"), 0.1).rows(values), np.full((37, 4), 0.1)
+    carry = Carry()
+    run = run_states(lambda _, *rest: code.rollout_batch(table, *rest), y0, 50, np.zeros(0, int), 1, carry, 4, 1)
+    assert (run.n_finite == 50).all()
+    assert np.isfinite(carry.running).all()

@@ -63,4 +63,4 @@ def test_bad_arguments(arguments, error, message):
     with pytest.raises(error, match=message):
         floquet_multipliers(systems.pendulum(), **arguments)
     with pytest.raises(TypeError, match="`system` must be a HamiltonianSystem"):
-        floquet_multipliers("pendulum", period=1.0)
+        floquet_multipliers(3, period=1.0)

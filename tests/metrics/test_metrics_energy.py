@@ -20,7 +20,7 @@ def test_verlet_energy_error_on_the_oscillator_is_bounded_by_a_quarter_of_z_squa
 
 def test_error_is_relative_to_the_initial_energy_or_to_the_declared_scale():
     system = systems.henon_heiles()
-    declared = HamiltonianSystem.from_sympy(system.symbols.H, y0=system.y0, energy_scale=2.0)
+    declared = HamiltonianSystem.from_sympy(system.symbols.H, y0=system.y0, dt=system.dt, energy_scale=2.0)
     sol, with_scale = (solve(s, "verlet", (0, 10)) for s in (system, declared))
     absolute = energy_error(sol, relative=False)
     H0 = system.hamiltonian(system.y0)
