@@ -4,6 +4,7 @@
     python benchmarks/learning.py --only hnn-spring             one protocol
     python benchmarks/learning.py --only discovery              formulas of four systems
     python benchmarks/learning.py --only sweeps                 the authors' sweeps in noise, N and M, with a figure
+    python benchmarks/learning.py --only measured --write FOLDER    data as they are measured, and as CSV files
 
 The data are made here, by the descriptions of the authors' generators, from solutions that are exact to 1e-10. "Theirs"
 are published figures (`SOURCES`), or, where the protocol asks for it, a baseline by code of this file that gets as much
@@ -31,6 +32,7 @@ import numpy as np
 import torch
 from contenders import networks
 from measuring import fragments
+from scipy.signal import savgol_filter
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, discover, solve, systems
@@ -40,6 +42,7 @@ SOURCES = {
     "ghnn": "GHNN (AELITTEN/GHNN): exact labels in place of the authors', which err by 1e-4 to 1e-3",
     "hnn": "HNN (greydanus/hamiltonian-nn): 50 trajectories, half for training, σ = 0.1",
     "d-hnn": "D-HNN (greydanus/dissipative_hnns): damped spring, γ = 0.1, σ = 0.01",
+    "measured": "M. Schmidt, H. Lipson, Science 324 (2009) 81–85: the kinds of systems and of data, made by a seed",
 }
 PENDULUM = systems.pendulum()
 SPRING = HamiltonianSystem.from_sympy("p**2 + q**2", name="spring")
@@ -439,6 +442,124 @@ def hnn(name: str, options: argparse.Namespace) -> list[Row]:
     return rows
 
 
+# as measured ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A system whose positions are filmed, with a friction of 1 %; velocities are slopes of smoothed positions.
+
+    Attributes
+    ----------
+    start : float
+        The size of the positions at the start, at random, at rest.
+    dt, judged : float
+        The time from one picture to the next, and that of the predictions.
+    angles : bool
+    """
+
+    system: HamiltonianSystem
+    start: float
+    dt: float
+    judged: float
+    angles: bool
+
+    def states(self, n: int, seed: int) -> np.ndarray:
+        q = np.random.default_rng(seed).uniform(-self.start, self.start, (n, self.system.ndof))
+        return np.concatenate([q, np.zeros_like(q)], axis=1)
+
+    def observed(self, y: np.ndarray) -> np.ndarray:
+        """Positions and velocities (N, 2d, n) of states."""
+        d = self.system.ndof
+        v = np.moveaxis(self.system.vector_field(np.moveaxis(y, -1, -2)), -1, -2)[:, :d]
+        return np.concatenate([y[:, :d], v], axis=1)
+
+
+PICTURES, FILMS, WINDOW = 200, 6, 11
+"""Points of a trajectory, trajectories, and points of the cubics by which positions are smoothed."""
+BLUR = 0.01
+"""Error of a position, in the spread of all."""
+MEASURED = {
+    "pendulum": Measured(
+        HamiltonianSystem.from_sympy("p**2/2 - cos(q)", damping=0.01, name="pendulum"), 2.5, 0.1, 20.0, True
+    ),
+    "spring": Measured(
+        HamiltonianSystem.from_sympy("(p**2 + q**2)/2", damping=0.01, name="spring"), 1.0, 0.1, 20.0, False
+    ),
+    "double pendulum": Measured(
+        HamiltonianSystem.from_sympy(systems.double_pendulum().symbols.H, damping=0.01, name="double_pendulum"),
+        1.2, 0.05, 10.0, True,
+    ),
+    "two carts": Measured(
+        HamiltonianSystem.from_sympy(
+            "p1**2/2 + p2**2/1.4 + q1**2/2 + (q2 - q1)**2/2 + q2**2/2", damping=0.01, name="two_carts"
+        ),
+        1.0, 0.1, 20.0, False,
+    ),
+}  # fmt: skip
+
+
+def filmed(of: Measured, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, positions with velocities (N, 2d, n), and their slopes, all by cubics through noisy positions."""
+    t = of.dt * np.arange(PICTURES)
+    q = exact(of.system, of.states(FILMS, seed), t)[:, : of.system.ndof]
+    q = q + BLUR * q.std() * np.random.default_rng([seed, 1]).normal(size=q.shape)
+    smooth = [savgol_filter(q, WINDOW, 3, deriv=k, delta=of.dt, axis=-1) for k in range(3)]
+    return t, np.concatenate(smooth[:2], axis=1), np.concatenate(smooth[1:], axis=1)
+
+
+def measured_rows(options: argparse.Namespace) -> list[Row]:
+    """`learn` by velocities, and what learns from smoothed derivatives, judged by positions from states never seen."""
+    rows = []
+    for name, of in MEASURED.items():
+        t, y, slopes = filmed(of)
+        d = of.system.ndof
+        if options.write is not None:
+            write_films(options.write / f"{of.system.name}.csv", t, y)
+        x, v = (part.transpose(0, 2, 1).reshape(-1, 2 * d) for part in (y, slopes))
+        y0 = of.states(20, 1000)
+        judged = np.arange(0.0, of.judged + of.dt / 2, of.dt)
+        truth = exact(of.system, y0, judged)[:, :d]
+        start = of.observed(y0[..., None])[..., 0]
+
+        def error(made: np.ndarray, truth: np.ndarray = truth) -> float:
+            far = np.clip(np.nan_to_num(made - truth, nan=np.inf), -2 * truth.std(), 2 * truth.std())
+            return float(np.sqrt(np.mean(far**2)) / truth.std())
+
+        theirs: dict[str, tuple[float, float]] = {}
+        for kind in ("HNN", "MLP", "SINDy"):
+            if kind == "SINDy":
+                field, seconds = timed(lambda x=x, v=v, of=of: networks.sparse_field(x, v, of.angles))  # type: ignore[misc]
+            else:
+                steps = 4 * options.networks  # beyond which neither is better
+                field, seconds = timed(
+                    lambda kind=kind, x=x, v=v, steps=steps: networks.learned_field(kind, x, v, steps)
+                )  # type: ignore[misc]
+            theirs[kind] = error(networks.followed(field, start, judged)[:, :d]), seconds
+        period = 2 * np.pi if of.angles else None
+        flow, seconds = timed(
+            lambda t=t, y=y, period=period: sympflow.learn((t, y), observed="qv", damping=True, period=period)  # type: ignore[misc]
+        )
+        with_momenta = np.concatenate([start[:, :d], flow.system.momenta(start[:, :d], start[:, d:])], axis=1)
+        ours = error(predicted(flow, with_momenta, judged)[:, :d])
+        kind = min(theirs, key=lambda kind: theirs[kind][0])
+        metric, best = f"error of q to t = {of.judged:g}, in their spread", theirs[kind][0]
+        rows.append(Row(name, metric, f"{fragments.number(best)} ({kind})", best / 2, ours, seconds, _model(flow)))
+        print(*rows[-1].cells(), sep=" | ", flush=True)
+        rows += [Row(f"{name}, {kind}", metric, "", None, *figures) for kind, figures in theirs.items()]
+    return rows
+
+
+def write_films(path: Path, t: np.ndarray, y: np.ndarray) -> None:
+    """A CSV file that `learn` reads: columns run, t, q1 …, v1 …"""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    d = y.shape[1] // 2
+    names = ["run", "t", *(f"{letter}{i + 1}" for letter in "qv" for i in range(d))]
+    runs = np.repeat(np.arange(len(y)), len(t))
+    table = np.column_stack([runs, np.tile(t, len(y)), y.transpose(0, 2, 1).reshape(-1, 2 * d)])
+    np.savetxt(path, table, fmt=["%d", *["%.9g"] * (1 + 2 * d)], delimiter=",", header=",".join(names), comments="")
+
+
 # discovery ------------------------------------------------------------------------------------------------------------
 
 
@@ -544,6 +665,7 @@ PROTOCOLS: dict[str, Callable[[argparse.Namespace], list[Row]]] = {
     "hnn-pendulum": lambda o: hnn("pendulum", o),
     "hnn-two-bodies": lambda o: hnn("two-bodies", o),
     "d-hnn": lambda o: hnn("damped", o),
+    "measured": measured_rows,
 }
 FRAGMENTS = {
     "authors-oscillator": "learning-authors-oscillator",
@@ -555,6 +677,7 @@ FRAGMENTS = {
     "hnn-pendulum": "learning-hnn-pendulum",
     "hnn-two-bodies": "learning-hnn-two-bodies",
     "d-hnn": "learning-d-hnn",
+    "measured": "learning-measured",
 }
 
 
@@ -565,6 +688,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=100, help="training trajectories of the GHNN protocols")
     parser.add_argument("--pendulums", type=int, default=30, help="training trajectories of the double pendulum")
     parser.add_argument("--baseline", type=float, default=20.0, help="least processor time of Adam, in seconds")
+    parser.add_argument("--write", type=Path, help="a folder for the data of the protocol `measured`")
     parser.add_argument("--networks", type=int, default=1000, help="steps of the networks' training, 0 for none")
     parser.add_argument("--budget", type=float, default=540.0, help="seconds for each fit of the three bodies")
     parser.add_argument("--flow-budget", type=float, default=120.0, help="seconds for each fit of a flow with networks")

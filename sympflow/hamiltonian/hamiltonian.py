@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
+NEWTON, FOUND = 20, 1e-12  # steps at most, and the error of a velocity relative to the largest
+
+
 class ExternalForce(Protocol):
     """F(q, p) in p' = −∂H/∂q + F, that no H has; of a driven system t, a number or (...), follows p."""
 
@@ -135,6 +138,26 @@ class Hamiltonian:
         A, B = self.potential_hessian(y[..., :d], t), self.kinetic_hessian(y[..., d:], t)
         B = B + 0 * A
         return concatenate([_rows(A, 0 * A), _rows(0 * B, B)]).swapaxes(-1, -2)
+
+    def momenta(self, q: Array, v: Array, t: Any = None) -> Array:
+        """p with ∂H/∂p(q, p) = v, by Newton's method from p = v: (..., d) and (..., d) to (..., d).
+
+        Raises
+        ------
+        ValueError
+            If no p is found: M of H = ½ pᵀM⁻¹p + V always gives one.
+        """
+        d, p = self.ndof, v
+        for _ in range(NEWTON):
+            y = concatenate([q, p])
+            left = v - self.gradient(y, t)[..., d:]
+            if bool((abs(left) <= FOUND * abs(v).max()).all()):
+                return p
+            try:
+                p = p + _library(left).linalg.solve(self.hessian(y, t)[..., d:, d:], left[..., None])[..., 0]
+            except (np.linalg.LinAlgError, RuntimeError):  # the latter of torch
+                break
+        raise ValueError("`v` are velocities of no momenta that Newton's method finds: give p itself.")
 
     def time_derivative(self, y: Array, t: Any = None) -> Array:
         """∂H/∂t of a driven system, 0 of another: (..., 2d) to (...)."""

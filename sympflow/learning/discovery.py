@@ -287,6 +287,10 @@ def discover(
             raise TypeError(f"`{next(iter(reading), 'noise')}` is of trajectories, and `data` is a flow: leave it out.")
         return _of_flow(data, terms, degree, most_terms, domain, seed, name)
     trajectories = Trajectories.read(data, ndof, **reading)
+    if trajectories.velocities:
+        raise ValueError(
+            '`observed` must be "qp" for `discover`: pass `velocity_mass`, or learn the masses by `learn`.'
+        )
     trajectories.check_moving()
     period = reading.get("period")
     trajectories.check_angles(None if period is None else np.isinf(periods_of(period, trajectories.ndof)))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,10 @@ class Said:
         The covariance of the momenta along a trajectory, in their mean; None where it is not known.
     flow_scaling : Scaling or None
         The units of a flow that is fitted itself, and its Δt; None for none.
+    velocities : bool
+        True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or M₁₁ in the middle of the data.
+    middle : ndarray of shape (d,) or None
+        The mean of q.
     """
 
     scales: np.ndarray
@@ -60,6 +65,8 @@ class Said:
     known: tuple[Formula, ...] = ()
     momenta: np.ndarray | None = None
     flow_scaling: Scaling | None = None
+    velocities: bool = False
+    middle: np.ndarray | None = None
 
     @property
     def ndof(self) -> int:
@@ -85,15 +92,21 @@ class Said:
         """½ pᵀM⁻¹p, learned if it is not known."""
         if self.inverse_mass is not None:
             return (FixedKinetic(self.inverse_mass),)
-        return () if self.kinetic_is_known else (Kinetic(self.scales[self.ndof :]),)
+        if self.kinetic_is_known:
+            return ()
+        T = Kinetic(self.scales[self.ndof :])
+        if not self.velocities:
+            return (T,)
+        unit = FixedKinetic(np.diag(np.eye(self.ndof)[0]))
+        return (unit, T.subset(np.arange(T.n) > 0)) if self.ndof > 1 else (unit,)
 
     def separated(self, *potential: Part) -> Model:
         """T(p) + V(q)."""
-        return Model(self.ndof, (*self.kinetic(), *potential, *self.known), self.rates)
+        return self.whole(*self.kinetic(), *potential)
 
     def whole(self, *parts: Part) -> Model:
         """H(q, p)."""
-        return Model(self.ndof, (*parts, *self.known), self.rates)
+        return Model(self.ndof, (*parts, *self.known), self.rates, self.velocities)
 
 
 @dataclass(frozen=True)
@@ -145,9 +158,19 @@ def _inertia(said: Said) -> Iterator[Candidate]:
     for order in () if said.kinetic_is_known else ORDERS:
         V = Waves.up_to(order, max(order, 2), "q", scales, periods)
         M = Waves.up_to(order, order, "q", scales, periods, constant=True)
-        part = Inertia(M)
+        part = Inertia(M, unit=said.middle if said.velocities else None)
         if V.n + part.n <= MOST_TERMS:
             yield Candidate(f"H = ½ pᵀM(q)⁻¹p + V(q), M and V series of order {order}", said.whole(part, V))
+
+
+def _magnetic(said: Said) -> Iterator[Candidate]:
+    d = said.ndof
+    exponents = [np.eye(2 * d, dtype=int)[[i, d + j]].sum(axis=0) for i, j in combinations(range(d), 2)]
+    for degree, V in _few(DEGREES, "q", said.scales[:d]) if exponents else ():
+        turn = Polynomial("y", exponents, said.scales)
+        yield Candidate(
+            f"H = ½ pᵀM⁻¹p + Σ b_ij q_i p_j + V, V a polynomial of degree {degree}", said.separated(turn, V)
+        )
 
 
 def _pairs(said: Said) -> Iterator[Candidate]:
@@ -212,11 +235,18 @@ class Family:
     linear : bool
         True of models that are linear in their numbers, and soon fitted. Before those that are not, the data are asked
         whether any H explains them.
+    observed : str
+        What its numbers can be told by: "qp" for states, "qv" for velocities, "both".
     """
 
     separable: bool
     models: Callable[[Said], Iterator[Candidate]]
     linear: bool = True
+    observed: str = "both"
+
+    def tells(self, said: Said) -> bool:
+        """True if what is observed can tell the numbers of its models."""
+        return self.observed in ("both", "qv" if said.velocities else "qp")
 
 
 FAMILIES = {
@@ -225,15 +255,17 @@ FAMILIES = {
     "polynomial": Family(True, _polynomials),
     "network": Family(True, _networks, linear=False),
     "inertia": Family(False, _inertia, linear=False),
-    "whole-waves": Family(False, _whole_waves),
-    "whole-polynomial": Family(False, _whole_polynomials),
-    "whole-network": Family(False, _whole_networks, linear=False),
-    "sympflow": Family(False, _flows, linear=False),
+    "magnetic": Family(False, _magnetic, observed="qv"),
+    "whole-waves": Family(False, _whole_waves, observed="qp"),
+    "whole-polynomial": Family(False, _whole_polynomials, observed="qp"),
+    "whole-network": Family(False, _whole_networks, linear=False, observed="qp"),
+    "sympflow": Family(False, _flows, linear=False, observed="qp"),
 }
 """In the order in which they are tried: potentials of the distances of bodies; Fourier series, where a `period` is
 given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q); "inertia" has a mass matrix that
-depends on q, as of pendulums that hang on each other; the next three are functions H(q, p). "sympflow" is last: flow
-maps with neural potentials, which are fitted to the data themselves, and no H is learned."""
+depends on q, as of pendulums that hang on each other; "magnetic", for velocities, a uniform magnetic field, in Landau's
+gauge; the next three are functions H(q, p). "sympflow" is last: flow maps with neural potentials, which are fitted to
+the data themselves, and no H is learned."""
 
 
 def families(said: Said, name: str | None) -> list[str]:
@@ -252,26 +284,30 @@ def families(said: Said, name: str | None) -> list[str]:
         )
     if said.inverse_mass is not None and (said.separable is False or (name and not FAMILIES[name].separable)):
         raise ValueError("`mass` is of T = ½ pᵀM⁻¹p in a separable H: leave out one of them.")
-    if name is not None and not any(True for _ in FAMILIES[name].models(said)):
+    if name is not None and not (FAMILIES[name].tells(said) and any(True for _ in FAMILIES[name].models(said))):
         raise ValueError(
             f"`family` {name!r} does not apply: series need the `period` of an angle, pairs the coordinates of two "
-            "bodies or more in two or three dimensions, flows nothing that is known of H, and other families not too "
-            "many degrees of freedom."
+            "bodies or more in two or three dimensions, functions H(q, p) and flows momenta, a magnetic field "
+            "velocities in two dimensions or more, flows nothing that is known of H, and other families not too many "
+            "degrees of freedom."
         )
     if name is not None:
         return [name]
     only = said.separable if said.inverse_mass is None else True
-    return [name for name, family in FAMILIES.items() if only is None or family.separable == only]
+    kinds = {name: family for name, family in FAMILIES.items() if family.tells(said)}
+    return [name for name, family in kinds.items() if only is None or family.separable == only]
 
 
 def with_unit_mass(candidate: Candidate, said: Said) -> Candidate | None:
     """The same model with T = ½ p²; None if its T is not learned."""
     parts = candidate.model.parts
-    if said.inverse_mass is not None or (not candidate.model.nystrom and not candidate.model.rates):
+    if not any(part.of == "p" and part.n for part in parts) or (
+        not candidate.model.nystrom and not candidate.model.rates
+    ):
         return None
     rest = tuple(part for part in parts if part.of != "p")
     name = candidate.name.replace("T = ½ pᵀM⁻¹p", "T = ½ p²")
-    return Candidate(name, Model(said.ndof, (FixedKinetic(np.eye(said.ndof)), *rest), said.rates))
+    return Candidate(name, replace(candidate.model, parts=(FixedKinetic(np.eye(said.ndof)), *rest)))
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:

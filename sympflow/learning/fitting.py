@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.models import Model
 from sympflow.learning.shooting import (
     FINEST,
@@ -24,10 +25,9 @@ from sympflow.learning.shooting import (
     rho,
     steppers,
 )
-from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
-FIRST_POINTS = 10  # of the pieces that a fit begins with
+FIRST_POINTS, SKETCH_POINTS = 10, 30  # of the pieces that a fit begins with, and that one of all terms has
 MATCHED_POINTS = 24  # of those whose increments give its start
 MATCHED_STEPS = 60
 ROUNDS = 4  # of longer pieces, or of another noise
@@ -85,6 +85,8 @@ class Setting:
     rival : ndarray of shape (2d,) or None
         The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is given
         up.
+    sketch : bool
+        True to end with orbits of a few points.
     """
 
     noise: np.ndarray | None = None
@@ -93,6 +95,7 @@ class Setting:
     seen: np.ndarray | None = None
     lag: float = 0.0
     rival: np.ndarray | None = None
+    sketch: bool = False
 
     def plausible(self, noise: np.ndarray) -> bool:
         """True unless a model leaves so much (2d,) that it is rejected whatever its last digits are."""
@@ -160,21 +163,23 @@ def fitted(
     scales, former = data.scales, theta if isinstance(theta, Fitted) else None
     theta = theta.theta if isinstance(theta, Fitted) else theta
     if theta is None:
-        theta = model.start(np.random.default_rng(seed))
-        if model.lagrangian:
+        theta, moved = model.start(np.random.default_rng(seed)), data
+        if model.lagrangian or model.velocities:
             assert isinstance(model, Model)
-            smooth = smoothed(data)
-            theta = model.lagrangian_start(smooth.points.T, smooth.slopes.T, scales)
+            theta, moved = lagrangian_start(model, data, theta)
         if model.stepper is None:
             steps = 1 if model.linear else MATCHED_STEPS
-            theta = matched(model, theta, data.pieces(MATCHED_POINTS), 1 / scales, steps)
+            theta = matched(model, theta, moved.pieces(MATCHED_POINTS), 1 / moved.scales, steps)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
     sigma = given if given is not None else 1e-2 * scales if former is None else former.sigma
     span = (
         former.span if former is not None else 0.0 if model.stepper is None else model.stepper.longest
     )  # a map of its own is fitted over all of a step
-    pieces = data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
-    states = first_states(pieces) if former is None or not span else _states(former, data, pieces, sigma, setting)
+    pieces = data.pieces(span=span) if span else data.pieces(SKETCH_POINTS if setting.sketch else FIRST_POINTS)
+    if former is None or not span:
+        states = first_states(pieces, model, theta)
+    else:
+        states = _states(former, data, pieces, sigma, setting)
     costs: list[float] = []
     finer = 1.0
     for attempt in range(1 + ROUNDS):
@@ -184,7 +189,8 @@ def fitted(
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
         gain = FINE if (attempt or former is not None) and setting.plausible(sigma) else COARSE
         most = STEPS if model.stepper is None else OWN_STEPS
-        fit = minimized(problem, theta, states, iterations=most, gain=gain, stop=setting.stop)
+        patience = 3 if former is None else 1  # near the minimum a step tells
+        fit = minimized(problem, theta, states, iterations=most, gain=gain, patience=patience, stop=setting.stop)
         theta, before = fit.theta, sigma
         costs += [cost / data.n_values for cost in fit.costs]
         if given is None:
@@ -194,7 +200,7 @@ def fitted(
         orbits = np.concatenate(fit.orbits, axis=1)
         coarse = fit.step_error(np.maximum(sigma, EXACT * scales)) > STEP_ERROR
         finer = finer / 10 if coarse else finer
-        longer = _span(model, data, method, theta, orbits, scales, sigma)
+        longer = 0.0 if setting.sketch else _span(model, data, method, theta, orbits, scales, sigma)
         settled = np.allclose(sigma, before, rtol=SETTLED, atol=EXACT * scales.min())
         if longer <= 1.5 * span and settled and not coarse:
             break
@@ -227,7 +233,8 @@ def _states(found: Fitted, data: Trajectories, pieces: Trajectories, sigma: np.n
     """The initial states (N, 2d) of pieces, by a few points each: the first observation alone leads far astray."""
     few = data.pieces(FIRST_POINTS)
     short = Problem(found.model, few, found.method, sigma, frozen=True, huber=setting.huber)
-    orbits = minimized(short, found.theta, first_states(few), iterations=20, patience=1).orbits
+    starts = first_states(few, found.model, found.theta)
+    orbits = minimized(short, found.theta, starts, iterations=20, patience=1, stop=setting.stop).orbits
     return np.concatenate(orbits, axis=1)[:, _starts(pieces.runs)].T
 
 
@@ -248,7 +255,8 @@ def _span(
     """The longest time over which orbits are followed: whole trajectories, unless their errors grow too fast."""
     limit = float(np.clip(PER_NOISE * np.min(scales / sigma), LEAST_GROWTH, GROWTH))
     frozen = Problem(model, data, method, sigma, frozen=True)
-    times = frozen.growth(theta, orbits[:, _starts(data.runs)].T, scales, limit)
+    spread = orbits.std(axis=1) if model.velocities else scales
+    times = frozen.growth(theta, orbits[:, _starts(data.runs)].T, spread, limit)
     soonest = float(np.quantile(times, 0.1, method="lower"))
     return soonest if math.isfinite(soonest) else max(run.span for run in data.runs)
 
@@ -334,7 +342,7 @@ def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
     states = _states(found, held, pieces, sigma, setting)
-    fit = minimized(problem, found.theta, states, iterations=20, patience=1)
+    fit = minimized(problem, found.theta, states, iterations=20, patience=1, stop=setting.stop)
     residuals = fit.residuals
     ends = np.cumsum([run.n_points for run in held.runs])
     owner = np.searchsorted(ends, _starts(pieces.runs), side="right")

@@ -24,18 +24,26 @@ class Inertia(Part):
         f, of q.
     entries : ndarray of int, shape (n, 3), optional
         For each θ the places k, i and j, i ≤ j; the default is all of them.
+    unit : ndarray of shape (d,), optional
+        q at which M₁₁ is 1: of velocities alone M is known but for a factor. The constant of M₁₁ is none of θ then.
     """
 
     of = "y"
 
-    def __init__(self, functions: Waves, entries: np.ndarray | None = None) -> None:
+    def __init__(self, functions: Waves, entries: np.ndarray | None = None, unit: np.ndarray | None = None) -> None:
         d = functions.waves.shape[1]
-        self.functions = functions
+        self.functions, self.unit = functions, unit
         self.pairs = [(i, j) for i in range(d) for j in range(i, d)]
+        self._constant = (functions.waves == 0).all(axis=1) & (functions.powers.exponents == 0).all(axis=1)
         if entries is None:
-            entries = np.array([(k, i, j) for i, j in self.pairs for k in range(functions.n)])
+            whole = np.array([(k, i, j) for i, j in self.pairs for k in range(functions.n)])
+            entries = whole[(unit is None) | ~self._constant[whole[:, 0]] | (whole[:, 2] > 0)]
         self.entries, self.n = entries, len(entries)
         self._pair = np.array([self.pairs.index((i, j)) for i, j in entries[:, 1:].tolist()], dtype=int)
+        self._shift = np.zeros(self.n)  # of functions, which then are 0 where M₁₁ is 1
+        if unit is not None:
+            there = functions.derivatives(unit[:, None], False)[0][:, 0]
+            self._shift = np.where(self._pair == 0, there[entries[:, 0]], 0.0)
         self._double = np.array([1.0 if i == j else 2.0 for i, j in self.pairs])
 
     @property
@@ -51,18 +59,19 @@ class Inertia(Part):
         return True
 
     def subset(self, kept: np.ndarray) -> Inertia:
-        return Inertia(self.functions, self.entries[kept])
+        return Inertia(self.functions, self.entries[kept], self.unit)
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """The unit matrix, where it can be written."""
         k, i, j = self.entries.T
-        constant = (self.functions.waves == 0).all(axis=1) & (self.functions.powers.exponents == 0).all(axis=1)
-        return (constant[k] & (i == j)).astype(float)
+        return (self._constant[k] & (i == j)).astype(float)
 
     def _coefficients(self, theta: np.ndarray) -> np.ndarray:
         """θ as a matrix (pairs, functions)."""
         C = np.zeros((len(self.pairs), self.functions.n))
         C[self._pair, self.entries[:, 0]] = theta
+        if self.unit is not None:
+            C[0, self._constant] = 1 - self._shift @ theta
         return C
 
     def _matrices(self, entries: np.ndarray) -> np.ndarray:
@@ -111,26 +120,30 @@ class Inertia(Part):
         if by_parameters:
             by = np.empty((m, self.n, N))
             k, pair = self.entries[:, 0], self._pair
+            g = f[k] - self._shift[:, None]
             pulled = np.stack([W[:, i] * v[j] + (W[:, j] * v[i] if i != j else 0.0) for i, j in self.pairs], axis=1)
             for i in range(d):
-                by[d + i] = -f[k] * pulled[i][pair]
+                by[d + i] = -g * pulled[i][pair]
                 turned = np.einsum("jn,jan->an", u[i], pulled)
-                by[i] = f[k] * turned[pair] - 0.5 * first[i][k] * products[pair]
+                by[i] = g * turned[pair] - 0.5 * first[i][k] * products[pair]
         return Linear(value, slopes, by)
 
-    def momenta(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         d, N = q.shape
         f, first, _ = self.functions.derivatives(q, False)
         k, pair = self.entries[:, 0], self._pair
+        g = f[k] - self._shift[:, None]
         made = np.zeros((2 * d, self.n, N))
         for place, (i, j) in enumerate(self.pairs):
             own = pair == place
-            made[i, own] = f[k[own]] * v[j]
-            made[j, own] = f[k[own]] * v[i]
+            made[i, own] = g[own] * v[j]
+            made[j, own] = g[own] * v[i]
         products = self._products(v)
         for i in range(d):
             made[d + i] = 0.5 * first[i][k] * products[pair]
-        return made
+        value = np.zeros((2 * d, N))
+        value[0] = v[0] if self.unit is not None else 0.0
+        return value, made
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         d = len(x) // 2

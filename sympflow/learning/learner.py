@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import warnings
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -43,8 +42,9 @@ from sympflow.learning.models import Formula, FreeField, Model, Pairs, Part, Pol
 from sympflow.learning.shooting import Field, Method
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
-from sympflow.learning.trajectories import FEW, Trajectories, periods_of
+from sympflow.learning.trajectories import FEW, Run, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
+from sympflow.storage.identity import digest
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
 from sympflow.training.starts import suited_step
@@ -56,7 +56,9 @@ TIME_BUDGET = 60.0  # seconds
 WIDE = 32  # trajectories from which orbits side by side cost no more than their steps; of fewer long ones are cut
 LONG_POINTS, LONG = 100, 12.0  # points, and times in which states move by their spread, that the pieces have at least
 ALONE = 24  # points of the pieces of a trajectory that is the only one, at least
-HOPELESS = 4.0  # squares of increments, over those of the best model, from which a model is one of the last
+SHARE = 3  # of families that are still to be tried, whose time is given to the next
+MANY = 20  # numbers of a model that is simplified before its orbits are followed
+HOPELESS = 2.0  # squares of increments, over those of the best model, from which a model is one of the last
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
 DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
@@ -143,7 +145,9 @@ def learn(
         As for `sympflow.train`; None for a search that ends by itself. A checkpoint is written after each model;
         `workers` share the replicas.
     **reading
-        Options of `Trajectories.read`, such as `units`, `order` and `velocity_mass`.
+        Options of `Trajectories.read`, such as `units`, `order` and `velocity_mass`. With observed="qv" the data have
+        velocities of a mass that is not known, with "q" positions alone: then H is learned but for a factor, by which
+        (M⁻¹)₁₁ is 1, or M₁₁ in the middle of q where M depends on q. `flow.system.momenta(q, v)` are the momenta.
 
     Returns
     -------
@@ -252,7 +256,10 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: A
     if inverse is not None and any(part.of != "q" for part in parts):
         raise ValueError("`known` has a kinetic energy, and so has `mass`: leave out one of them.")
     rates = 0 if damping is False else 1 if damping is True else d
-    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts, _covariance(data))
+    momenta = None if data.velocities else _covariance(data)
+    middle = np.nanmean(np.concatenate([run.y[:d] for run in data.runs], axis=1), axis=1)
+    of_data: dict[str, Any] = {"momenta": momenta, "velocities": data.velocities, "middle": middle}
+    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts, **of_data)
 
 
 def _covariance(data: Trajectories) -> np.ndarray:
@@ -290,11 +297,9 @@ def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
 
 def _identity(data: Trajectories, said: Said, setting: Setting, options: dict[str, Any]) -> dict[str, Any]:
     """The description that a search must share with the one that it goes on with."""
-    numbers = [*(run.t for run in data.runs), *(run.y.ravel() for run in data.runs)]
-    numbers += [v for v in (said.inverse_mass, said.periods, setting.noise) if v is not None]
-    digest = zlib.crc32(np.concatenate([np.ravel(v) for v in numbers]).tobytes())
     known = [str(part.formula) for part in said.known]
-    return {"config": json.dumps(options), "architecture": json.dumps(known), "fingerprint": [float(digest)]}
+    of_data = digest([data, said.inverse_mass, said.periods, setting.noise])
+    return {"config": json.dumps(options), "architecture": json.dumps(known), "system": of_data}
 
 
 def _noise(noise: Any, data: Trajectories) -> np.ndarray | None:
@@ -388,6 +393,11 @@ def without_growth(found: Fitted) -> Fitted:
     return replace(found, theta=np.where(growing, 0.0, theta - moved))
 
 
+def _by_lagrange(model: Any) -> bool:
+    """True of a model whose numbers velocities tell by linear equations."""
+    return bool(model.velocities and model.lagrangian)
+
+
 Chosen = tuple[Candidate, Fitted, Held]
 
 
@@ -449,6 +459,8 @@ class Search:
     """The trajectories as they were before they were cut; None if they were not."""
     final: Fitted = field(init=False)
     """The chosen model, fitted to all trajectories."""
+    late: Callable[[], bool] = lambda: False
+    """True once there is no time for another model."""
 
     @property
     def data(self) -> Trajectories:
@@ -490,6 +502,7 @@ class Search:
     def run(self, names: list[str], session: Session) -> None:
         """Fit models of these families until one explains the held-out trajectories, or no richer one does better."""
         deadline = session.deadline.part(1 - TABLE_SHARE) if session.time_budget is not None else session.deadline
+        self.late = deadline.over
         setting = replace(self.setting, stop=deadline.over)
         total = sum(1 for name in names for _ in FAMILIES[name].models(self.said))
         with session.bar(total, "Models") as self.bar:
@@ -502,7 +515,7 @@ class Search:
                     break
                 if self.best is not None and not linear and self.freedom(setting) is not None:
                     break
-                own = deadline.part(min(2 / (len(queue) - place), 1.0))
+                own = deadline.part(min(SHARE / (len(queue) - place), 1.0))
                 self._climb(candidates, replace(setting, stop=own.over), session)
         if self.best is None:
             raise ValueError(
@@ -531,7 +544,7 @@ class Search:
         that leave much more of increments than the best of all are the last.
         """
         queue = [(FAMILIES[name].linear, [*FAMILIES[name].models(self.said)]) for name in names]
-        linear = [c for is_linear, candidates in queue if is_linear for c in candidates]
+        linear = [c for _, candidates in queue for c in candidates if c.model.linear or _by_lagrange(c.model)]
         found = best_by_increments(*self.folds[0], [candidate.model for candidate in linear])
         if found is None:
             return queue
@@ -553,7 +566,7 @@ class Search:
         )
         apart = bool(squares) and not promising
         order = sorted(range(len(names)), key=lambda i: apart and names[i] in separable)
-        late = [(True, [c for c in some if id(c) in hopeless]) for kind, some in queue if kind]
+        late = [(True, [c for c in some if id(c) in hopeless]) for _, some in queue]
         return [group for group in [*(kept[i] for i in order), *late] if group[1]]
 
     def _first_fold(self, model: Model, setting: Setting) -> tuple[Fitted, Held]:
@@ -571,9 +584,21 @@ class Search:
             over = self.best is not None and (self.best[2].exact or setting.stop())
             if over or worse == 2 or not self._affords(candidate):
                 return
-            made = self._try(candidate, setting, session)
+            sparse = self._sparse(candidate, setting)
+            made = None if sparse is None else self._try(sparse, setting, session)
+            if made is None or not (made[2].explained or setting.stop()):
+                made = self._try(candidate, setting, session)
             better = best is None or gains(best[2], made[2])
             worse, best = (0, made) if better else (worse + 1, best)
+
+    def _sparse(self, candidate: Candidate, setting: Setting) -> Candidate | None:
+        """A model of many numbers whose orbits take long, without the terms that short orbits do not ask for."""
+        if candidate.model.n < MANY or not candidate.model.lagrangian:
+            return None
+        found = fitted(candidate.model, self.data, replace(setting, sketch=True), seed=self.seed)
+        if not math.isfinite(found.fit.cost):
+            return None
+        return pruned(candidate, found.theta, found.fit.normal.precision(), self.data.n_values)
 
     def _affords(self, candidate: Candidate) -> bool:
         """True if there are more numbers than the model and the initial states have."""
@@ -588,7 +613,7 @@ class Search:
                 self.save(session)
         else:
             found = restored(candidate.model, self.data, numbers, setting)
-        chosen = candidate, found, left_out(found, self.folds, self.setting)
+        chosen = candidate, found, left_out(found, self.folds, replace(self.setting, stop=self.late))
         self._note(chosen, session)
         return chosen
 
@@ -600,7 +625,7 @@ class Search:
             "training_chi2": found.costs[-1],
             "held_out_loss": held.loss,
             "correlation": held.correlation,
-            "noise": float(np.mean(found.sigma / self.data.scales)),
+            "noise": float(np.mean((found.sigma / self.data.scales)[found.fit.counts > 0])),
         }
         self.history.append({"model": candidate.name, **figures})
         self.bar.tries(len(self.history), f"{candidate.name}: held-out loss {held.loss:.3g}")
@@ -608,10 +633,10 @@ class Search:
             session.callback(len(self.history), figures)
 
     def _try(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
-        """Fit a model, and keep it if it is the best so far."""
+        """Fit a model, and keep it if it is the best so far, and was judged before the time was up."""
         rival = None if self.best is None else self.best[1].sigma
         made = self._fit(candidate, replace(setting, rival=rival), session)
-        if self.best is None or gains(self.best[2], made[2]):
+        if self.best is None or (not self.late() and gains(self.best[2], made[2])):
             self.best = made
         return made
 
@@ -622,6 +647,8 @@ class Search:
         rich, simple = self.winner, self._fit(candidate, setting, session)
         fewer = rich[0].model.n - candidate.model.n
         lost = 2 * (simple[1].loss(rich[1].sigma) - rich[1].loss(rich[1].sigma))
+        if self.late():
+            return
         if simple[2].exact or lost < fewer * math.log(self.data.n_values):
             self.best = simple
 
@@ -678,7 +705,7 @@ class Search:
             if free.remedy:
                 warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=4)
                 return
-        smooth = smoothed(self.data)
+        smooth = smoothed(self._whole(self.data))
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.said.rates > 0
         said += " " + hint(library, smooth, self.data, otherwise, damped)
@@ -764,21 +791,35 @@ class Search:
                 groups.append((q, None))
             if any(part.of != "q" for part in parts):
                 groups.append((p, Polynomial.up_to(1, "p", self.data.scales[d:])))
-        errors = self.final.sigma * math.sqrt(self.final.fit.states.size / self.data.n_values)
+        errors = self._wide(self.final.sigma) * math.sqrt(self.final.fit.states.size / self.data.n_values)
         return [g for columns, part in groups for g in unseen(states, errors, columns, part)]
 
     def _states(self) -> np.ndarray:
         """The states (n, 2d) of all orbits that do not diverge; those of the data where all do."""
         states = self.final.states
         finite = np.isfinite(states).all(axis=1)
-        return states[finite] if finite.any() else self.all.states
+        return states[finite] if finite.any() else self._whole(self.all).states
+
+    def _wide(self, sizes: np.ndarray) -> np.ndarray:
+        """Sizes (2d,) of observations as such of states, whose momenta may be wider or narrower than velocities."""
+        if not self.data.velocities:
+            return sizes
+        return sizes * self.final.states.std(axis=0) / self.data.scales
+
+    def _whole(self, data: Trajectories) -> Trajectories:
+        """Trajectories of states, by the model that was learned where velocities were observed."""
+        if not data.velocities:
+            return data
+        model, theta = self.winner[0].model, self.winner[1].theta
+        runs = zip(data.runs, smoothed(data).states, strict=True)
+        return replace(data, runs=tuple(Run(run.t, model.states(theta, y)) for run, y in runs), velocities=False)
 
     def _domain(self) -> tuple[Box | Tube, np.ndarray]:
         """A box around the states (n, 2d) of all orbits, or a tube where they do not tell H beyond them; and these."""
         states = self._states()
         if self.unseen:
             fitted = next(data for data in (self.all, self.data) if data.n_points == len(states))
-            return tube(states, fitted.runs, self.all.scales), states
+            return tube(states, fitted.runs, self._wide(self.all.scales)), states
         low, high = states.min(axis=0), states.max(axis=0)
         wider = MARGIN * (high - low)
         return Box(low - wider, high + wider), states
@@ -873,15 +914,16 @@ class Search:
     def figures(self, dt: float) -> dict[str, float]:
         """The figures of the chosen model on the held-out trajectories, before its last fit to all of them."""
         _, found, held = self.winner
+        noise = {name: float(s) for name, s, n in zip(self.data.names, found.sigma, found.fit.counts, strict=True) if n}
         made = {
             "held_out_loss": held.loss,
             "held_out_trajectories": len(self.held.runs),
             "residual_correlation": held.correlation,
-            "noise": float(np.sqrt(np.mean(found.sigma**2))),
+            "noise": math.sqrt(np.mean(np.square([*noise.values()]))),
         }
         if self.tested and self.tested[0] is not None:
             made["unconstrained_share"] = self.tested[0].share
-        made |= {f"noise_{name}": float(s) for name, s in zip(self.data.names, found.sigma, strict=True)}
+        made |= {f"noise_{name}": sigma for name, sigma in noise.items()}
         passed = np.concatenate([run.t - run.t[0] for run in held.pieces])
         residuals = np.concatenate(held.residuals, axis=1)
         seen = np.isfinite(residuals).any(axis=0)
@@ -894,7 +936,7 @@ class Search:
 
     def energy_scatter(self, flow: FlowMap) -> float | None:
         """The standard deviation of 𝓗 along a held-out trajectory, in their mean; None where no state is whole."""
-        runs = [run.y[:, np.isfinite(run.y).all(axis=0)] for run in self.held.runs]
+        runs = [run.y[:, np.isfinite(run.y).all(axis=0)] for run in self._whole(self.held).runs]
         energies = self._energy(flow, np.concatenate(runs, axis=1).T)
         along = np.split(energies, np.cumsum([y.shape[1] for y in runs])[:-1])
         scatter = [float(np.std(values)) for values in along if len(values) > 1]

@@ -19,6 +19,7 @@ from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.kernels.network_tangents import NetworkTangents
+from sympflow.learning.models import VectorField
 from sympflow.learning.shooting import Method, Stepper
 
 ON_TIME = 1e-9
@@ -53,7 +54,7 @@ class OwnSteps(Stepper):
             yield self.step(model, theta, x, X, passed) if passed.any() else (x, X)
 
 
-class NetworkFlow:
+class NetworkFlow(VectorField):
     """A SympFlow with neural potentials, its weights θ the numbers of a model.
 
     Palindromic, ψ_t = φ_{t/2} ∘ φ_{−t/2}⁻¹, so that ψ_{−t} = ψ_t⁻¹, it has twice the layers of φ and the weights of φ.

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import sympy
 
 
+NEWTON = 8  # steps by which momenta are found of velocities
 STEEP = 5.0
 """Size of the weights and biases of neurons, in the spread of the coordinates, beyond which they would be steps."""
 
@@ -37,6 +38,21 @@ class Linear(NamedTuple):
     value: np.ndarray
     slope: np.ndarray | None = None
     by_parameters: np.ndarray | None = None
+
+
+class VectorField:
+    """A vector field of states [q, p], which are observed as they are; by default linear in nothing."""
+
+    velocities: bool = False
+    """True if [q, q'] are observed."""
+
+    def observed(self, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None) -> tuple[np.ndarray, Any]:
+        """Observations (2d, N) of states x, and their derivatives (2d, c, N) by what X are derivatives by."""
+        return x, X
+
+    def states(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """The states (2d, N) of observations."""
+        return y
 
 
 class Part(ABC):
@@ -96,14 +112,21 @@ class Part(ABC):
         """True if it is a kinetic energy whose masses depend on q, and linear in θ in Lagrange's form."""
         return False
 
-    def momenta(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """The derivatives (2d, n, N) of p = ∂L/∂v and of p' = ∂L/∂q by θ, at columns q and velocities v (d, N).
+    def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """p = ∂L/∂v and p' = ∂L/∂q of a Lagrangian at q and v (d, N), for θ = 0; and their derivatives by θ (2d, n, N).
 
-        L is the Lagrangian; the default is that of a potential that is linear in θ.
+        L has −V of what depends on q alone. Other parts stand in it with v in place of p, and numbers of their own.
         """
-        by = self.gradient(np.zeros(self.n), q, False, True).by_parameters
-        assert by is not None
-        return np.concatenate([np.zeros_like(by), -by])
+        x = {"q": q, "p": v, "y": np.concatenate([q, v])}[self.of]
+        f = self.gradient(np.zeros(self.n), x, False, True)
+        assert f.by_parameters is not None
+        return self._mechanics(f.value), self._mechanics(f.by_parameters)
+
+    def _mechanics(self, slopes: np.ndarray) -> np.ndarray:
+        """∂L/∂v and ∂L/∂q of slopes (m, …) of a part."""
+        none, d = np.zeros_like(slopes), len(slopes) // 2
+        rows = {"q": (none, -slopes), "p": (slopes, none), "y": (slopes[d:], slopes[:d])}
+        return np.concatenate(rows[self.of])
 
 
 class Polynomial(Part):
@@ -249,6 +272,10 @@ class FixedKinetic(Part):
             W @ x, W[:, :, None] if slope else None, np.empty((len(x), 0, x.shape[1])) if by_parameters else None
         )
 
+    def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        p = np.linalg.pinv(self.inverse_mass) @ v
+        return np.concatenate([p, np.zeros_like(p)]), np.zeros((2 * len(q), 0, q.shape[1]))
+
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         return 0.5 * np.einsum("in,ij,jn->n", x, self.inverse_mass, x)
 
@@ -324,6 +351,10 @@ class Waves(Part):
         """The terms (n, N), their slopes (m, n, N), and for i ≤ j their second derivatives (n, N) if asked for."""
         m, N = x.shape
         wave, turned = self._turns(x)
+        if not self.powers.exponents.any():  # of angles alone
+            slopes = self.waves.T[..., None] * turned
+            pairs = combinations_with_replacement(range(m), 2) if twice else ()
+            return wave, slopes, {(i, j): -(self.waves[:, i] * self.waves[:, j])[:, None] * wave for i, j in pairs}
         powers = self.powers.tables(x)
         whole = self.powers.monomials(powers, self.powers.exponents)
         slopes = np.empty((m, self.n, N))
@@ -606,7 +637,7 @@ def _float(value: float) -> sympy.Float:
 
 
 @dataclass(frozen=True)
-class Model:
+class Model(VectorField):
     """H_θ(q, p), the sum of its parts, each with its own place in θ; y' = J∇H, with friction p' = −∂H/∂q − Γp.
 
     Parameters
@@ -615,11 +646,14 @@ class Model:
     parts : tuple of Part
     rates : int
         How many rates of friction there are at the end of θ: none, one, or one for each p.
+    velocities : bool
+        True if q' = ∂H/∂p is observed in place of p.
     """
 
     ndof: int
     parts: tuple[Part, ...]
     rates: int = 0
+    velocities: bool = False
     stepper: ClassVar[Any] = None
     """The steps of a map of its own; None where schemes follow a field."""
 
@@ -694,6 +728,31 @@ class Model:
                     columns[d + i, self.n - self.rates + place] -= y[d + i]
         return Linear(value, slopes, columns)
 
+    def observed(self, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None) -> tuple[np.ndarray, Any]:
+        if not self.velocities:
+            return x, X
+        d = self.ndof
+        f = self.field(theta, x, X is not None, X is not None and X.shape[1] > 2 * d)
+        seen = np.concatenate([x[:d], f.value[:d]])
+        if X is None:
+            return seen, None
+        assert f.slope is not None
+        moved = np.einsum("ijn,jcn->icn", f.slope[:d], X)
+        if f.by_parameters is not None:
+            moved[:, 2 * d :] += f.by_parameters[:d]
+        return seen, np.concatenate([X[:d], moved])
+
+    def states(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
+        if not self.velocities:
+            return y
+        d, x = self.ndof, y.copy()
+        for _ in range(1 if all(part.quadratic or part.of == "q" or part.inertial for part in self.parts) else NEWTON):
+            f = self.field(theta, x, True, False)
+            assert f.slope is not None
+            by_p = np.moveaxis(np.broadcast_to(f.slope[:d, d:], (d, d, x.shape[1])), -1, 0)
+            x[d:] += np.linalg.solve(by_p, (y[d:] - f.value[:d]).T[..., None])[..., 0].T
+        return x
+
     @property
     def linear(self) -> bool:
         """True if the vector field is linear in θ."""
@@ -706,25 +765,10 @@ class Model:
             part.inertial or (part.of == "q" and part.linear) for part in self.parts
         )
 
-    def lagrangian_start(self, y: np.ndarray, slopes: np.ndarray, scales: np.ndarray) -> np.ndarray:
-        """θ by which p = ∂L/∂v and p' = ∂L/∂q hold best, by linear least squares, at states (2d, N) with slopes."""
-        d = self.ndof
-        q, p, v = y[:d], y[d:], slopes[:d]
-        rates = np.broadcast_to(np.arange(d) if self.rates > 1 else 0, d)
-        columns = [part.momenta(q, v) for part in self.parts]
-        friction = np.zeros((2 * d, self.rates, y.shape[1]))
-        for i in range(d if self.rates else 0):
-            friction[d + i, rates[i]] = -p[i]
-        A = np.concatenate([*columns, friction], axis=1)
-        b = np.concatenate([p, slopes[d:]])
-        for part in self.parts:
-            if not part.n:  # a part that is known
-                b[d:] += part.gradient(np.zeros(0), q, False, False).value
-        weights = np.concatenate([1 / scales[d:], 1 / np.maximum(slopes[d:].std(axis=1), np.finfo(float).tiny)])
-        rows = (A * weights[:, None, None]).transpose(0, 2, 1).reshape(-1, self.n)
-        lengths = np.linalg.norm(rows, axis=0)
-        lengths[lengths == 0] = 1.0
-        return np.linalg.lstsq(rows / lengths, (b * weights[:, None]).ravel(), rcond=1e-10)[0] / lengths
+    def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """p and p' by Lagrange's equations for θ = 0, and their derivatives by θ, without those of friction."""
+        values, columns = zip(*(part.momenta(q, v) for part in self.parts), strict=True)
+        return np.sum(values, axis=0), np.concatenate(columns, axis=1)
 
     def hamiltonian(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
         """H (N,)."""
@@ -775,7 +819,7 @@ def turns(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return fields, slopes
 
 
-class Forced:
+class Forced(VectorField):
     """The field of a model with forces that no H(q, p) gives, whose factors are its last numbers.
 
     Parameters
@@ -810,7 +854,7 @@ class Forced:
         return Linear(value, moved, columns)
 
 
-class FreeField:
+class FreeField(VectorField):
     """A vector field of polynomials that need not be Hamiltonian, to be compared with those that are.
 
     Parameters

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from sympflow.learning.models import Forced, FreeField, Linear, Model
+from sympflow.learning.models import Forced, FreeField, Linear, Model, VectorField
 from sympflow.learning.trajectories import Run, Trajectories
 from sympflow.schemes import Scheme, scheme_named
 from sympflow.training.least_squares import Damping
@@ -39,6 +39,7 @@ MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the ca
 LEAST_DAMPING = 1e-15
 TRIES = 12
 FINEST = 1e-13  # of an observation, relative to the spread of the coordinate
+SLOPE_POINTS = 10  # of a piece, that give a velocity which was not observed
 SOLVED = 1e-4  # of the error of a scheme, to which its equations are solved
 
 Stop = Callable[[], bool]
@@ -267,15 +268,32 @@ def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
     return made
 
 
-def first_states(data: Trajectories) -> np.ndarray:
-    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing."""
-    middle = np.nanmean(np.concatenate([run.y for run in data.runs], axis=1), axis=1)
+def first_states(data: Trajectories, model: VectorField | None = None, theta: Any = None) -> np.ndarray:
+    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing.
+
+    Momenta are those of a model where velocities are observed.
+    """
+    values = np.concatenate([run.y for run in data.runs], axis=1)
+    middle = np.nanmean(np.where(np.isnan(values).all(axis=1, keepdims=True), 0.0, values), axis=1)
     states = np.empty((len(data.runs), 2 * data.ndof))
     for state, run in zip(states, data.runs, strict=True):
-        for i, values in enumerate(run.y):
-            seen = np.isfinite(values)
-            state[i] = np.interp(run.t[0], run.t[seen], values[seen]) if seen.any() else middle[i]
-    return states
+        for i, row in enumerate(run.y):
+            seen = np.isfinite(row)
+            if seen.any():
+                state[i] = np.interp(run.t[0], run.t[seen], row[seen])
+            else:
+                state[i] = _first_slope(run, i - data.ndof) if data.velocities and i >= data.ndof else middle[i]
+    return states if model is None else model.states(theta, states.T).T
+
+
+def _first_slope(run: Run, i: int) -> float:
+    """The derivative of a coordinate at the first time, by a cubic through the first points."""
+    seen = np.flatnonzero(np.isfinite(run.y[i]))[:SLOPE_POINTS]
+    t, y = run.t[seen] - run.t[0], run.y[i, seen]
+    if len(seen) < 2:
+        return 0.0
+    powers = np.vander(t / t[-1], min(len(seen), 4), increasing=True)
+    return float(np.linalg.lstsq(powers, y, rcond=None)[0][1] / t[-1])
 
 
 # normal equations -----------------------------------------------------------------------------------------------------
@@ -409,7 +427,7 @@ class Problem:
             yield k, x, X
 
     def _weighted(self, batch: Batch, k: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals in σ (2d, N), and their weights."""
+        """Residuals in σ (2d, N) of predictions x, and their weights."""
         r = (batch.y[k] - x) / self.sigma[:, None] * batch.seen[k]
         if self.huber is None:
             return r, batch.seen[k]
@@ -427,7 +445,8 @@ class Problem:
         total = self._unlikely(theta)
         for batch in self.batches:
             for k, x, _ in self._orbits(batch, theta, states, False):
-                total += self._cost(self._weighted(batch, k, x)[0])
+                seen, _ = self.model.observed(theta, x, None)
+                total += self._cost(self._weighted(batch, k, seen)[0])
                 if not math.isfinite(total):
                     return math.inf
         return total
@@ -458,18 +477,21 @@ class Problem:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
     def normal(self, theta: np.ndarray, states: np.ndarray) -> Normal:
-        """The normal equations at a point."""
+        """The normal equations at a point, as far as its orbits are finite."""
         N, m, n = len(states), 2 * self.model.ndof, 0 if self.frozen else self.model.n
         made = Normal(np.empty((N, m, m)), np.empty((N, m, n)), np.zeros((n, n)), np.empty((N, m)), np.zeros(n), 0.0)
         for batch in self.batches:
             size = len(batch.index)
             A, B, a = np.zeros((m, m, size)), np.zeros((m, n, size)), np.zeros((m, size))
             for k, x, X in self._orbits(batch, theta, states, True):
-                assert X is not None
-                r, weight = self._weighted(batch, k, x)
+                seen, by = self.model.observed(theta, x, X)
+                r, weight = self._weighted(batch, k, seen)
                 made.cost += self._cost(r)
+                if not math.isfinite(made.cost):
+                    made.cost = math.inf
+                    return made
                 for i in range(m):
-                    J = X[i] * (np.sqrt(weight[i]) / self.sigma[i])
+                    J = by[i] * (np.sqrt(weight[i]) / self.sigma[i])
                     rest = np.sqrt(weight[i]) * r[i]
                     by_state, by_theta = J[:m], J[m:]
                     a += by_state * rest
@@ -523,15 +545,21 @@ class Fit:
         """The orbit of each piece at its times, (2d, k)."""
         return self.problem.orbits(self.theta, self.states)
 
+    def _seen(self, orbits: list[np.ndarray]) -> list[np.ndarray]:
+        """What is observed along orbits."""
+        return [self.problem.model.observed(self.theta, orbit, None)[0] for orbit in orbits]
+
     @property
     def residuals(self) -> list[np.ndarray]:
         """Observation less orbit of each piece, (2d, k), NaN where nothing was observed."""
-        return [run.y - orbit for run, orbit in zip(self.problem.data.runs, self.orbits, strict=True)]
+        return [run.y - seen for run, seen in zip(self.problem.data.runs, self._seen(self.orbits), strict=True)]
 
     @cached_property
     def variances(self) -> np.ndarray:
         """Mean squares of the residuals of each coordinate (2d,), of outliers limited where the loss is robust."""
         r = np.concatenate(self.residuals, axis=1)
+        unseen = self.counts == 0  # as loud as the data are wide
+        r[unseen] = self.problem.data.scales[unseen, None]
         return np.nanmean(r * r, axis=1) if self.problem.huber is None else _robust_variances(r, self.problem.huber)
 
     @cached_property
@@ -550,10 +578,8 @@ class Fit:
         if method.stepper.longest is not None:
             return 0.0
         finer = replace(self.problem, method=replace(method, longest=method.longest / 2))
-        moved = finer.orbits(self.theta, self.states)
-        return max(
-            float((np.abs(a - b) / sigma[:, None]).max(initial=0.0)) for a, b in zip(moved, self.orbits, strict=True)
-        )
+        pairs = zip(self._seen(finer.orbits(self.theta, self.states)), self._seen(self.orbits), strict=True)
+        return max(float((np.abs(a - b) / sigma[:, None]).max(initial=0.0)) for a, b in pairs)
 
     def covariance(self) -> np.ndarray:
         """The covariance of θ (n, n), where σ is the noise."""
@@ -609,11 +635,10 @@ def minimized(
         if found is None:
             reason = "no step lowers the cost"
             break
-        theta, states, cost = found
-        normal = problem.normal(theta, states)
+        theta, states, normal = found
         scale = np.maximum(scale, np.diagonal(normal.C))
-        costs.append(cost)
-        if len(costs) > patience and cost > (1 - gain) * costs[-1 - patience]:
+        costs.append(normal.cost)
+        if len(costs) > patience and normal.cost > (1 - gain) * costs[-1 - patience]:
             reason = "it has converged"
             break
     return Fit(problem, theta, states, costs[-1], normal, costs, reason)
@@ -627,17 +652,18 @@ def _stepped(
     scale: np.ndarray,
     level: Damping,
     before: float,
-) -> tuple[np.ndarray, np.ndarray, float] | None:
-    for _ in range(TRIES):
+) -> tuple[np.ndarray, np.ndarray, Normal] | None:
+    for attempt in range(TRIES):
         solved = normal.solved(level.value, scale)
         if solved is not None:
             step, moved, promised = solved
             trial = theta if problem.frozen else theta + step, states + moved
-            after = problem.cost(*trial)
+            made = None if attempt else problem.normal(*trial)  # the first is mostly taken
+            after = problem.cost(*trial) if made is None else made.cost
             gain = (before - after) / promised if promised > 0 and math.isfinite(after) else -1.0
             if gain > 0:
                 level.accepted(gain)
-                return *trial, after
+                return *trial, made or problem.normal(*trial)
         level.rejected()
     return None
 
@@ -656,7 +682,7 @@ def chosen_method(
     if model.stepper is not None:
         return Method(model.stepper, model.stepper.longest)
     starts, gaps = _gaps(data)
-    widest = float(gaps.max())
+    starts, widest = model.states(theta, starts), float(gaps.max())
     best: tuple[float, Method] | None = None
 
     def cost(method: Method) -> float:
@@ -702,7 +728,7 @@ def _gaps(data: Trajectories, most: int = 400) -> tuple[np.ndarray, np.ndarray]:
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def _ends(model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-    return method.over(model, theta, x.copy(), None, gaps)[0]
+    return model.observed(theta, method.over(model, theta, x.copy(), None, gaps)[0], None)[0]
 
 
 def matched(model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1) -> np.ndarray:
@@ -744,6 +770,13 @@ def matched(model: Field, theta: np.ndarray, data: Trajectories, weights: np.nda
 def increments_left(model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray) -> float:
     """The squares of y(t) − ∫ f_θ(y) dt less a constant for each piece, weighted (2d,): 0 of the field of the data."""
     pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
+    if model.velocities:
+        y = np.concatenate([run.y for run in pieces], axis=1)
+        x = model.states(theta, y)
+        rates = model.observed(theta, x, model.field(theta, x, False, False).value[:, None])[1][:, 0]
+        parts = np.split(rates, np.cumsum([run.n_points for run in pieces])[:-1], axis=1)
+        rests = [run.y - integrals(run.t, part) for run, part in zip(pieces, parts, strict=True)]
+        return float(sum((((rest.T - rest.mean(axis=1)) * weights) ** 2).sum() for rest in rests))
     r, _ = _increments(model, theta, pieces, weights) if pieces else (np.zeros(0), None)
     return float(r @ r)
 
@@ -766,7 +799,7 @@ def _increments(
         here = slice(at, at + run.n_points)
         at += run.n_points
         rates = np.concatenate([f.value[:, None, here], f.by_parameters[:, :, here]], axis=1)  # (m, 1 + n, k)
-        moved = _integrals(run.t, rates)
+        moved = integrals(run.t, rates)
         rest = run.y - moved[:, 0]
         rests.append(((rest - rest.mean(axis=-1, keepdims=True)) * weights[:, None]).ravel())
         J = (moved[:, 1:] - moved[:, 1:].mean(axis=-1, keepdims=True)) * weights[:, None, None]
@@ -774,7 +807,7 @@ def _increments(
     return np.concatenate(rests), np.concatenate(columns)
 
 
-def _integrals(t: np.ndarray, rates: np.ndarray) -> np.ndarray:
+def integrals(t: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """The integrals of rates (…, k) from the first time on, by cubic splines where there are points for them."""
     if len(t) < 4:
         parts = np.diff(t) * (rates[..., 1:] + rates[..., :-1]) / 2

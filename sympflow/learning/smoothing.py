@@ -22,8 +22,8 @@ class Smooth:
 
     Attributes
     ----------
-    states : tuple of ndarray, shape (2d, n)
-        The curve of each trajectory at its times.
+    states, rates : tuple of ndarray, shape (2d, n)
+        The curve of each trajectory at its times, and its derivatives.
     points, slopes : ndarray, shape (m, 2d)
         States and their derivatives where both are known well.
     times, owner : ndarray, shape (m,)
@@ -33,6 +33,7 @@ class Smooth:
     """
 
     states: tuple[np.ndarray, ...]
+    rates: tuple[np.ndarray, ...]
     points: np.ndarray
     slopes: np.ndarray
     times: np.ndarray
@@ -43,22 +44,41 @@ class Smooth:
 def smoothed(data: Trajectories) -> Smooth:
     """Local cubic polynomials through each coordinate, the width of their windows by leave-one-out cross-validation.
 
-    Of trajectories with fewer than six points the derivatives are differences, at the mean of two states.
+    Of trajectories with fewer than six points the derivatives are differences, at the mean of two states. Velocities
+    that are missing are the derivatives of the positions.
     """
-    made = [_curve(run) for run in data.runs]
-    middle = np.nanmean(np.concatenate([run.y for run in data.runs], axis=1), axis=1)
+    runs = [_with_velocities(run) for run in data.runs] if data.velocities else data.runs
+    made = [_curve(run) for run in runs]
+    middle = np.nanmean(np.concatenate([run.y for run in runs], axis=1), axis=1)
     states = tuple(np.where(np.isfinite(one[0]), one[0], middle[:, None]) for one in made)
-    points, slopes = np.concatenate([one[1].T for one in made]), np.concatenate([one[2].T for one in made])
-    times = np.concatenate([one[3] for one in made])
-    owner = np.repeat(np.arange(len(made)), [len(one[3]) for one in made])
+    rates = tuple(
+        np.where(np.isfinite(one[1]), one[1], np.gradient(y, run.t, axis=1))
+        for one, y, run in zip(made, states, runs, strict=True)
+    )
+    points, slopes = np.concatenate([one[2].T for one in made]), np.concatenate([one[3].T for one in made])
+    times = np.concatenate([one[4] for one in made])
+    owner = np.repeat(np.arange(len(made)), [len(one[4]) for one in made])
     known = np.isfinite(points).all(1) & np.isfinite(slopes).all(1)
     noise = np.concatenate([_roughness(run) for run in data.runs], axis=1)
+    noise[np.isnan(noise).all(axis=1)] = 0.0
     sigma = np.zeros(2 * data.ndof) if noise.shape[1] == 0 else np.sqrt(_middle(noise))
-    return Smooth(states, points[known], slopes[known], times[known], owner[known], sigma)
+    return Smooth(states, rates, points[known], slopes[known], times[known], owner[known], sigma)
 
 
-def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The states of a trajectory, smooth; points and slopes there or between, and their times."""
+def _with_velocities(run: Run) -> Run:
+    """The trajectory with derivatives of the positions where velocities were not observed at all."""
+    d = len(run.y) // 2
+    missing = np.isnan(run.y[d:]).all(axis=1)
+    if not missing.any():
+        return run
+    y = run.y.copy()
+    states, rates, *_ = _curve(Run(run.t, run.y[:d][missing]))
+    y[d:][missing] = np.where(np.isfinite(rates), rates, np.gradient(states, run.t, axis=1))
+    return Run(run.t, y)
+
+
+def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The states of a trajectory, smooth, and slopes; points and slopes there or between, and their times."""
     seen = np.isfinite(run.y)
     if seen.sum(1).min() < FEWEST:
         states = np.full(run.y.shape, np.nan)
@@ -67,7 +87,8 @@ def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
                 states[i] = np.interp(run.t, run.t[has], y[has])
         whole = seen.all(0)
         t, y = run.t[whole], run.y[:, whole]
-        return states, (y[:, 1:] + y[:, :-1]) / 2, np.diff(y) / np.diff(t), (t[1:] + t[:-1]) / 2
+        none = np.full(run.y.shape, np.nan)
+        return states, none, (y[:, 1:] + y[:, :-1]) / 2, np.diff(y) / np.diff(t), (t[1:] + t[:-1]) / 2
     best = np.full(len(run.y), np.inf)
     states, slopes = np.zeros(run.y.shape), np.zeros(run.y.shape)
     for width in [w for w in WIDTHS if w <= run.n_points] or [run.n_points]:
@@ -78,7 +99,7 @@ def _curve(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     for i, has in enumerate(seen):
         outside = (run.t < run.t[has][0]) | (run.t > run.t[has][-1])
         slopes[i, outside] = np.nan
-    return states, states[:, 1:-1], slopes[:, 1:-1], run.t[1:-1]
+    return states, slopes, states[:, 1:-1], slopes[:, 1:-1], run.t[1:-1]
 
 
 def _windows(t: np.ndarray, y: np.ndarray, seen: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sympflow.learning.diagnosis import DRAG, TURNED
+from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.models import Forced, FreeField, Model, drags, turns
 from sympflow.learning.shooting import Field, increments_left, matched
-from sympflow.learning.smoothing import smoothed
+from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.learning.trajectories import Run, Trajectories
 
 DEGREES = (1, 2, 3)
@@ -121,6 +122,8 @@ def forced(model: Model) -> list[Reading]:
     d = model.ndof
     rows = tuple(range(2 * d))
     made = [] if model.rates else [Reading(replace(model, rates=d), rows, math.inf, *FRICTION, d)]
+    if model.velocities:  # among whose models there are those in magnetic fields
+        return made
     made += [Reading(Forced(model, turns), rows, math.inf, *TURNED_SAID, d * (d - 1) // 2)] if d > 1 else []
     return [*made, Reading(Forced(model, drags), rows, math.inf, *DRAG_SAID, d)]
 
@@ -147,19 +150,20 @@ def best_by_increments(
     affordable = [k for k, model in enumerate(models) if _affords(fitted, model)]
     if not affordable or not others.runs:
         return None
-    squares = {k: _left(models[k], fitted, others, scales) for k in affordable}
+    smooth = smoothed(fitted) if data.velocities else None
+    squares = {k: _left(models[k], fitted, others, scales, smooth) for k in affordable}
     best = min(affordable, key=lambda k: squares[k])
     if not 0 < squares[best] < math.inf:
         return best, None, squares
 
     def compared(reading: Reading) -> Reading:
         a, b = reading.of(fitted), reading.of(others)
-        return replace(reading, share=_left(reading.field, a, b, scales[[*reading.rows]]) / squares[best])
+        return replace(reading, share=_left(reading.field, a, b, scales[[*reading.rows]], smooth) / squares[best])
 
     free = [free_reading(scales, degree) for degree in DEGREES]
     found = [compared(reading) for reading in free if _affords(fitted, reading.field)]
     plain = [reading for k in affordable for reading in forced(models[k]) if _affords(fitted, reading.field)]
-    if d > 1:
+    if d > 1 and not data.velocities:
         turned = (*range(0, 2 * d, 2), *range(1, 2 * d, 2))
         plain += [Reading(models[k], turned, math.inf, *PAIRS) for k in affordable]
     plain = [compared(reading) for reading in plain]
@@ -177,9 +181,16 @@ def _affords(data: Trajectories, model: Field) -> bool:
     return model.n <= MOST_NUMBERS and PER_NUMBER * model.n < data.n_values
 
 
-def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray) -> float:
+def _left(
+    model: Field, data: Trajectories, held: Trajectories, scales: np.ndarray, smooth: Smooth | None = None
+) -> float:
     """The squares that a model which was fitted to increments leaves of held-out ones; infinite where it diverges."""
-    theta = matched(model, np.zeros(model.n), data, 1 / scales)
+    theta, moved = np.zeros(model.n), data
+    if model.velocities:
+        assert isinstance(model, Model)
+        theta, moved = lagrangian_start(model, data, model.start(np.random.default_rng(0)), smooth)
+    if model.linear:
+        theta = matched(model, theta, moved, 1 / moved.scales)
     squares = increments_left(model, theta, held, 1 / scales)
     return squares if math.isfinite(squares) else math.inf
 

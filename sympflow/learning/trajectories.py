@@ -33,6 +33,8 @@ RUNS = (ORBIT, "run", "run_id", "trajectory", "trajectory_id", "traj", "id")
 BESIDE = ("energy", "status")
 """Columns of tables of sympflow that are no states."""
 ORDERS = ("halves", "pairs")
+OBSERVED = {"qp": "p", "qv": "v", "q": "v"}
+"""What the rows of states are, with the letter of the second half; velocities of "q" are missing."""
 FEW = 8
 """Trajectories from which some are held out for good; of fewer each is left out in turn, or in one of three parts."""
 HELD_LEAST = PARTS = 3
@@ -71,10 +73,13 @@ class Trajectories:
     runs : tuple of Run
     names : tuple of str, length 2d
         The names of q1 … qd, p1 … pd in the data.
+    velocities : bool
+        True if the second half are velocities q', of a mass that is not known.
     """
 
     runs: tuple[Run, ...]
     names: tuple[str, ...]
+    velocities: bool = False
 
     @classmethod
     def read(
@@ -89,6 +94,7 @@ class Trajectories:
         p: str | Sequence[str] | None = None,
         units: Mapping[str, str | float] | None = None,
         velocity_mass: ArrayLike | None = None,
+        observed: str = "qp",
         period: ArrayLike | None = None,
     ) -> Trajectories:
         """Read trajectories.
@@ -123,6 +129,9 @@ class Trajectories:
             "p": "deg/ms"}, or factors. The data are converted to those of the SI, and to radians.
         velocity_mass : float or array_like of shape (d,) or (d, d), optional
             M where the data have velocities in place of momenta: then p = M v.
+        observed : {"qp", "qv", "q"}
+            The rows of states: positions with momenta; with velocities, of a mass that is not known and may depend on
+            q; positions alone, y (d, n), of columns q1 … qd.
         period : float or array_like of shape (d,), optional
             Of q that are angles, in the converted units; infinite or NaN for coordinates that are none. Where an angle
             jumps by more than half of it from one point to the next, as one that was wrapped does, it is continued.
@@ -143,14 +152,19 @@ class Trajectories:
         >>> Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]))).ndof
         1
         """
-        given: dict[str, Any] = {"order": order, "time": time, "run": run, "q": q, "p": p}
+        if observed not in OBSERVED:
+            raise ValueError(f"`observed` must be one of {', '.join(OBSERVED)}; got {observed!r}.")
+        if observed != "qp" and velocity_mass is not None:
+            raise ValueError("`velocity_mass` makes momenta of velocities: leave out `observed`, or the mass.")
+        given: dict[str, Any] = {"order": order, "time": time, "run": run, "q": q, "p": p, "observed": observed}
         converted: dict[str, Any] = {"units": units, "velocity_mass": velocity_mass, "period": period}
         if isinstance(data, Trajectories):
             found, names = list(_labelled(data.runs)), data.names
+            observed = "qv" if data.velocities else observed
         elif isinstance(data, Mapping) and not _is_a("xarray", "Dataset", data):
-            return cls.read(_of_mapping(data, ndof, time, q, p), ndof, **given, **converted)
+            return cls.read(_of_mapping(data, ndof, time, q, p, observed), ndof, **given, **converted)
         elif _is_a("pandas", "DataFrame", data):
-            found, names = _of_table(data, ndof, order, time, run, q, p, velocity_mass is not None)
+            found, names = _of_table(data, ndof, order, time, run, q, p, velocity_mass is not None, observed)
             order = "halves"
         elif _is_a("xarray", "Dataset", data):
             found, names = _of_dataset(data), ()
@@ -161,10 +175,13 @@ class Trajectories:
             found, names = list(_of_arrays(data)), ()
         if not found:
             raise ValueError("`data` has no trajectories: give at least one, (t, y).")
+        if observed == "q":
+            found = [(label, t, np.concatenate([y, np.full_like(y, np.nan)])) for label, t, y in found]
         width = _width(found, ndof)
         rows = _rows(order, width)
-        plainly = tuple(f"{letter}{i + 1}" for letter in "qp" for i in range(width // 2))
-        names = plainly if names in ((), plainly) else tuple(names[i] for i in rows)
+        plainly = tuple(f"{letter}{i + 1}" for letter in f"q{OBSERVED[observed]}" for i in range(width // 2))
+        names = (*names, *plainly[len(names) :])  # of velocities that are missing
+        names = plainly if names == plainly else tuple(names[i] for i in rows)
         factors, of_time = _factors(units, names)
         runs = []
         for label, times, states in found:
@@ -173,12 +190,12 @@ class Trajectories:
             if velocity_mass is not None:
                 y = np.concatenate([y[: width // 2], _momenta(velocity_mass, y[width // 2 :])])
             runs.append(Run(np.ascontiguousarray(t) * of_time, np.ascontiguousarray(y)))
-        for i, name in enumerate(names):
+        for i, name in enumerate(names if observed == "qp" else names[: width // 2]):
             if all(np.isnan(one.y[i]).all() for one in runs):
                 raise ValueError(
                     f"`data` has no value of {name} in any trajectory: drop the degree of freedom, or add it."
                 )
-        read = cls(tuple(runs), names)
+        read = cls(tuple(runs), names, observed != "qp")
         return read if period is None else read.unwrapped(periods_of(period, width // 2))
 
     @property
@@ -202,8 +219,16 @@ class Trajectories:
 
     @cached_property
     def scales(self) -> np.ndarray:
-        """The spread of each coordinate, (2d,): its standard deviation, 1 where it does not change."""
-        spread = np.nanstd(np.concatenate([run.y for run in self.runs], axis=1), axis=1)
+        """The spread of each coordinate, (2d,): its standard deviation, 1 where it does not change.
+
+        Of velocities that are missing it is that of differences.
+        """
+        values = np.concatenate([run.y for run in self.runs], axis=1)
+        missing = np.isnan(values).all(axis=1)
+        spread = np.nanstd(np.where(missing[:, None], 0.0, values), axis=1)
+        if missing.any():
+            rates = np.concatenate([np.diff(run.y) / np.diff(run.t) for run in self.runs], axis=1)
+            spread[missing] = np.nanstd(np.roll(rates, self.ndof, axis=0)[missing], axis=1)
         return np.where(spread > 0, spread, 1.0)
 
     @cached_property
@@ -255,7 +280,7 @@ class Trajectories:
         """Raise ValueError if a coordinate has the same value everywhere: H could have any slope in it."""
         for i, name in enumerate(self.names):
             values = np.concatenate([run.y[i] for run in self.runs])
-            if np.nanmin(values) == np.nanmax(values):
+            if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
                 raise ValueError(
                     f"`trajectories` have the same {name} at all points, {np.nanmin(values):g}: nothing can be learned "
                     "of it; drop this degree of freedom, or add trajectories in which it changes."
@@ -475,7 +500,7 @@ def _of_ends(x: Any, t: Any, y: Any) -> Iterator[Found]:
         yield f"pair {i}", np.array([0.0, later]), np.stack([start, end], 1)
 
 
-def _of_mapping(data: Mapping[str, Any], ndof: int | None, time: str | None, q: Any, p: Any) -> Any:
+def _of_mapping(data: Mapping[str, Any], ndof: int | None, time: str | None, q: Any, p: Any, observed: str) -> Any:
     """The pair (t, y) of a dictionary of arrays; of one of columns the table."""
     arrays = {str(name): _numbers(values, f"values of {name}") for name, values in data.items() if np.ndim(values)}
     of_time = _column([*arrays], time, TIMES, "time")
@@ -485,12 +510,13 @@ def _of_mapping(data: Mapping[str, Any], ndof: int | None, time: str | None, q: 
     t, several = arrays[of_time], isinstance(q, Sequence) and not isinstance(q, str)
     if "y" in arrays and q is None:
         return t, arrays["y"]
-    halves = [arrays.get(name) for name in ("q" if q is None else str(q), "p" if p is None else str(p))]
+    names = ["q" if q is None else str(q), OBSERVED[observed] if p is None else str(p)]
+    halves = [arrays.get(name) for name in names[: len(observed)]]
     if several or all(a.ndim == 1 for a in arrays.values()):
         if len({a.shape for a in arrays.values()}) > 1:
             raise ValueError(f"{said}: columns must be of one length.")
         return imported("pandas", "Reading columns").DataFrame(arrays)
-    if halves[0] is None or halves[1] is None or halves[0].shape != halves[1].shape:
+    if len({() if half is None else half.shape for half in halves}) > 1 or halves[0] is None:
         raise ValueError(f"{said}: give t with y (N, 2d, n), or with q and p of one shape, (N, d, n) or (d, n).")
     runs = t.ndim == 2 or ndof == 1  # q (N, n) of one degree of freedom
     made = [a[:, None] if a.ndim == 2 and runs else a for a in halves if a is not None]
@@ -620,6 +646,7 @@ def _of_table(
     q: Any,
     p: Any,
     velocities: bool,
+    observed: str,
 ) -> tuple[list[Found], tuple[str, ...]]:
     columns = [str(c) for c in table.columns]
     table = table.set_axis(columns, axis=1)
@@ -630,7 +657,10 @@ def _of_table(
     one = _column(columns, run, RUNS, "run")
     ids = ids or ([] if one is None else [one])
     rest = [c for c in columns if c not in (*ids, of_time, *BESIDE)]
-    names = _coordinates(rest, ndof, order, q, p, velocities)
+    if observed == "q":
+        names = _positions(rest, ndof, q)
+    else:
+        names = _coordinates(rest, ndof, order, q, p, velocities or observed == "qv")
     groups = [("the trajectory", table)]
     if ids:
         grouped = table.groupby(ids if len(ids) > 1 else ids[0], sort=False, dropna=False)
@@ -675,7 +705,7 @@ def _coordinates(
             return (*found["q"], *found["v"])
         raise ValueError(
             f"`data` has velocities, {', '.join(found['v'])}, and no momenta: give the mass matrix as "
-            "`velocity_mass`, by which p = M v, or columns p1 …"
+            '`velocity_mass`, by which p = M v, or columns p1 …; or pass observed="qv" to `learn`, which finds M.'
         )
     if ndof is not None and len(rest) == 2 * ndof:
         return tuple(rest[i] for i in _rows(order, len(rest)))
@@ -683,6 +713,15 @@ def _coordinates(
         f"`data` has columns {', '.join(rest)}, of which the coordinates and momenta are not recognized: name them by "
         "`q` and `p`, or give `ndof` if they are all, q's first, or in another `order`."
     )
+
+
+def _positions(rest: list[str], ndof: int | None, q: Any) -> tuple[str, ...]:
+    """The columns of q1 … qd, where there are no others."""
+    named = _numbered(rest, "q") if q is None else [q] if isinstance(q, str) else list(q)
+    names = rest if q is None and ndof == len(rest) else named
+    if not names or any(name not in rest for name in names):
+        raise ValueError(f"`q` must name columns of {', '.join(rest)}; got {names}: or give `ndof` if they are all.")
+    return tuple(names)
 
 
 def _numbered(columns: list[str], letter: str) -> list[str]:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from sympflow.storage.identity import digest
+
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -20,7 +22,7 @@ FIELDS = {
     "format",
     "config",
     "architecture",
-    "fingerprint",
+    "system",
     "step",
     "flow",
     "best",
@@ -35,7 +37,7 @@ def identity(flow: FlowMap, system: HamiltonianSystem, config: dict[str, Any]) -
     return {
         "config": json.dumps(config),
         "architecture": json.dumps({"kind": flow.kind, "dt": flow.dt, **flow.architecture()}),
-        "fingerprint": list(system.fingerprint),
+        "system": f"{system.fingerprint} {digest(system)}",  # the numbers tell functions of C apart
     }
 
 
@@ -54,7 +56,7 @@ def read_same(path: str | os.PathLike[str], mine: dict[str, Any]) -> dict[str, A
     differing = sorted(n for n in names if theirs.get(n, nothing) != ours.get(n, nothing))
     if differing:
         raise ValueError(f"`resume` is a run with another {', '.join(differing)}: pass the same arguments as then.")
-    for name in ("architecture", "fingerprint"):
+    for name in ("architecture", "system"):
         if state[name] != mine[name]:
             raise ValueError(
                 f"`resume` is a run with another {name}: pass the same system, and the same arguments of "

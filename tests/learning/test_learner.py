@@ -9,7 +9,7 @@ import sympy
 from scipy.integrate import solve_ivp
 
 import sympflow
-from sympflow.learning.families import FAMILIES, Candidate, Said, pruned
+from sympflow.learning.families import FAMILIES, Candidate, pruned
 from sympflow.learning.fitting import Held, Setting, fitted, judged, left_out, restored
 from sympflow.learning.inertia import Inertia
 from sympflow.learning.learner import (
@@ -198,18 +198,6 @@ def test_parts_of_h_are_what_their_derivatives_say(part):
     formula = part.expression(theta, Q)
     values = [float(formula.subs(dict(zip(Q, column, strict=True)))) for column in x.T]
     assert np.ptp(values - part.value(theta, x)) < 1e-12
-
-
-def test_lagranges_equations_give_the_masses_of_a_double_pendulum():
-    """By linear least squares from states and their slopes, without a start."""
-    pendulum = sympflow.systems.double_pendulum()
-    y = pendulum.domain.sample(200, 0)
-    periods = np.array([2 * np.pi, 2 * np.pi, np.inf, np.inf])
-    family = FAMILIES["inertia"].models(Said(np.ones(4), None, None, 0, periods))
-    model = [candidate.model for candidate in family][1]
-    theta = model.lagrangian_start(y.T, pendulum.vector_field(y).T, np.ones(4))
-    assert model.field(theta, y.T, False, False).value == pytest.approx(pendulum.vector_field(y).T, abs=1e-9)
-    assert (np.abs(theta) > 1e-9).sum() == 5  # 2, 1, cos(q1 - q2); -2cos(q1), -cos(q2)
 
 
 def test_bodies_whose_total_momentum_changes_are_no_bodies():

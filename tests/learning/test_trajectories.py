@@ -167,6 +167,35 @@ def test_tables_and_datasets_are_read_by_their_names(tmp_path, monkeypatch):
         Trajectories.read(tmp_path / "runs.csv")
 
 
+VELOCITIES = {"t": t, "q1": RUN[0], "v1": RUN[1]}
+
+
+@pytest.mark.parametrize(
+    ("data", "options"),
+    [
+        ((t, RUN), {"observed": "qv"}),
+        ({"t": t, "q": RUN[:1], "v": RUN[1:]}, {"observed": "qv", "ndof": 1}),
+        (VELOCITIES, {"observed": "qv"}),
+        (VELOCITIES, {"observed": "qv", "q": "q1", "p": "v1"}),
+        ((t, RUN[:1]), {"observed": "q"}),
+        ({"t": t, "q": RUN[:1]}, {"observed": "q", "ndof": 1}),
+        ({"t": t, "q1": RUN[0]}, {"observed": "q"}),
+        ({"t": t, "angle": RUN[0]}, {"observed": "q", "q": "angle"}),
+        ({"t": t, "angle": RUN[0]}, {"observed": "q", "ndof": 1}),
+    ],
+)
+def test_velocities_and_positions_alone_are_read(data, options):
+    read = Trajectories.read(data, **options)
+    assert (read.velocities, read.ndof, read.names[1][0]) == (True, 1, "v")
+    np.testing.assert_array_equal(read.runs[0].y[0], RUN[0])
+    missing = options["observed"] == "q"
+    np.testing.assert_array_equal(read.runs[0].y[1], np.full(6, np.nan) if missing else RUN[1])
+    assert read.scales[1] == pytest.approx(RUN[1].std(), rel=0.3)
+    again = Trajectories.read(read)
+    assert again.velocities
+    assert again.names == read.names
+
+
 def test_units_and_orders():
     degrees = Trajectories.read(
         (1e3 * t, np.rad2deg(RUN) * [[1], [1e-3]]), units={"t": "ms", "q": "deg", "p": "deg/ms"}

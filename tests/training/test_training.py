@@ -262,8 +262,10 @@ def test_resuming_another_run_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             train(system, resume=path, **{**QUICK, **changed})
-    with pytest.raises(ValueError, match="another fingerprint"):
-        train(harmonic_oscillator(2.0), resume=path, steps=10, **QUICK)
+    far = sympflow.HamiltonianSystem.from_sympy("p**2/2 + q**2/2 + Max(q - 40, 0)**4", domain=system.domain)
+    for other in (harmonic_oscillator(2.0), far):
+        with pytest.raises(ValueError, match="another system"):
+            train(other, resume=path, steps=10, **QUICK)
 
 
 @pytest.mark.parametrize("content", [b"", b"junk", None])

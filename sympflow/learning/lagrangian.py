@@ -1,0 +1,176 @@
+"""Starts by Lagrange's equations of motion, which are linear in the masses where the field of H is not.
+
+Of smoothed curves q(t) with velocities v, p = ∂L/∂v, and p(t) − ∫ ∂L/∂q dt + Γ ∫ p dt is constant. Where momenta are
+observed they are the p of both equations. Where velocities are, L is known but for a factor: the constant of M₁₁ is 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from sympflow.learning.models import Model, Network, Part, Polynomial
+from sympflow.learning.shooting import integrals
+from sympflow.learning.smoothing import Smooth, smoothed
+from sympflow.learning.trajectories import Run, Trajectories
+
+POINTS = 24
+"""Number of points of a piece along which p is followed."""
+STEPS, HALVINGS, SETTLED = 12, 6, 1e-2
+"""Gauss–Newton steps for masses, halvings of one, and the gain of a step that ends them."""
+DEGREE = 4
+"""Degree of the polynomial in place of a potential that is not linear in its numbers."""
+
+
+def lagrangian_start(
+    model: Model, data: Trajectories, theta: np.ndarray, smooth: Smooth | None = None
+) -> tuple[np.ndarray, Trajectories]:
+    """θ by Lagrange's equations where they are linear in it, else as it was; and the data, smooth, with momenta."""
+    smooth, d = smooth or smoothed(data), data.ndof
+    runs = [Run(run.t, y) for run, y in zip(data.runs, smooth.states, strict=True)]
+
+    def with_momenta(states: list[np.ndarray]) -> Trajectories:
+        made = (Run(run.t, y) for run, y in zip(runs, states, strict=True))
+        return replace(data, runs=tuple(made), velocities=False)
+
+    if data.velocities and all(part.of == "q" or not part.n for part in model.parts):  # the masses are known
+        return theta, with_momenta([model.states(theta, run.y) for run in runs])
+    velocities = [run.y[d:] if data.velocities else rates[:d] for run, rates in zip(runs, smooth.rates, strict=True)]
+    equations = Equations(
+        replace(model, parts=tuple(map(_linear, model.parts))),
+        replace(data, runs=tuple(Run(r.t, np.concatenate([r.y, v])) for r, v in zip(runs, velocities, strict=True))),
+    )
+    found = equations.solved()
+    if not data.velocities:
+        return found, data
+    masses = equations.masses(found)
+    if not (np.isfinite(masses).all() and (np.linalg.eigvalsh(masses) > 0).all()):
+        return theta, with_momenta([run.y for run in runs])
+    unit = 1.0 if model.lagrangian else np.linalg.inv(masses.mean(axis=0))[0, 0]  # of H (M⁻¹)₁₁ is 1
+    states = [np.concatenate([run.y[:d], unit * equations.momenta(found, run.y[:d], run.y[d:])]) for run in runs]
+    return found if model.lagrangian else theta, with_momenta(states)
+
+
+def _linear(part: Part) -> Part:
+    """A polynomial in place of a network."""
+    return Polynomial.up_to(DEGREE, part.of, part.scales) if isinstance(part, Network) else part
+
+
+class Equations:
+    """Lagrange's equations of a model along curves with rows q, p or v as observed, and v.
+
+    Parameters
+    ----------
+    model : Model
+    curves : Trajectories
+    """
+
+    def __init__(self, model: Model, curves: Trajectories) -> None:
+        self.model, self.d, self.observed = model, model.ndof, not curves.velocities
+        self.pieces = curves.pieces(POINTS).runs
+        self.q, self.second, self.v = np.split(np.concatenate([run.y for run in self.pieces], axis=1), 3)
+        self.n = model.n - model.rates
+        self.value, self.by = model.momenta(self.q, self.v)
+        self.scales = curves.scales[self.d : 2 * self.d, None]
+
+    def momenta(self, theta: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """p (d, N) at q and v."""
+        value, by = self.model.momenta(q, v)
+        return value[: self.d] + np.einsum("ikn,k->in", by[: self.d], theta[: self.n])
+
+    def masses(self, theta: np.ndarray) -> np.ndarray:
+        """M (N, d, d) at all points."""
+        known, by = self.by_mass
+        return (known + np.einsum("ijkn,k->ijn", by, theta[: self.n])).T
+
+    def solved(self) -> np.ndarray:
+        """θ by least squares: linear where momenta are observed, else by Gauss–Newton steps from M = 1."""
+        likely = self._stacked(self.by[: self.d] / self.scales[..., None])
+        theta = np.zeros(self.model.n)
+        right = ((self.second - self.value[: self.d]) / self.scales).ravel()
+        if self.observed:
+            rest, rows = self._rows(self.second)
+            rows, rest = self._stacked(rows / self.scales[..., None]), (rest / self.scales).ravel()
+            wide = np.concatenate([likely, np.zeros((len(likely), self.model.rates))], axis=1)
+            return _least(np.concatenate([wide, rows]), np.concatenate([right, -rest]))
+        theta[: self.n] = _least(likely, right)  # p = v
+        left, J = self._left(theta)
+        forces = np.arange(self.model.n) >= self.n  # first those alone
+        forces[: self.n] = ~self.by_mass[1].any(axis=(0, 1, 3))
+        for attempt in range(STEPS):
+            step = _least(J if attempt else J * forces, -left)
+            for _ in range(HALVINGS):
+                after, K = self._left(theta + step)
+                if after @ after < left @ left:
+                    break
+                step = step / 2
+            else:
+                break
+            gained = 1 - (after @ after) / (left @ left)
+            theta, left, J = theta + step, after, K
+            if gained < SETTLED:
+                break
+        return theta
+
+    def _left(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """M⁻¹ times what the equations leave, and the derivative by θ; infinite where M is not positive definite."""
+        rest, rows = self._rows(self.momenta(theta, self.q, self.v))
+        M = self.masses(theta)
+        if not (np.isfinite(M).all() and (np.linalg.eigvalsh(M) > 0).all()):
+            return np.full(rest.size, np.inf), np.empty(0)
+        W = np.linalg.inv(M)
+        r = np.einsum("nij,jn->in", W, rest + np.einsum("ikn,k->in", rows, theta))
+        rows[:, : self.n] -= np.einsum("ijkn,jn->ikn", self.by_mass[1], r)
+        return (r / self.scales).ravel(), self._stacked(np.einsum("nij,jkn->ikn", W / self.scales, rows))
+
+    @cached_property
+    def by_mass(self) -> tuple[np.ndarray, np.ndarray]:
+        """M (d, d, N) for θ = 0, and its derivative by θ, (d, d, n, N)."""
+        units = (unit[:, None] * np.ones_like(self.q) for unit in (np.zeros(self.d), *np.eye(self.d)))
+        none, *columns = (self.model.momenta(self.q, v) for v in units)
+        known, by = (np.stack([c[k] - none[k] for c in columns], axis=1)[: self.d] for k in (0, 1))
+        return known, by
+
+    @staticmethod
+    def _stacked(rows: np.ndarray) -> np.ndarray:
+        """Rows (d, n, N) as a matrix (d N, n)."""
+        return rows.transpose(0, 2, 1).reshape(-1, rows.shape[1])
+
+    def _along(self, top: np.ndarray, pushes: np.ndarray) -> np.ndarray:
+        """Momenta less the integrals of what pushes them, (…, N), less their mean over a piece."""
+        ends = np.cumsum([run.n_points for run in self.pieces])[:-1]
+        parts = zip(self._weights, np.split(top, ends, axis=-1), np.split(pushes, ends, axis=-1), strict=True)
+        made = [a - b @ weights for weights, a, b in parts]
+        return np.concatenate([rows - rows.mean(axis=-1, keepdims=True) for rows in made], axis=-1)
+
+    @cached_property
+    def _weights(self) -> list[np.ndarray]:
+        """The integrals (k, k) of what is 1 at one of the points of a piece, of each piece."""
+        return [integrals(run.t, np.eye(run.n_points)) for run in self.pieces]
+
+    @cached_property
+    def _conservative(self) -> np.ndarray:
+        """p(t) − ∫ ∂L/∂q dt for θ = 0, and its derivatives by θ but for friction: (d, 1 + n, N)."""
+        whole = np.concatenate([self.value[:, None], self.by], axis=1)
+        top, pushes = whole[: self.d], whole[self.d :]
+        if self.observed:
+            top = np.concatenate([self.second[:, None], np.zeros_like(top[:, 1:])], axis=1)
+        return self._along(top, pushes)
+
+    def _rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """p(t) − ∫ ∂L/∂q dt + Γ ∫ p dt for θ = 0, (d, N), and its derivatives (d, n, N), with these momenta p."""
+        d, rates = self.d, self.model.rates
+        friction = np.zeros((d, rates, p.shape[1]))
+        for i in range(d if rates else 0):
+            friction[i, i if rates > 1 else 0] = p[i]
+        whole = self._conservative
+        return whole[:, 0], np.concatenate([whole[:, 1:], self._along(np.zeros_like(friction), -friction)], axis=1)
+
+
+def _least(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The solution of least squares, its columns in their lengths; the shortest where there are many."""
+    lengths = np.linalg.norm(rows, axis=0)
+    lengths[lengths == 0] = 1.0
+    return np.linalg.lstsq(rows / lengths, right, rcond=1e-10)[0] / lengths
