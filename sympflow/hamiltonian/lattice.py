@@ -6,7 +6,7 @@ import copy
 import math
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from typing import TYPE_CHECKING, Any, Self
 
@@ -23,6 +23,8 @@ from sympflow.hamiltonian.poles import LatticePoles, Poles
 if TYPE_CHECKING:
     from sympflow.hamiltonian.normal_modes import SpectralPart
 
+Expressions = Callable[[], Sequence[sp.Expr]]
+"""Expressions that are made when a function of them is generated, not in each call of it."""
 BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
 FEW = 6, 4, 3
@@ -409,9 +411,9 @@ class LatticeHamiltonian(LocalHamiltonian):
         """
         x, found = self._on_sites(q), list[tuple[int | None, int, list[Array]]]()
         if self.U != 0:
-            found.append((None, 0, self._site_values(f"onsite {key}", expressions(self.U, self.x), self.x, x)))
+            found.append((None, 0, self._site_values(f"onsite {key}", partial(expressions, self.U, self.x), self.x, x)))
         for axis, k in self._kinds():
-            of_bond = expressions(self.bonds[k], self.r)
+            of_bond = partial(expressions, self.bonds[k], self.r)
             values = self._bond_values(axis, k, key, of_bond, self.r, self._differences(x, axis, k))
             found.append((axis, k, [self._own_bonds(value, axis, k) for value in values]))
         return found
@@ -439,17 +441,22 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     def _kinetic_of_sites(self, p: Array) -> Array:
         """T at each site: (..., d) to (..., *shape)."""
-        return self._site_values("kinetic", [self.T], self.p, self._on_sites(p))[0]
+        return self._site_values("kinetic", lambda: [self.T], self.p, self._on_sites(p))[0]
 
     def kinetic_gradient(self, p: Array) -> Array:
-        slopes = [sp.diff(self.T, s) for s in self.p]
+        def slopes() -> list[sp.Expr]:
+            return [sp.diff(self.T, s) for s in self.p]
+
         return _joined(self._site_values("kinetic 1", slopes, self.p, self._on_sites(p)), len(self.shape))
 
     def kinetic_hessian(self, p: Array) -> Array:
         """∇²T, dense: (..., d) to (..., d, d)."""
         xp, n, F = library(p), math.prod(self.shape), len(self.fields)
         S = xp.zeros((*p.shape, p.shape[-1]), dtype=p.dtype)
-        entries = [sp.diff(self.T, a, b) for a, b in product(self.p, self.p)]
+
+        def entries() -> list[sp.Expr]:
+            return [sp.diff(self.T, a, b) for a, b in product(self.p, self.p)]
+
         values = self._site_values("kinetic 2", entries, self.p, self._on_sites(p))
         sites = np.arange(n)
         for (i, j), value in zip(product(range(F), range(F)), values, strict=True):
@@ -460,9 +467,9 @@ class LatticeHamiltonian(LocalHamiltonian):
         x, p = self._on_sites(y[..., : self.ndof]), y[..., self.ndof :]
         density = self._kinetic_of_sites(p)
         if self.U != 0:
-            density = density + self._site_values("onsite", [self.U], self.x, x)[0]
+            density = density + self._site_values("onsite", lambda: [self.U], self.x, x)[0]
         for axis, k in self._kinds():
-            V = self._bond_values(axis, k, "", [self.bonds[k]], self.r, self._differences(x, axis, k))[0]
+            V = self._bond_values(axis, k, "", partial(list, [self.bonds[k]]), self.r, self._differences(x, axis, k))[0]
             n, at = self.shape[axis], axis - len(self.shape)
             if self.boundary[axis] == "free":
                 V = _padded(V, at, k, "zeros")
@@ -488,11 +495,11 @@ class LatticeHamiltonian(LocalHamiltonian):
         out: list[Any] = [0.0] * len(self.fields)
         if self.U != 0:
             variables = sum(given, self.x)
-            out = self._site_values(f"onsite {order}", slopes(self.U, self.x), variables, *parts)
+            out = self._site_values(f"onsite {order}", partial(slopes, self.U, self.x), variables, *parts)
         for axis, k in self._kinds():
             variables = sum(given, self.r)
             differences = [self._differences(x, axis, k) for x in parts]
-            values = self._bond_values(axis, k, order, slopes(self.bonds[k], self.r), variables, *differences)
+            values = self._bond_values(axis, k, order, partial(slopes, self.bonds[k], self.r), variables, *differences)
             n, at = self.shape[axis], axis - len(self.shape)
             free = self.boundary[axis] == "free"
             for i, value in enumerate(values):
@@ -521,7 +528,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return _cut(values, at, k, values.shape[at]) if self.boundary[axis] == "periodic" else values
 
     def _site_values(
-        self, key: str, expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], *arrays: Sequence[Array]
+        self, key: str, expressions: Expressions, variables: Sequence[sp.Symbol], *arrays: Sequence[Array]
     ) -> list[Array]:
         return self._of_letters(key, expressions, variables, [x for row in arrays for x in row], list(self._sites))
 
@@ -530,7 +537,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         axis: int,
         k: int,
         order: str,
-        expressions: Sequence[sp.Expr],
+        expressions: Expressions,
         variables: Sequence[sp.Symbol],
         *arrays: Sequence[Array],
     ) -> list[Array]:
@@ -540,7 +547,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     def _of_letters(
         self,
         key: str,
-        expressions: Sequence[sp.Expr],
+        expressions: Expressions,
         variables: Sequence[sp.Symbol],
         arrays: Sequence[Array],
         parameters: Sequence[Any],
@@ -552,7 +559,7 @@ class LatticeHamiltonian(LocalHamiltonian):
             parameters = [torch.tensor(c, dtype=like.dtype, device=like.device) for c in parameters]
         elif like.dtype != np.float64:
             parameters = [np.asarray(c, dtype=like.dtype) for c in parameters]
-        values = self._values(key, lambda: expressions, (*variables, *self.c), *arrays, *parameters)
+        values = self._values(key, expressions, (*variables, *self.c), *arrays, *parameters)
         return [value + 0 * like if not getattr(value, "ndim", 0) else value for value in values]
 
     @property

@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import sympy as sp
 
 from sympflow.compiler.control import Value
@@ -20,15 +19,9 @@ from sympflow.compiler.functions import apply, where
 from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled, with_letters
 from sympflow.hamiltonian.recorded import check_recorded, evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.codegen import sampled_name
 from sympflow.kernels.samples import check_samples, sampled_value
 
-__all__ = ["Driving", "driven_form", "in_code", "letters_of_time", "sampled_sources"]
-
-MOST_SAMPLED = 200_000
-"""Numbers of samples that compiled code holds."""
-UNIFORM = 1e-9
-"""Relative deviation of equal intervals."""
+__all__ = ["Driving", "driven_form", "letters_of_time"]
 
 
 @dataclass(frozen=True)
@@ -138,57 +131,3 @@ def letters_of_time(
         others = [letters_of_time(a, t, fixed, found, prefix) for a in f.args if not a.free_symbols <= known]
         return f.func(letters_of_time(f.func(*alone), t, fixed, found, prefix), *others)
     return f.func(*[letters_of_time(a, t, fixed, found, prefix) if isinstance(a, sp.Basic) else a for a in f.args])
-
-
-# functions of samples ---------------------------------------------------------------------------------------------
-
-
-def in_code(f: sp.Expr, time: sp.Symbol, name: str) -> sp.Expr:
-    """The expression with the variable `name` for the time, and `length` for a duration."""
-    return f.xreplace({time: sp.Symbol(name, real=True), DURATION: sp.Symbol("length", real=True)})
-
-
-def sampled_sources(expressions: Sequence[sp.Expr], samples: Mapping[str, Samples]) -> list[str]:
-    """The functions of samples that the expressions hold.
-
-    Raises
-    ------
-    ValueError
-        As `_sampled_source`.
-    """
-    functions = {(a.name_of_samples, a.order) for f in expressions for a in f.atoms(sampled)}
-    return [_sampled_source(name, order, samples[name]) for name, order in sorted(functions)]
-
-
-def _sampled_source(name: str, order: int, samples: Samples) -> str:
-    """A derivative of samples: the polynomial of the interval of t.
-
-    The interval is found at once where all are equal, else by bisection.
-
-    Raises
-    ------
-    ValueError
-        If there are more than compiled code holds.
-    """
-    c, x = samples.polynomials(order), samples.x
-    if c.size > MOST_SAMPLED:
-        raise ValueError(
-            f"`params` has samples of {len(x)} times, more than compiled code holds: give fewer than "
-            f"{MOST_SAMPLED // len(c)}, or use backend='array'."
-        )
-    called, n, first, last = sampled_name(name, order), len(x) - 1, float(x[0]), float(x[-1])
-    width = (last - first) / n
-    lines, rest = [], ""
-    if samples.periodic:
-        lines += [f"turns = math.floor((t - {first!r}) / {last - first!r})", f"t = t - turns * {last - first!r}"]
-        rest = f" + turns * {float(np.polyval(c[:, -1], last - float(x[-2])))!r}" if order < 0 else ""
-    if np.all(np.abs(np.diff(x) - width) <= UNIFORM * width):
-        lines.append(f"i = int(math.floor((t - {first!r}) * {1 / width!r}))")
-    else:
-        lines.append(f"i = np.searchsorted(TIMES_{called}, t, side='right') - 1")
-    lines += [f"i = max(0, min(i, {n - 1}))", f"s = t - TIMES_{called}[i]", f"total = OF_{called}[i, 0]"]
-    lines += [f"total = total * s + OF_{called}[i, {k}]" for k in range(1, len(c))]
-    constants = f"TIMES_{called} = np.array({x.tolist()})\nOF_{called} = np.array({c.T.tolist()})"
-    return "\n    ".join(
-        [f"import numpy as np\n\n{constants}\n\n\n@njit(**OPTIONS)\ndef {called}(t):", *lines, f"return total{rest}"]
-    )
