@@ -20,7 +20,7 @@ def fragments(results: Results) -> dict[str, str]:
     for n in sorted({row.trajectories for row in results.rows}):
         name = "one" if n == 1 else "batch"
         found |= {f"peers-{name}": run_time_table(results, n), f"peers-{name}-work": work_table(results, n)}
-    found |= {"peers-first-calls": first_call_table(results), "peers-fastest": fastest_table(results)}
+    found |= {"peers-fastest": fastest_table(results)}
     return found | {"peers-order": order_table(results), "peers-left-out": left_out(results)}
 
 
@@ -107,15 +107,6 @@ def same_steps(package: str, label: str) -> bool:
     if package == "SciPy":
         return "scalar" in label
     return package in ("Numba", "NumPy", "torch") or label.startswith("leapfrog, jit")
-
-
-def first_call_table(results: Results) -> str:
-    lines = [
-        (call.label, call.package, str(call.trajectories), duration(call.seconds))
-        for call in results.first_calls
-        if call.seconds > 0.005
-    ]
-    return table(("method", "package", "trajectories", "first call, less the second"), lines)
 
 
 def left_out(results: Results) -> str:
