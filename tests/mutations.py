@@ -41,7 +41,12 @@ MUTATIONS = (
     ),
     Mutation(
         "drift of the inverse",
-        (("q = q - (substep.one * h) * system.velocity(p)", "q = q + (substep.one * h) * system.velocity(p)"),),
+        (
+            (
+                "q, p = _drift(system, q, p, substep.one * h, at, -1.0)",
+                "q, p = _drift(system, q, p, substep.one * h, at, 1.0)",
+            ),
+        ),
         ("test_inverse_undoes_the_step_to_rounding",),
     ),
     Mutation(
@@ -51,7 +56,7 @@ MUTATIONS = (
     ),
     Mutation(
         "sign of a tangent",
-        (("A[..., d:, :] -= c * h[..., None]", "A[..., d:, :] += c * h[..., None]"),),
+        (("return [*change, *(x for i, y in enumerate", "return [*change, *(-x for i, y in enumerate"),),
         ("test_tangent_is_the_derivative_of_the_step",),
     ),
     Mutation(
@@ -74,7 +79,7 @@ MUTATIONS = (
     ),
     Mutation(
         "tableau of Gauss",
-        (("_A21 = 0.25 + sqrt(3) / 6", "_A21 = 0.25 + sqrt(3) / 5"),),
+        (("/ (2 * math.sqrt(4 * k * k - 1))", "/ (2 * math.sqrt(4 * k * k - 0.9))"),),
         ("test_the_contract_holds_where_h_does_not_split",),
     ),
     Mutation(
@@ -84,15 +89,20 @@ MUTATIONS = (
     ),
     Mutation(
         "compensated sum",
-        (("error[m] = (new - y[m]) - change", "error[m] = (new - y[m]) + change"),),
+        (
+            (
+                'left.append(op("sub", op("sub", total, value), corrected))',
+                'left.append(op("add", op("sub", total, value), corrected))',
+            ),
+        ),
         ("test_compensated_sums_need_compiled_loops_and_lower_the_rounding",),
     ),
     Mutation(
         "reach of the clock",
         (
             (
-                "now = before + sign * ((new_q[NDOF - 1] - t) + clock_advance(clock, sign * sigma, B))",
-                "now = before + sign * (new_q[NDOF - 1] - t)",
+                "gone = x[self.time] - start[self.time] + self._advance(self.sign * s, start[-1])",
+                "gone = x[self.time] - start[self.time]",
             ),
         ),
         ("test_one_compiled_pass_makes_what_the_run_by_chunks_makes",),
@@ -149,10 +159,7 @@ MUTATIONS = (
     ),
     Mutation(
         "scale of the energy error",
-        (
-            ("H0 = np.abs(_energy(self, self.y0))", "H0 = 1 + np.abs(_energy(self, self.y0))"),
-            ("H0 = np.abs(_energy(sol, sol.y0))", "H0 = 1 + np.abs(_energy(sol, sol.y0))"),
-        ),
+        (("np.nan, np.abs(H0))", "np.nan, 1 + np.abs(H0))"),),
         ("test_error_is_relative_to_the_initial_energy_or_to_the_declared_scale",),
     ),
     Mutation(
