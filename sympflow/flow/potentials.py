@@ -24,7 +24,7 @@ from sympflow.arrays import jvp
 from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 from sympflow.lazy import announced, distribution, load_announced
 
-if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+if TYPE_CHECKING:  # a flow needs it only to be compiled
     from importlib.metadata import EntryPoint
 
     from sympflow.kernels.network_tangents import TrainedNetwork
