@@ -232,7 +232,7 @@ def register_activation(
         forward-mode differentiation; or an `Activation`, which has them in closed form.
     compiled : callable, optional
         A function of a number a that returns σ(a) and σ'(a), by operators; one with branches or functions of a module
-        is compiled by Numba, or is one of Numba. With it flows run compiled, else by array operations.
+        is compiled by Numba (the extra `numba`), or is one of Numba. With it flows run compiled, else by arrays.
 
     Raises
     ------

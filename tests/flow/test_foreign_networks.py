@@ -221,7 +221,10 @@ def test_an_activation_of_a_function_has_all_derivatives_and_compiled_loops(comp
 
 
 def test_without_numba_the_extra_is_named(monkeypatch):
-    register_activation("softsign_like", softsign_like, lambda a: softsign_like_by_cases(a))
+    def not_yet_compiled(a):
+        return softsign_like_by_cases(a)
+
+    register_activation("softsign_like", softsign_like, not_yet_compiled)
     flow = SympFlow(1, pairs=1, hidden=(3,), activation="softsign_like", dt=1.0)
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(ValueError, match=r"`compiled`.*pip install \"sympflow\[numba\]\", or write it by operators"):
