@@ -45,7 +45,7 @@ def test_a_verlet_solve_loads_sympy_only(backend):
         "    assert sol.stats['backend'] == 'compiled', method",
         "sol = sympflow.solve(sympflow.systems.lennard_jones(), 'verlet', (0, 0.001))\n"
         "assert sol.stats['backend'] == 'compiled'",
-        "sympflow.ensemble(sympflow.systems.pendulum(), 'verlet', (0, 1), n=100)",
+        "sympflow.ensemble(sympflow.systems.pendulum(), 'verlet', (0, 1), [[1.0, 0.0]] * 100)",
     ],
     ids=["deviation vectors", "volume", "many terms", "kinds", "pairs", "ensemble"],
 )
