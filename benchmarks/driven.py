@@ -31,7 +31,10 @@ from measuring import fragments
 
 import sympflow
 from sympflow import HamiltonianSystem, energy_balance_error, floquet_multipliers, solve, systems
-from sympflow.kernels.modules import load_module, template
+from sympflow.compiler.control import INT, POINTER, Module
+from sympflow.compiler.functions import apply
+from sympflow.compiler.machine import address, host
+from sympflow.kernels.runs import finished
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import SCHEMES
 
@@ -44,14 +47,6 @@ START = np.array([0.5, 0.1])
 """The state from which heyoka, the schemes and the flows that ship are compared, on the systems of these flows."""
 TARGET, PERIODS = 1e-9, 1000
 CANDIDATES = ("kahan_li6", "kahan_li8", "srkn11b", "srkn14a", "omelyan6", "chin4c")
-COSINES = """
-@njit(**OPTIONS)
-def cosines(w, h, n):
-    total = 0.0
-    for k in range(n):
-        total += fast_cos(w * (k * h))
-    return total
-"""
 
 
 def least(calls: Sequence[Callable[[], Any]], rounds: int) -> list[float]:
@@ -67,11 +62,28 @@ def least(calls: Sequence[Callable[[], Any]], rounds: int) -> list[float]:
     return times.min(0).tolist()
 
 
+def cosines_alone() -> Callable[[float, float, int], float]:
+    """The sum of cos(w·k·h), k = 0 … n − 1, compiled: of w, h, n."""
+    types = [POINTER, INT]
+    code = Module(host().fused).function("cosines", types)
+    numbers, n = code.arguments
+    total, step = code.variable(code.constant(0.0)), code.load(numbers, 0)
+    with code.over(n) as k:
+        total.value = total.value + apply("cos", step * code.convert("sitofp", k, "double"))
+    code.store(total.value, numbers, 1)
+    function = finished(code, types)
+
+    def cosines(w: float, h: float, n: int) -> float:
+        numbers = np.array([w * h, 0.0])
+        function(address(numbers), n)
+        return float(numbers[1])
+
+    return cosines
+
+
 def cost(rounds: int) -> list[tuple[str, ...]]:
     """A step of the driven pendulum against one of the pendulum plus the cosines of its kicks."""
-    options = {"error_model": "numpy", "fastmath": {"contract"}}
-    header = f"import math\n\nimport numpy as np\nfrom numba import njit\n\nOPTIONS = {options}"
-    cosines = load_module("\n\n\n".join([header, template("elementary"), COSINES])).cosines
+    cosines = cosines_alone()
     rows: list[tuple[str, ...]] = [("method", "pendulum, ns a step", "cosines", "driven pendulum", "ratio")]
     n, h, save = 200_000, 0.05, np.array([200_000])
     for name in ("verlet", "kahan_li8", "srkn14a", "chin4c"):

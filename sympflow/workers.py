@@ -39,7 +39,7 @@ TRIES = 3
 LOOK = 0.2  # seconds between two looks at the processes of a pool that does not tell when they die
 LOST = {"KilledWorker", "FutureCancelledError", "TerminatedWorkerError"}
 """Names of the errors by which engines say that a worker died: of dask and joblib, which need not be installed."""
-SAME = ("numpy", "numba")
+SAME = ("numpy", "llvmlite")
 """Distributions whose versions may decide the last bits of a result."""
 
 

@@ -40,10 +40,16 @@ def test_a_verlet_solve_loads_sympy_only(backend):
         "H = ' + '.join(f'p{i}**2/2 + cos(q{i}) + (q{i} - q{i + 1})**4/4' for i in range(1, 150)) + ' + p150**2'\n"
         "system = sympflow.HamiltonianSystem.from_sympy(H, y0=[0.1]*300)\n"
         "assert sympflow.solve(system, 'verlet', (0, 1), dt=0.1).stats['backend'] == 'compiled'",
+        "for method in ('gauss_legendre4', 'strang_parts', 'log_kahan_li8', 'rk4', 'tao4'):\n"
+        "    sol = sympflow.solve(sympflow.systems.kepler(), method, (0, 1), dt=0.1)\n"
+        "    assert sol.stats['backend'] == 'compiled', method",
+        "sol = sympflow.solve(sympflow.systems.lennard_jones(), 'verlet', (0, 0.001))\n"
+        "assert sol.stats['backend'] == 'compiled'",
+        "sympflow.ensemble(sympflow.systems.pendulum(), 'verlet', (0, 1), [[1.0, 0.0]] * 100)",
     ],
-    ids=["deviation vectors", "volume", "many terms"],
+    ids=["deviation vectors", "volume", "many terms", "kinds", "pairs", "ensemble"],
 )
-def test_derivatives_and_systems_of_many_terms_load_no_numba(code):
+def test_compiled_runs_load_no_numba(code):
     assert not {"numba", "torch"} & loaded_after(f"import sympflow\n{code}")
 
 

@@ -137,6 +137,6 @@ def test_other_versions(monkeypatch):
     assert module._sent(packed).value == 1
     mine = module._versions()
     module._unpacked.cache_clear()
-    monkeypatch.setattr(module, "_versions", lambda: mine | {"numba": "0.1"})
-    with pytest.raises(ValueError, match=r"`workers` run other versions than this program: numba 0\.1 instead of"):
+    monkeypatch.setattr(module, "_versions", lambda: mine | {"llvmlite": "0.1"})
+    with pytest.raises(ValueError, match=r"`workers` run other versions than this program: llvmlite 0\.1 instead of"):
         module._sent(packed).value  # noqa: B018

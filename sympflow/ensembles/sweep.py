@@ -24,7 +24,6 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import build, check_applies
-from sympflow.kernels.modules import compiling_alone
 from sympflow.kernels.threads import at_most
 from sympflow.solver import check_backend, check_own_parameters
 from sympflow.systems.given import given_system
@@ -328,7 +327,7 @@ class Task:
         """Compile the method, or load it, once in each process, by a few steps from some first orbits (n, 2d)."""
         if os.getpid() in self.ready:
             return
-        with _preparing, compiling_alone():
+        with _preparing:
             if os.getpid() not in self.ready:
                 self._few_steps(self.problem(y0[:2]))
                 if self.varied:

@@ -34,7 +34,7 @@ from sympflow.hamiltonian import collocation
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 
-if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.kernels.flow_loops import CollocatedFlowKernel
 
 MOST_STAGES, MOST_STEPS = 8, 200

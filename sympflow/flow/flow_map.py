@@ -24,7 +24,7 @@ from sympflow.flow.records import MAX_DT, MIN_DT, Description
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.system import HamiltonianSystem
 
-if TYPE_CHECKING:  # Numba, which a flow needs only to be compiled
+if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.kernels.network_tangents import NetworkTangents
 
 MAX_STEPS = 10_000_000  # of one call

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from sympflow.flow.potentials import NO_NETWORK, Potential, Time
 
-if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.kernels.network_tangents import TrainedNetwork
     from sympflow.kernels.networks import NetworkLayer
 

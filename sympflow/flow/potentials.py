@@ -24,7 +24,7 @@ from sympflow.arrays import jvp
 from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 from sympflow.lazy import announced, distribution, load_announced
 
-if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+if TYPE_CHECKING:  # a flow needs it only to be compiled
     from importlib.metadata import EntryPoint
 
     from sympflow.kernels.network_tangents import TrainedNetwork
@@ -232,7 +232,7 @@ def register_activation(
         forward-mode differentiation; or an `Activation`, which has them in closed form.
     compiled : callable, optional
         A function of a number a that returns σ(a) and σ'(a), by operators; one with branches or functions of a module
-        is compiled by Numba, or is one of Numba. With it flows run compiled, else by array operations.
+        is compiled by Numba (the extra `numba`), or is one of Numba. With it flows run compiled, else by arrays.
 
     Raises
     ------

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -50,9 +50,6 @@ from sympflow.hamiltonian.local_states import LocalStates
 from sympflow.hamiltonian.monomials import Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, Scheme, compose, scheme_named
-
-if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
-    pass
 
 
 class PrimedFlow(PrimedKnown, SympFlow):

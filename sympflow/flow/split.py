@@ -33,7 +33,7 @@ from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, map_evaluations
 from sympflow.hamiltonian.system import HamiltonianSystem
 
-if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.kernels.flow_loops import SplitFlowKernel
 
 MOST_KEPT = 64  # steps whose maps are kept

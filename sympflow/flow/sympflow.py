@@ -31,7 +31,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
 
-if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.kernels.network_tangents import NetworkTangents
     from sympflow.kernels.networks import MLPFlowKernel
 

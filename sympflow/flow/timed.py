@@ -19,7 +19,7 @@ from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow, pairs_of_layers
 from sympflow.hamiltonian.system import HamiltonianSystem
 
-if TYPE_CHECKING:  # Numba and SymPy, which a flow needs only to be compiled
+if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.kernels.network_tangents import TrainedNetwork
     from sympflow.kernels.networks import NetworkLayer
 

@@ -369,7 +369,7 @@ def _by_numba(function: Any) -> Any:
     except ImportError as error:
         raise ValueError(
             "`compiled`, with which the activation of the flow was registered, has branches or calls functions, which "
-            "Numba compiles: install numba, or write it by operators."
+            'Numba compiles: pip install "sympflow[numba]", or write it by operators.'
         ) from error
 
     compiled = function if hasattr(function, "py_func") else njit(error_model="numpy")(function)

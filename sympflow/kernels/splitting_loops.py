@@ -49,8 +49,7 @@ LANES_OF_SUMS, LANES = 16.0, 2.0
 class SplittingLoops:
     """Compiled loops that run any `Scheme` on one system; states are [q, p], float64.
 
-    Force gradients and compensated sums are compiled when first used. A symbolic system's code is kept on disk for
-    the next process; that of a system given by Numba functions is not.
+    Force gradients and compensated sums are compiled when first used.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Functions of many terms as code: a loop over the terms of each kind, in place of code for every one.
 
 Pairs of bodies and springs of a chain differ in their coordinates and constants only. Written out, their derivatives
-take Numba minutes; as tables of coordinates and constants, and one formula for each kind of term, a second or two
+take minutes to compile; as tables of coordinates and constants, and one formula for each kind of term, the same time
 however many there are.
 """
 
@@ -24,7 +24,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["Family", "Terms", "families", "is_large", "is_long", "written_out"]
 
-MOST_WRITTEN_OUT = 200  # operations of a gradient: longer ones take Numba more than a few seconds
+MOST_WRITTEN_OUT = 200  # operations of a gradient
 MOST_IN_REGISTERS = 16  # degrees of freedom of states that are tuples of numbers
 MOST_COMPILED = 50_000  # operations of the slopes of all formulas, which take some ten seconds
 MOST_TOGETHER = 75  # operations of terms that stand alone in one loop

@@ -29,7 +29,7 @@ _most_threads: ContextVar[int | None] = ContextVar("most_threads", default=None)
 
 
 def given(x: ArrayLike, dtype: DTypeLike = np.float64) -> np.ndarray:
-    """An array as compiled functions are given it: contiguous, and not read-only, for which Numba compiles another."""
+    """An array as compiled functions are given it: contiguous, and not read-only."""
     array = np.ascontiguousarray(x, dtype=dtype)
     return array if array.flags.writeable else array.copy()
 

@@ -273,7 +273,7 @@ def outer_solar_system() -> HamiltonianSystem:
     """H = Σ|p_i|²/(2m_i) − G Σ_{i<j} m_i m_j/|q_i − q_j|, d = 18: Sun, Jupiter, Saturn, Uranus, Neptune, Pluto.
 
     Lengths are in astronomical units, times in days, masses in solar masses; q and p list the bodies' three coordinates
-    one body after the other. It is given by Numba functions.
+    one body after the other.
 
     Notes
     -----

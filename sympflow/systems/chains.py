@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.domain import Ball, Box, Tube
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.systems.pairs import OPTIONS, pair_functions
 
 SPRINGS = 50  # stiff springs: H, its gradient and its Hessian are written out symbolically
 
@@ -164,7 +161,7 @@ def lennard_jones() -> HamiltonianSystem:
     """H = Σ|p_i|²/(2m) + Σ_{i<j} 4ε[(σ/r_ij)¹² − (σ/r_ij)⁶], d = 14: seven argon atoms in a plane, nearly frozen.
 
     Lengths are in nanometres, times in nanoseconds, energies in kelvin (divided by Boltzmann's constant); q and p list
-    the atoms' two coordinates one atom after the other. It is given by Numba functions.
+    the atoms' two coordinates one atom after the other.
 
     Notes
     -----
@@ -181,27 +178,14 @@ def lennard_jones() -> HamiltonianSystem:
     """
     y0 = np.concatenate([POSITIONS.ravel(), MASS * VELOCITIES.ravel()])
     rest = np.concatenate([POSITIONS.ravel(), np.zeros(14)])
-    return HamiltonianSystem(
-        **_attraction_and_repulsion(),
-        mass=MASS,
+    return HamiltonianSystem.pairs(
+        "4*epsilon*((sigma/r)**12 - (sigma/r)**6)",
+        masses=np.full(7, MASS),
+        dim=2,
+        params={"epsilon": EPSILON, "sigma": SIGMA},
         name="lennard_jones",
         domain=Tube([rest, rest], np.repeat([0.15, 3.5], 14)),
         y0=y0,
         t_span=(0.0, 0.2),
         dt=4e-5,
-        check=False,
     )
-
-
-@cache
-def _attraction_and_repulsion() -> dict[str, Any]:
-    from numba import njit
-
-    @njit(**OPTIONS)
-    def potential(s: Any) -> Any:
-        x = SIGMA * SIGMA / s
-        x3 = x * x * x
-        u6, u12 = -4 * EPSILON * x3, 4 * EPSILON * x3 * x3
-        return u6 + u12, -(3 * u6 + 6 * u12) / s, (12 * u6 + 42 * u12) / (s * s)
-
-    return pair_functions(potential, np.ones((7, 7)), 2)

@@ -1,4 +1,4 @@
-"""Potentials that are sums over pairs of bodies, as Numba functions: where symbols would explode."""
+"""Potentials that are sums over pairs of bodies, as Numba functions: of pairs that no formula gives."""
 
 from __future__ import annotations
 
@@ -25,8 +25,19 @@ def pair_functions(pair: Callable[..., Any], strength: np.ndarray, dimension: in
     -------
     dict
         The arguments `potential`, `gradient`, `hessian_vector` and `ndof` of `HamiltonianSystem`.
+
+    Raises
+    ------
+    ImportError
+        If Numba is not installed.
     """
-    from numba import njit
+    try:
+        from numba import njit
+    except ImportError as error:
+        raise ImportError(
+            '`pair` must be a Numba function, for which Numba is needed: pip install "sympflow[numba]", or give the '
+            "potential of a pair to HamiltonianSystem.pairs."
+        ) from error
 
     n, D = len(strength), dimension
     strength = np.ascontiguousarray(strength, dtype=float)

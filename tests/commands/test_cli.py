@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import subprocess
 import sys
@@ -426,3 +427,15 @@ def test_solve_takes_a_formula_and_the_values_of_its_symbols():
     missing = run("solve", "p**2/2 + k*q**4/4", "--y0", "1,0")
     assert missing.exit_code == 2
     assert "`--k` is missing" in missing.output
+
+
+@pytest.mark.parametrize("locale", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0"}], ids=str)
+def test_the_command_line_writes_utf_8(locale, tmp_path):
+    env = os.environ | {"PYTHONCOERCECLOCALE": "0", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))} | locale
+    words = ["compare", "pendulum", "--methods", "verlet", "--t-end", "1", "--out", str(tmp_path)]
+    for call in (words, ["compare", "--help"], ["methods"]):
+        ended = subprocess.run([sys.executable, "-m", "sympflow.cli", *call], capture_output=True, check=False, env=env)
+        assert ended.returncode == 0, ended.stderr
+        text = ended.stdout.decode("utf-8")
+        assert not text.isascii() or call[0] == "methods"
+    assert (tmp_path / "pendulum.csv").read_text(encoding="utf-8").startswith("system,")

@@ -3,6 +3,7 @@
 import importlib
 import math
 import pickle
+import sys
 from importlib import metadata
 from importlib.metadata import EntryPoint
 
@@ -217,6 +218,18 @@ def test_an_activation_of_a_function_has_all_derivatives_and_compiled_loops(comp
     np.testing.assert_allclose(sol.y, arrays.y, rtol=0, atol=1e-14)
     copy = pickle.loads(pickle.dumps(flow))
     assert torch.equal(copy(0.5, x), flow(0.5, x))
+
+
+def test_without_numba_the_extra_is_named(monkeypatch):
+    def not_yet_compiled(a):
+        return softsign_like_by_cases(a)
+
+    register_activation("softsign_like", softsign_like, not_yet_compiled)
+    flow = SympFlow(1, pairs=1, hidden=(3,), activation="softsign_like", dt=1.0)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(ValueError, match=r"`compiled`.*pip install \"sympflow\[numba\]\", or write it by operators"):
+        solve(PENDULUM, flow, (0, 2), on_domain_exit="ignore", backend="compiled")
+    assert solve(PENDULUM, flow, (0, 2), on_domain_exit="ignore").stats["backend"] == "torch"
 
 
 def test_without_a_compiled_form_it_runs_by_arrays_and_says_why():

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import sys
 import warnings
 
 import numpy as np
@@ -11,6 +12,8 @@ from numba import njit
 
 from sympflow import Ball, HamiltonianSystem, poincare_section, solve, systems, time_transformed, train
 from sympflow.interop.scipy import as_scipy
+from sympflow.systems.chains import EPSILON, MASS, SIGMA
+from sympflow.systems.pairs import pair_functions
 
 Y1, Y2 = np.array([1.0, 0.3]), np.array([0.3, 0.6, 0.1, 0.2])
 SQUARE = {"potential": lambda q: (q**2).sum(-1) / 2, "ndof": 1}
@@ -366,16 +369,29 @@ class TestNumbaFunctions:
         assert solve(unchecked, "verlet", (0, 1), Y2, dt=0.1).status == -1
 
 
-def test_the_scene_that_ships_is_right():
+@njit
+def lennard_jones(s):
+    x = (SIGMA * SIGMA / s) ** 3
+    return 4 * EPSILON * (x * x - x), EPSILON * (12 * x - 24 * x * x) / s, EPSILON * (168 * x * x - 48 * x) / s**2
+
+
+def test_sums_over_pairs_by_numba_functions_are_those_by_a_formula():
     system = systems.lennard_jones()
-    assert not system.functions_given
-    names = ("potential", "gradient", "hessian_vector")
-    given = dict(zip(names, system.numba_functions, strict=True))
-    again = HamiltonianSystem(**given, ndof=system.ndof, domain=system.domain, y0=system.y0)
+    given = pair_functions(lennard_jones, np.ones((7, 7)), 2)
+    again = HamiltonianSystem(**given, mass=MASS, domain=system.domain, y0=system.y0)
     assert again.functions_given
     again.check_functions()
-    q = system.y0[: system.ndof]
-    assert again.potential(q) == system.potential(q)
+    q, v = system.y0[: system.ndof], np.random.default_rng(0).standard_normal(system.ndof)
+    assert again.potential(q) == pytest.approx(system.potential(q), rel=1e-14)
+    np.testing.assert_allclose(again.force(q), system.force(q), rtol=0, atol=1e-14 * 42 * 4 * EPSILON / SIGMA)
+    exact = system.hessian_vector(q, v)
+    np.testing.assert_allclose(again.hessian_vector(q, v), exact, rtol=0, atol=1e-13 * abs(exact).max())
+
+
+def test_without_numba_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    with pytest.raises(ImportError, match=r"^`pair` must be a Numba function.*sympflow\[numba\]"):
+        pair_functions(lennard_jones, np.ones((2, 2)), 2)
 
 
 def test_symbolic_systems_are_not_tested():

@@ -1,4 +1,4 @@
-"""The cache of compiled modules: threads that compile at once, and files that were cut."""
+"""The cache of machine code: threads and processes that compile at once, and files that were damaged."""
 
 import os
 import subprocess
@@ -29,49 +29,71 @@ for step in (threading.Thread.start, threading.Thread.join):
 print(len(found), *set(found))
 """
 
+SCRIPT = """
+import numpy as np
+from sympflow.kernels.splitting_loops import splitting_loops
+from sympflow.schemes import SCHEMES
+from sympflow.systems import pendulum
 
-def told(folder, method="gauss_legendre4"):
-    """The output of a process with its own cache folder."""
-    env = os.environ | {"SYMPFLOW_CACHE_DIR": str(folder), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    ended = subprocess.run(
-        [sys.executable, "-c", AT_ONCE, method], capture_output=True, text=True, check=False, env=env
-    )
-    assert ended.returncode == 0, ended.stderr
-    return ended.stdout
-
-
-def test_threads_that_compile_at_once_and_files_that_were_cut(tmp_path):
-    """Eight threads call `solve` first at once; then each file of the cache is cut, empty, or another text."""
-    first = told(tmp_path)
-    assert first.startswith("8 [0."), first
-    assert first.count("[") == 1
-    for ending in ("nbi", "nbc", "py"):
-        files = sorted(tmp_path.rglob(f"*.{ending}"))
-        assert files
-        for i, file in enumerate(files):
-            content = file.read_bytes()
-            file.write_bytes((content[: len(content) // 2], b"", b"text")[i % 3])
-        assert told(tmp_path) == first
-    kept = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nbc")}
-    assert told(tmp_path) == first
-    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.nbc")} == kept  # compiled once
+Y, n, _ = splitting_loops(pendulum()).kernel(SCHEMES["verlet"]).run(0.1, np.array([1.0, 0.0]), 10, np.array([10]))
+print(repr(Y.tolist()))
+"""
 
 
-def test_threads_that_trace_at_once(tmp_path):
-    """Eight threads call `solve` first at once with a method over traced numbers: one file is made."""
-    found = told(tmp_path, "verlet")
+def started(folder, *words):
+    """A process with its own cache folder."""
+    env = os.environ | {"SYMPFLOW_CACHE_DIR": str(folder), "HOME": str(folder), "XDG_CACHE_HOME": str(folder)}
+    return subprocess.Popen([sys.executable, "-c", *words], stdout=subprocess.PIPE, text=True, env=env)
+
+
+def told(folder, *words):
+    """The output of such a process."""
+    process = started(folder, *words)
+    text, _ = process.communicate()
+    assert process.returncode == 0
+    return text
+
+
+@pytest.mark.parametrize("method", ["gauss_legendre4", "verlet"])
+def test_threads_that_compile_at_once(method, tmp_path):
+    """Eight threads call `solve` first at once: every text is compiled once."""
+    found = told(tmp_path, AT_ONCE, method)
     assert found.startswith("8 [0."), found
     assert found.count("[") == 1
     assert len([*tmp_path.rglob("*.o")]) == 1
+    assert not [*tmp_path.rglob("*.part")]
 
 
-@pytest.mark.parametrize("locale", [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONUTF8": "0"}], ids=str)
-def test_the_command_line_writes_utf_8(locale, tmp_path):
-    env = os.environ | {"PYTHONCOERCECLOCALE": "0", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))} | locale
-    words = ["compare", "pendulum", "--methods", "verlet", "--t-end", "1", "--out", str(tmp_path)]
-    for call in (words, ["compare", "--help"], ["methods"]):
-        ended = subprocess.run([sys.executable, "-m", "sympflow.cli", *call], capture_output=True, check=False, env=env)
-        assert ended.returncode == 0, ended.stderr
-        text = ended.stdout.decode("utf-8")
-        assert not text.isascii() or call[0] == "methods"
-    assert (tmp_path / "pendulum.csv").read_text(encoding="utf-8").startswith("system,")
+def test_processes_that_compile_at_once(tmp_path):
+    """Each finds or makes the same file, and none reads what another one is about to write."""
+    processes = [started(tmp_path, SCRIPT) for _ in range(4)]
+    first, *others = [process.communicate()[0] for process in processes]
+    assert first.startswith("[[")
+    assert others == [first] * 3
+    assert [file.suffix for file in (tmp_path / "code").iterdir()] == [".o"]
+
+
+def test_a_fresh_process_finds_the_machine_code(tmp_path):
+    first = told(tmp_path, SCRIPT)
+    (file,) = (tmp_path / "code").iterdir()
+    made = file.stat().st_mtime_ns
+    assert told(tmp_path, SCRIPT) == first
+    assert [*(tmp_path / "code").iterdir()] == [file]
+    assert file.stat().st_mtime_ns == made
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[: len(b) // 2], lambda b: b[:-9] + bytes([b[-9] ^ 1]) + b[-8:], lambda b: b""]
+)
+def test_damaged_machine_code_is_made_again(tmp_path, damage):
+    first = told(tmp_path, SCRIPT)
+    (file,) = (tmp_path / "code").iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    assert told(tmp_path, SCRIPT) == first
+    assert file.read_bytes() == whole
+
+
+def test_a_folder_that_cannot_be_written_is_no_obstacle(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    assert told(tmp_path / "file" / "cache", SCRIPT).startswith("[[")

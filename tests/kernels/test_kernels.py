@@ -1,9 +1,6 @@
 """The splitting kernel against plain NumPy loops, and what it promises about saves, blow-ups, lanes and caches."""
 
-import os
 import pickle
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -343,90 +340,3 @@ def test_refusals(systems):
 
 def test_loops_are_built_once_per_system(systems):
     assert splitting_loops(systems["pendulum"]) is splitting_loops(systems["pendulum"])
-
-
-# --- the cache on disk -----------------------------------------------------------------------------------------
-
-SCRIPT = """
-import numpy as np
-from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.schemes import SCHEMES
-from sympflow.systems import pendulum
-
-Y, n, _ = splitting_loops(pendulum()).kernel(SCHEMES["verlet"]).run(0.1, np.array([1.0, 0.0]), 10, np.array([10]))
-print(repr(Y.tolist()))
-"""
-
-
-def run_in_fresh_process(folder):
-    result = subprocess.run(
-        [sys.executable, "-c", SCRIPT],
-        env={**os.environ, "SYMPFLOW_CACHE_DIR": str(folder), "HOME": str(folder), "XDG_CACHE_HOME": str(folder)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return result.stdout
-
-
-def test_a_fresh_process_finds_the_machine_code(tmp_path):
-    first = run_in_fresh_process(tmp_path)
-    (file,) = (tmp_path / "code").iterdir()
-    made = file.stat().st_mtime_ns
-    assert run_in_fresh_process(tmp_path) == first
-    assert [*(tmp_path / "code").iterdir()] == [file]
-    assert file.stat().st_mtime_ns == made
-
-
-@pytest.mark.parametrize(
-    "damage", [lambda b: b[: len(b) // 2], lambda b: b[:-9] + bytes([b[-9] ^ 1]) + b[-8:], lambda b: b""]
-)
-def test_damaged_machine_code_is_made_again(tmp_path, damage):
-    first = run_in_fresh_process(tmp_path)
-    (file,) = (tmp_path / "code").iterdir()
-    whole = file.read_bytes()
-    file.write_bytes(damage(whole))
-    assert run_in_fresh_process(tmp_path) == first
-    assert file.read_bytes() == whole
-
-
-def test_a_folder_that_cannot_be_written_is_no_obstacle(tmp_path):
-    (tmp_path / "file").write_text("not a folder")
-    assert run_in_fresh_process(tmp_path / "file" / "cache").startswith("[[")
-
-
-SHARING = """
-import sys
-import numba
-from sympflow.kernels.modules import constants_source, load_module
-
-compiled = []
-
-
-class Compilations(numba.core.event.Listener):
-    def on_start(self, event):
-        pass
-
-    def on_end(self, event):
-        compiled.append(event.data["dispatcher"].__name__)
-
-
-numba.core.event.register("numba:compile", Compilations())
-shared = constants_source(FACTOR=0.5) + "\\n\\n\\n@njit(**OPTIONS)\\ndef scaled(x):\\n    return FACTOR * x\\n"
-for name in sys.argv[1:]:
-    own = f"{constants_source()}\\n\\n\\n@njit(**OPTIONS)\\ndef {name}(x):\\n    return scaled(x) + {len(name)}\\n"
-    module = load_module(own, [shared])
-    print(getattr(module, name)(3.0), hasattr(module, "scaled"))
-print(*compiled)
-"""
-
-
-def test_shared_functions_are_compiled_once_for_all_modules_and_processes(tmp_path):
-    def run(*names):
-        environment = os.environ | {"SYMPFLOW_CACHE_DIR": str(tmp_path)}
-        command = [sys.executable, "-c", SHARING, *names]
-        result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        return result.stdout.splitlines()
-
-    assert run("f") == ["2.5 False", "scaled f"]
-    assert run("f", "second", "third") == ["2.5 False", "7.5 False", "6.5 False", "second third"]

@@ -47,11 +47,11 @@ SCENES = {
     ),
 }
 
-NUMBA_SCENES = {
+PAIR_SCENES = {
     "outer_solar_system": systems.outer_solar_system,
     "lennard_jones": systems.lennard_jones,
 }
-ALL = {**{name: make for name, (make, _) in SCENES.items()}, **NUMBA_SCENES}
+ALL = {**{name: make for name, (make, _) in SCENES.items()}, **PAIR_SCENES}
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -73,10 +73,10 @@ def test_derivatives_are_those_of_H(scene):
         np.testing.assert_allclose(system.hessian(array), hessian, rtol=1e-10, atol=1e-10 * float(abs(hessian).max()))
 
 
-@pytest.mark.parametrize("scene", NUMBA_SCENES)
-def test_derivatives_of_numba_functions_are_those_of_H(scene):
+@pytest.mark.parametrize("scene", PAIR_SCENES)
+def test_derivatives_of_sums_over_pairs_are_those_of_H(scene):
     """By central differences, of the potential and of its gradient."""
-    system = NUMBA_SCENES[scene]()
+    system = PAIR_SCENES[scene]()
     q, d = system.y0[: system.ndof], system.ndof
     step = 1e-4 * np.abs(q).max() * np.eye(d)
     slope = (system.potential(q + step) - system.potential(q - step)) / (2 * step.diagonal())
