@@ -211,7 +211,6 @@ REFUSED = [
     ({"on_domain_exit": "stop"}, ValueError, "`store` takes no `on_domain_exit` 'stop'"),
     ({"method": "rk45"}, ValueError, "`store` keeps runs on a grid of equal steps in t, and method 'rk45' chooses"),
     ({"method": "log_kahan_li8"}, ValueError, "those of method 'log_kahan_li8' are equal in another time"),
-    ({"method": "explicit_adams"}, ValueError, "`store` needs a run that can be cut, and the loops of method 'explicit_adams'"),
 ]
 OTHER = [
     ({"resume": False}, "exists: pass resume=True to go on with it"),
