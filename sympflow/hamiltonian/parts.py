@@ -66,6 +66,11 @@ class PartFunctions(SymbolicHamiltonian):
     q, p : tuple of Symbol
     whole : SymbolicHamiltonian
         With the time and the samples that H may hold.
+
+    Attributes
+    ----------
+    of_positions : bool
+        True for a potential, H_k(q).
     """
 
     turns = False
@@ -76,14 +81,10 @@ class PartFunctions(SymbolicHamiltonian):
         self.H, self.q, self.p, self.ndof = H, q, p, len(q)
         self.V = self.T = None
         self.separable = False
+        self.of_positions = not H.has(*p)  # a value, which tracers of torch do not ask SymPy for
         self.time = whole.time if whole.time in H.free_symbols else None
         if whole.samples:
             self.samples = whole.samples
-
-    @property
-    def of_positions(self) -> bool:
-        """True for a potential, H_k(q)."""
-        return not self.H.has(*self.p)
 
     def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
         """∇²_q H_k(y)·v: (..., 2d), (..., d) to (..., d)."""
