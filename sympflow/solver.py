@@ -35,7 +35,6 @@ from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
-    smaller_tolerance,
     warn_of_leap,
     warn_of_loss,
 )
@@ -305,7 +304,7 @@ def _answered(integrator: Integrator, problem: Problem, action: str, rows: Param
 
 def _solved(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None = None) -> Solution:
     """The solution of a validated problem; `rows` are the parameters of its trajectories, where they have some."""
-    given, system, y_start = problem, problem.system, problem.y0
+    system, y_start = problem.system, problem.y0
     n_times = 0 if problem.t_eval is None else len(problem.t_eval)
     between = system.between_impulses
     integrator = integrator.resolved(between, y_start, abs(problem.t1 - problem.t0), n_times)
@@ -339,11 +338,6 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
-    if integrator.absolute_tolerance and stopped is None and readable(outcome.y) and np.all(outcome.status >= 0):
-        atol = smaller_tolerance(outcome, system, integrator.absolute_tolerance)
-        if atol is not None:
-            afresh = replace(given, events=given.events and given.events.afresh())
-            return _solved(replace(integrator, atol=atol), afresh, action, rows)  # type: ignore[type-var]
     passed = False
     if (system.poles is not None or problem.letters is not None) and problem.diagnosed and problem.store is None:
         if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):

@@ -220,11 +220,6 @@ class Integrator:
         return False
 
     @property
-    def absolute_tolerance(self) -> float:
-        """The default `atol`, in units of y, of a method that chooses its steps; 0 where it was given, or is none."""
-        return 0.0
-
-    @property
     def takes_forces(self) -> bool:
         """True if every step holds any force beside −∂H/∂q, as one by `system.vector_field` does."""
         return False

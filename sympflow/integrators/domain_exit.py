@@ -12,7 +12,6 @@ import numpy as np
 
 from sympflow.arrays import Array, finite_states, has_values, is_tensor, one_lane, readable, to_numpy
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
-from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome
 
@@ -75,31 +74,6 @@ def check_system_along(outcome: Outcome, integrator: Integrator, system: Hamilto
         f"`system` {system.name!r} is not the one that the flow was trained for: at the state ({shown}) of this run "
         "its H is another. Pass the flow of this system, or train one with sympflow.train(system)."
     )
-
-
-NEXT_TO = 1e-3
-"""Of the larger of q and p, in comparable units: where the other one is smaller, a run is at rest or has none."""
-
-
-HIDES = 0.01  # of the largest q, or p: errors of the default tolerance that are as large
-
-
-def smaller_tolerance(outcome: Outcome, system: HamiltonianSystem, tolerance: float) -> float | None:
-    """The absolute tolerance of a run of which all q, or all p, are so small that the default one hides their errors.
-
-    None if none are: they are of an order between, or at rest.
-    """
-    y = to_numpy(outcome.y).reshape(-1, 2, system.ndof)
-    with np.errstate(all="ignore"):
-        sizes = np.abs(y).max(0, initial=0.0)
-        small = (sizes.max(-1) > 0) & (HIDES * sizes.max(-1) <= tolerance)
-    if not small.any():
-        return None
-    scale = weights(system)
-    scaled = (sizes * scale.reshape(2, -1)).max(-1)
-    at_rest = system.y0 is not None and scaled.max() <= np.finfo(float).eps * np.abs(scale * system.y0).max()
-    small &= (scaled > NEXT_TO * scaled.max()) & (not at_rest)
-    return tolerance * float(sizes.max(-1)[small].min()) if small.any() else None
 
 
 def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stacklevel: int) -> None:

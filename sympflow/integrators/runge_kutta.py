@@ -9,11 +9,15 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import as_float
-from sympflow.arrays import Array, per_state, to_numpy
+from sympflow.arrays import Array, per_state, readable, to_numpy
+from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.contract import ByVectorField
 from sympflow.integrators.grid import no_event
+
+HIDES = 0.01
+"""Errors of the default tolerance that are so large, in units of q or of p, hide what a run does."""
 
 
 class ExplicitStep(ByVectorField):
@@ -83,7 +87,8 @@ class RungeKutta(ExplicitStep):
     Parameters
     ----------
     rtol, atol : float
-        The local error is kept below atol + rtol·|y|.
+        The local error is kept below atol + rtol·|y|. Where `atol` is the default and states are less than a hundred
+        times it, in the units of q or p, it is in units of their size.
     """
 
     rtol: float = 1e-3
@@ -97,9 +102,15 @@ class RungeKutta(ExplicitStep):
         if self.rtol == 0 and self.atol == 0:
             raise ValueError("`rtol` and `atol` are both 0, which no step can meet: make one of them positive.")
 
-    @property
-    def absolute_tolerance(self) -> float:
-        return float(self.atol) if self.atol == type(self).atol else 0.0
+    def tolerance_of(self, system: HamiltonianSystem, y0: Array) -> float:
+        """Return `atol`, the default one in units of states so small that it would hide their errors."""
+        if self.atol != type(self).atol or not readable(y0):
+            return float(self.atol)
+        y = to_numpy(y0)
+        if (HIDES * np.abs(y.reshape(-1, 2, system.ndof)).max((0, 2), initial=0.0) > self.atol).all():
+            return float(self.atol)
+        size = smallest_size(system, y)
+        return self.atol * size if HIDES * size <= self.atol else float(self.atol)
 
 
 def weighted(weights: Any, K: list[Array]) -> Array:

@@ -87,7 +87,8 @@ class _Scipy(RungeKutta):
                 field = self.compiled(system, "compiled_field")
         with np.errstate(all="ignore"):
             longest = min(self.max_step, system.shortest_piece)
-            solver = self.solver(field, t0, y0, t1, longest, self.rtol, self.atol, first_step=first)
+            atol = self.tolerance_of(system, y0)
+            solver = self.solver(field, t0, y0, t1, longest, self.rtol, atol, first_step=first)
         return solver if np.isfinite(solver.f).all() and 0 < solver.h_abs < math.inf else None
 
     def _no_start(self, system: HamiltonianSystem, t0: float, y0: np.ndarray) -> str:

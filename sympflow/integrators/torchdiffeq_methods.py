@@ -374,8 +374,9 @@ class Adaptive(Watched, RungeKutta):
         options: dict[str, Any] = {"max_num_steps": most}
         if trace.system.shortest_piece < math.inf:
             options["max_step"] = trace.system.shortest_piece
+        atol = self.tolerance_of(trace.system, y)
         try:
-            odeint(trace, y, s, rtol=self.rtol, atol=self.atol, method=self.name, options=options)
+            odeint(trace, y, s, rtol=self.rtol, atol=atol, method=self.name, options=options)
         except AssertionError:
             if trace.n_tried < most:
                 raise
