@@ -1,4 +1,4 @@
-"""What learns a vector field from states and their derivatives, as published: MLP, HNN, D-HNN by Adam, and SINDy.
+"""Learners of a vector field from states and their derivatives, as published: MLP, HNN, D-HNN by Adam, and SINDy.
 
 References
 ----------

@@ -12,7 +12,7 @@ import numpy as np
 
 from sympflow.arrays import untransformed
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
-from sympflow.flow.records import Description, Refused, numbers_checksum, read
+from sympflow.flow.records import Description, numbers_checksum, read
 from sympflow.flow.tables import PrimedShape, Tables, free_numbers, substeps_of
 from sympflow.hamiltonian.domain import states_of
 from sympflow.hamiltonian.local_states import DRAWN, LocalStates
@@ -96,7 +96,7 @@ class PrimedKnown(KnownFlow):
         raise NotImplementedError
 
     def description_for(self, system: HamiltonianSystem) -> Description:
-        """What is known of the flow, for another size of its system."""
+        """Return the description of the flow for another size of its system."""
         domain = self.domain
         if isinstance(domain, LocalStates):
             domain = domain.of(system)
@@ -245,14 +245,21 @@ class FrozenNetwork(KnownFlow):
 
 
 def _read(path: Path) -> tuple[dict[str, Any], Mapping[str, np.ndarray]]:
-    """The record and the arrays of a file."""
+    """Return the record and the arrays of a file; a ValueError says that it is damaged."""
     from safetensors.numpy import load
 
-    content, _, record, altered = read(path)
-    arrays: Mapping[str, np.ndarray] = load(content)
-    if altered or numbers_checksum(arrays) != record["checksum"]:
-        raise Refused("its numbers are not those that were saved")
+    try:
+        content, _, record, altered = read(path)
+        arrays: Mapping[str, np.ndarray] = load(content)
+    except Exception as error:  # of whatever kind the reader raises
+        raise _damaged(path) from error
+    if altered or numbers_checksum(arrays) != record.get("checksum"):
+        raise _damaged(path)
     return record, arrays
+
+
+def _damaged(path: Path) -> ValueError:
+    return ValueError(f"`flow` {path.stem!r}, which ships with the package, is damaged: install the package again.")
 
 
 def _thawed(path: Path, system: HamiltonianSystem | None = None) -> Any:

@@ -156,7 +156,7 @@ def _check_characters(text: str) -> None:
 
 
 def _remedy(text: str) -> str | None:
-    """What to write in place of a text that is not Python."""
+    """The text to write in place of one that is not Python."""
     if found := re.search(r"(?<![\w.])(\d+\.?\d*)([A-Za-z(]\w*)", text):
         return f"{found[0]} lacks a sign: write {found[1]}*{found[2]}"
     if found := re.search(r"[²³⁴½¼√·×÷−π]", text):

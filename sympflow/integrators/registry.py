@@ -114,7 +114,7 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
 
 
 def _instead(name: str) -> str:
-    """What to take in place of a method that is not there."""
+    """The advice for the name of a method that is not there."""
     if name in ABSENT:
         return f"{ABSENT[name]} "
     close = difflib.get_close_matches(name, [*available(), *SYNONYMS], n=1)

@@ -55,7 +55,7 @@ SLOPES: dict[str, Callable[[Any], tuple[Any, Any]]] = {
     "logcosh": _logcosh,
     "swish": _swish,
 }
-"""Of each activation by its name, the function of a number a that returns σ(a) and σ'(a)."""
+"""The activations by name: functions of a number a that return σ(a) and σ'(a)."""
 
 
 def bent(name: str, orders: int) -> Program:

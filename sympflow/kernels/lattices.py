@@ -106,7 +106,7 @@ class Form:
 
     @property
     def distances(self) -> list[int]:
-        """Of the ends of bonds."""
+        """The ends of bonds, as distances in sites."""
         return [k for k, _ in self.terms if isinstance(k, int)]
 
     @property
@@ -249,7 +249,7 @@ class Pass:
         return Law(self.form, [*((kind, f) for kind in kinds for f in self._fields), *more], outputs)
 
     def _gradient(self, term: Any, kind: str, made: Any, get: dict[Key, Any], c: Sequence[Any]) -> dict[Key, Any]:
-        """What this pass takes of a term: ("flux", f), and ("kept", (term, k))."""
+        """The parts of a term that this pass takes: ("flux", f), and ("kept", (term, k))."""
         potential, fields = self._terms.get(term), self._fields
         if potential is None:
             return {("flux", f): made.number(0.0) for f in fields}
@@ -567,7 +567,7 @@ class _Scene:
         self.meet()
 
     def around(self, x: Value) -> None:
-        """What stands around a plane."""
+        """The surroundings of a plane."""
         code, (rows, row) = self.code, (self.numbers[name] for name in ("rows", "row"))
         if self.n_axes == 2:
             self._ghosts(x, self.reach)
@@ -766,7 +766,7 @@ class _Place:
         return found if found is not None else self.get(("array", key[1]) if key[0] == "number" else key)
 
     def _acting(self, axis: int, k: int, x: Value) -> Value:
-        """What a bond does, 0 where a free end leaves it out."""
+        """The effect of a bond, 0 where a free end leaves it out."""
         if self.scene.form.boundary[axis] != "free":
             return x
         return self.scene.within(x, self.inside(axis, k))
@@ -976,7 +976,7 @@ class Slabs:
 
 @dataclass(frozen=True)
 class _Piece:
-    """What stands in the context of a piece."""
+    """The context of a piece."""
 
     numbers: list[int]
     arrays: list[np.ndarray]

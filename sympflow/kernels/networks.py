@@ -212,7 +212,7 @@ class _NetworkRollouts(Rollouts):
         return columns[0], kinds
 
     def own_columns(self, table: Any, values: np.ndarray, width: int) -> Columns:
-        """Those of trajectories with their own |h|, and the sign of `table`."""
+        """The columns of trajectories with their own |h|, and the sign of `table`."""
         groups = -(-len(values) // width)
         times = np.concatenate([values[:, 0], np.repeat(values[-1:, 0], groups * width - len(values))])
         return self._columns(table, times.reshape(groups, width))

@@ -728,7 +728,7 @@ class PairForces:
 
     @cached_property
     def _forces(self) -> Callable[..., None]:
-        """Of (n, P, sites, numbers, q, F, G): adds F and G at P states to zeros."""
+        """The function of (n, P, sites, numbers, q, F, G) that adds F and G at P states to zeros."""
         code = Module(host().fused).function("forces", [INT, INT, *[POINTER] * 5])
         *_, F, G = code.arguments
         states = _States(self._law, code)
@@ -742,7 +742,7 @@ class PairForces:
 
     @cached_property
     def _products(self) -> Callable[..., None]:
-        """Of (n, P, sites, numbers, q, F, v, DF, DG, K): adds the derivatives of F and G along K directions."""
+        """The function of (n, P, sites, numbers, q, F, v, DF, DG, K) that adds the derivatives of F and G along K directions."""
         types = [INT, INT, *[POINTER] * 7, INT]
         code = Module(host().fused).function("products", types)
         *_, F, v, DF, DG, K = code.arguments

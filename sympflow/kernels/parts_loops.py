@@ -370,8 +370,8 @@ class PartsLoops:
         """The modes (N, 2d) of states."""
         y, parts, d = given(y), self.parts, self.parts.ndof
         if parts.diagonal:
-            C, inverse = np.diag(parts.C), np.diag(parts.inverse_C)
-            return np.concatenate([(y[..., :d] - parts.center) * inverse, y[..., d:] * C], axis=-1)
+            center, factors, _ = self._factors
+            return (y - center) * factors
         X = row_products(parts.inverse_C, y[..., :d] - parts.center)
         return np.concatenate([X, row_products(parts.C.T, y[..., d:])], axis=-1)
 
@@ -379,13 +379,22 @@ class PartsLoops:
         """The states of modes; those after no step are `y0`."""
         parts, d = self.parts, self.parts.ndof
         if parts.diagonal:
-            X, Y = out[..., :d] * np.diag(parts.C), out[..., d:] * np.diag(parts.inverse_C)
+            center, _, factors = self._factors
+            states = out * factors
+            states += center
         else:
             X, Y = row_products(parts.C, out[..., :d]), row_products(parts.inverse_C.T, out[..., d:])
-        states = np.concatenate([parts.center + X, Y], axis=-1)
+            states = np.concatenate([parts.center + X, Y], axis=-1)
         if save is not None and len(save) and save[0] <= 0:
             states[..., : np.searchsorted(save, 0, "right"), :] = y0
         return states
+
+    @cached_property
+    def _factors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The centre (2d,) of states, and the factors (2d,) to modes and back, of modes that are single coordinates."""
+        C, inverse = np.diag(self.parts.C), np.diag(self.parts.inverse_C)
+        center = np.concatenate([np.broadcast_to(self.parts.center, C.shape), np.zeros_like(C)])
+        return center, np.concatenate([inverse, C]), np.concatenate([C, inverse])
 
     def _of(self, sequence: Sequence[Map]) -> PartMaps:
         """The code of maps with what these have."""
@@ -484,7 +493,7 @@ class PartsLoops:
 
 
 class _Table(NamedTuple):
-    """What a run of a sequence of maps reads: the maps in groups, their numbers, and the columns of these."""
+    """The tables of a run of a sequence of maps: the maps in groups, their numbers, and the columns of these."""
 
     code: PartsCode
     maps: list[Map]

@@ -127,7 +127,7 @@ class Rollouts:
 
     @property
     def place(self) -> Callable[..., Memory] | None:
-        """What is made of states in memory; None where they are in registers."""
+        """The class of states in memory; None where they are in registers."""
         return None if self.room is None else self.memory
 
     def function(self, name: str, width: int) -> Callable[..., None]:

@@ -98,7 +98,7 @@ def _waited(meeting: Value, members: Value, stop: Value) -> None:
 
 @dataclass(frozen=True)
 class Member:
-    """What one thread of a team has.
+    """The view that one thread has of its team.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class SharedRollouts(Rollouts):
     terms: int
 
     def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
-        """What makes the members of a team: by the numbers where it meets and what ends it, the threads, and the most
+        """The maker of the members of a team: by the numbers where it meets and what ends it, the threads, and the most
         steps between two looks for an interrupt."""
         raise NotImplementedError
 

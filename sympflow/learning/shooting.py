@@ -546,7 +546,7 @@ class Fit:
         return self.problem.orbits(self.theta, self.states)
 
     def _seen(self, orbits: list[np.ndarray]) -> list[np.ndarray]:
-        """What is observed along orbits."""
+        """The observed values along orbits."""
         return [self.problem.model.observed(self.theta, orbit, None)[0] for orbit in orbits]
 
     @property

@@ -34,7 +34,7 @@ BESIDE = ("energy", "status")
 """Columns of tables of sympflow that are no states."""
 ORDERS = ("halves", "pairs")
 OBSERVED = {"qp": "p", "qv": "v", "q": "v"}
-"""What the rows of states are, with the letter of the second half; velocities of "q" are missing."""
+"""The meaning of the rows of states, with the letter of the second half; velocities of "q" are missing."""
 FEW = 8
 """Trajectories from which some are held out for good; of fewer each is left out in turn, or in one of three parts."""
 HELD_LEAST = PARTS = 3

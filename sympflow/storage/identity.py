@@ -49,7 +49,7 @@ class Identified(Protocol):
 
 @dataclass
 class Known:
-    """What a call is known by.
+    """The knowledge of a call.
 
     Attributes
     ----------
