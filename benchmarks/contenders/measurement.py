@@ -45,22 +45,11 @@ class Row:
     part: float
 
 
-@dataclass(frozen=True)
-class FirstCall:
-    """Seconds that the first call of a method took beyond the second: compiling, loading, building."""
-
-    label: str
-    package: str
-    trajectories: int
-    seconds: float
-
-
 @dataclass
 class Results:
     """Everything that the page says."""
 
     rows: list[Row] = field(default_factory=list)
-    first_calls: list[FirstCall] = field(default_factory=list)
     step_seconds: dict[str, float] = field(default_factory=dict)
     skipped: list[Skipped] = field(default_factory=list)
     unreached: list[tuple[str, str, int, float]] = field(default_factory=list)
@@ -73,7 +62,6 @@ class Results:
     def from_dict(cls, content: dict[str, Any]) -> Results:
         return cls(
             [Row(**row) for row in content["rows"]],
-            [FirstCall(**call) for call in content["first_calls"]],
             content["step_seconds"],
             [Skipped(**skip) for skip in content["skipped"]],
             [tuple(entry) for entry in content["unreached"]],
@@ -209,10 +197,7 @@ def measure(
     for contender in contenders:
         leader = steppers[contender.same_steps_as or contender.label, contender.trajectories]
         control = (leader.choices or [leader.guesses[max(leader.guesses)]])[0]
-        first, second = (seconds_of(partial(contender.run, control, PROBE * scene.t_end)) for _ in range(2))
-        results.first_calls.append(
-            FirstCall(contender.label, contender.package, contender.trajectories, first - second)
-        )
+        contender.run(control, PROBE * scene.t_end)  # what the first call compiles is no part of any time
         if contender.same_steps_as:
             check_agreement(scene, contender, leader, control)
 
