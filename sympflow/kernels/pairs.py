@@ -742,7 +742,7 @@ class PairForces:
 
     @cached_property
     def _products(self) -> Callable[..., None]:
-        """The function of (n, P, sites, numbers, q, F, v, DF, DG, K) that adds the derivatives of F and G along K directions."""
+        """The function of (n, P, sites, numbers, q, F, v, DF, DG, K) that adds derivatives of F and G along K directions."""
         types = [INT, INT, *[POINTER] * 7, INT]
         code = Module(host().fused).function("products", types)
         *_, F, v, DF, DG, K = code.arguments
