@@ -89,13 +89,8 @@ MUTATIONS = (
     ),
     Mutation(
         "compensated sum",
-        (
-            (
-                'left.append(op("sub", op("sub", total, value), corrected))',
-                'left.append(op("add", op("sub", total, value), corrected))',
-            ),
-        ),
-        ("test_compensated_sums_need_compiled_loops_and_lower_the_rounding",),
+        (('op("sub", op("sub", total, x), change)', 'op("add", op("sub", total, x), change)'),),
+        ("test_compensated_sums_need_compiled_loops_and_lower_the_rounding", "test_compensated_sums_lower_it"),
     ),
     Mutation(
         "reach of the clock",

@@ -178,6 +178,12 @@ def apply(name: str, *args: Any) -> Any:
     return function.torch(*args)
 
 
+def added(x: Any, change: Any, op: Callable[..., Any] = apply) -> tuple[Any, Any]:
+    """Return x + change, and its rounding error by Kahan's compensated sum: subtract it from the next change."""
+    total = op("add", x, change)
+    return total, op("sub", op("sub", total, x), change)
+
+
 def fma(x: Any, y: Any, z: Any) -> Any:
     """Return x·y + z, in compiled code rounded once."""
     return apply("fma", x, y, z)

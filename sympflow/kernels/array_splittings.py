@@ -14,7 +14,7 @@ import numpy as np
 
 from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, POINTER, Value
-from sympflow.compiler.functions import fma
+from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Numbers, Room
@@ -348,8 +348,8 @@ class ArrayCode(SplittingCode):
         corrected = -room.load(i, place)
         for factor, change in changes:
             corrected = fma(factor, change, corrected)
-        total = old + corrected
-        room.store((total - old) - corrected, i, place)
+        total, error = added(old, corrected)
+        room.store(error, i, place)
         room.store(total, i, x)
 
     def _letters(self, given: Sequence[Any]) -> Sequence[Any]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from sympflow.compiler.arrange import ALWAYS, Arrangement
 from sympflow.compiler.control import INT, Code, Sweep, Type, Value
-from sympflow.compiler.functions import FUNCTIONS, times
+from sympflow.compiler.functions import FUNCTIONS, added, times
 from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
@@ -351,12 +351,9 @@ class Pass:
         x = [get[vector, f] for f in self._fields]
         if not self.form.compensated:
             return [made.written(a + b) for a, b in zip(x, changes, strict=True)], []
-        sums, left, op = [], [], made.operation
-        for f, (value, change) in enumerate(zip(map(made.node, x), changes, strict=True)):
-            corrected = made.written(change - get[f"{vector}_error", f])
-            sums.append(op("add", value, corrected))
-            left.append(op("sub", op("sub", sums[-1], value), corrected))
-        return sums, left
+        corrected = [made.written(change - get[f"{vector}_error", f]) for f, change in enumerate(changes)]
+        pairs = [added(value, c, made.operation) for value, c in zip(map(made.node, x), corrected, strict=True)]
+        return [total for total, _ in pairs], [error for _, error in pairs]
 
 
 # the code of a stage ------------------------------------------------------------------------------------------------

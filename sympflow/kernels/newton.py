@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Type, Value
-from sympflow.compiler.functions import fma, where
+from sympflow.compiler.functions import added, fma, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
 from sympflow.kernels.one_steps import Lettered, OneStep, add_terms, recorded
@@ -102,10 +102,10 @@ class _InRegisters(NewtonCode):
         K, taken, lost = self._iterated(code, y, column)
         changes = [self._changes(K[m::n]) for m in range(n)]
         if self._compensated:
-            changes = [change - error for change, error in zip(changes, errors, strict=True)]
-        state = [a + b for a, b in zip(y, changes, strict=True)]
-        if self._compensated:
-            errors = [(new - old) - change for new, old, change in zip(state, y, changes, strict=True)]
+            sums = [added(old, change - error) for old, change, error in zip(y, changes, errors, strict=True)]
+            state, errors = [total for total, _ in sums], [error for _, error in sums]
+        else:
+            state = [old + change for old, change in zip(y, changes, strict=True)]
         if self._damped:
             decay = column[self.size - d :]
             state = [*state[:d], *(p * e for p, e in zip(state[d:], decay, strict=True))]
@@ -273,10 +273,10 @@ class _InMemory(NewtonCode):
         code, n = room.code, self.n_out
         change, old = self._changes([code.load(K, m + i * n) for i in range(self.stages)]), room.load(m)
         if self._compensated:
-            change = change - room.load(m + n)
-        new = old + change
-        if self._compensated:
-            room.store((new - old) - change, m + n)
+            new, error = added(old, change - room.load(m + n))
+            room.store(error, m + n)
+        else:
+            new = old + change
         room.store(where(small, new, float("nan")), m)
 
     def _iterated(self, *arguments: Value) -> Value:

@@ -19,7 +19,7 @@ import sympy as sp
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
-from sympflow.compiler.functions import apply
+from sympflow.compiler.functions import added, apply
 from sympflow.compiler.machine import address, host
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.recorded import evaluator
@@ -470,9 +470,8 @@ class PairStages:
             code.store(code.fma(factor, x, value), state, at)
             return
         error = size * (2 * self.dim) + at
-        corrected = factor * x - code.load(state, error, _LANES)
-        total = value + corrected
-        code.store((total - value) - corrected, state, error)
+        total, left = added(value, factor * x - code.load(state, error, _LANES))
+        code.store(left, state, error)
         code.store(total, state, at)
 
     @contextmanager
@@ -742,7 +741,7 @@ class PairForces:
 
     @cached_property
     def _products(self) -> Callable[..., None]:
-        """The function of (n, P, sites, numbers, q, F, v, DF, DG, K) that adds derivatives of F and G along K directions."""
+        """The function of (n, P, sites, numbers, q, F, v, DF, DG, K) that adds derivatives along K directions."""
         types = [INT, INT, *[POINTER] * 7, INT]
         code = Module(host().fused).function("products", types)
         *_, F, v, DF, DG, K = code.arguments

@@ -16,7 +16,7 @@ import numpy as np
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Type, Value
-from sympflow.compiler.functions import FUNCTIONS, times
+from sympflow.compiler.functions import FUNCTIONS, added, times
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
@@ -242,13 +242,10 @@ class Shape:
         self, x: Sequence[Any], changes: Sequence[Any], errors: Sequence[Any]
     ) -> tuple[list[Any], list[Any]]:
         """x + change by Kahan's compensated sum, and the new errors."""
-        op, sums, left = self.made.operation, [], []
-        for value, change, error in zip(map(self.made.node, x), changes, map(self.made.node, errors), strict=True):
-            corrected = op("sub", change, error)
-            total = op("add", value, corrected)
-            sums.append(total)
-            left.append(op("sub", op("sub", total, value), corrected))
-        return sums, left
+        op, node = self.made.operation, self.made.node
+        pairs = zip(map(node, x), changes, map(node, errors), strict=True)
+        sums, left = zip(*(added(value, op("sub", change, error), op) for value, change, error in pairs), strict=True)
+        return list(sums), list(left)
 
 
 class NearShape(Shape):
