@@ -9,9 +9,9 @@ containers of these. Most answers are those of expressions in a text, one a line
 compared by their bits, NaN being equal to NaN. Differences in results are told apart from those in words, which are
 texts with blanks in them. Times, dates, addresses and folders are left out.
 
-`--only PATTERN` runs the cases whose names match a regular expression. Compiled loops are kept in a folder of their
-own, unless SYMPFLOW_CACHE_DIR names another. Loops that were compiled in this process may differ by a rounding from the
-same loops that were loaded from there; so a run in which any were compiled is made once more, in a new process.
+`--only PATTERN` runs the cases whose names match a regular expression. `--rounding R` takes arrays for equal whose
+numbers differ by at most R of the largest one, where code is compiled in another way. Compiled code is kept in a folder
+of its own, unless SYMPFLOW_CACHE_DIR names another.
 """
 
 # ruff: noqa: F401  (some names are used by the expressions in texts only)
@@ -1115,29 +1115,9 @@ def public_names() -> Any:
 # recording and comparing ------------------------------------------------------------------------------------------
 
 
-def load_loops() -> None:
-    """Load what most cases share of the compiled loops, always in one order, on which their last bits depend.
-
-    Loops of one module may each have a copy of a function that they call, compiled with other choices; of all that are
-    loaded the first is taken.
-    """
-    for one in (S.henon_heiles, S.pendulum, S.kepler, S.oscillator):
-        for method in ("verlet", "omelyan4", "implicit_midpoint"):
-            run = partial(tried, solve, one, method, (0.0, 2.5 * one.dt), backend="compiled")
-            for given in (
-                {},
-                {"t_eval": [0.7 * one.dt]},
-                {"y0": states(one)},
-                {"y0": states(one), "t_eval": [one.dt / 3]},
-            ):
-                run(**given)
-
-
 def run_cases(names: list[str]) -> dict[str, dict[str, Leaf]]:
     """The leaves of the cases."""
     found, group, since = {}, "", time.perf_counter()
-    load_loops()
-    print(f"  loops loaded in {time.perf_counter() - since:.0f} s", file=sys.stderr, flush=True)
     for name in names:
         if name.partition(":")[0] != group:
             group = name.partition(":")[0]
@@ -1157,12 +1137,16 @@ def bits(array: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(array), np.array(nan, array.dtype), array).view(f"i{array.dtype.itemsize}")
 
 
-def difference(old: np.ndarray, new: np.ndarray) -> str:
-    """Say how two arrays differ; "" if they do not."""
+def difference(old: np.ndarray, new: np.ndarray, rounding: float) -> str:
+    """Say how two arrays differ; "" if they do not, or by rounding only."""
     if old.dtype != new.dtype or old.shape != new.shape:
         return f"{old.dtype} of shape {old.shape} became {new.dtype} of shape {new.shape}"
     old, new = np.atleast_1d(old), np.atleast_1d(new)
     count = np.count_nonzero(bits(old) != bits(new))
+    if count and rounding and old.dtype.kind in "fc":
+        size = np.abs(old[np.isfinite(old)]).max(initial=0.0)
+        same = np.isclose(old, new, rtol=0.0, atol=rounding * size, equal_nan=True)
+        count = np.count_nonzero(~same)
     if not count or old.size == 1:
         return f"{old[0]!r} became {new[0]!r}" if count else ""
     with np.errstate(all="ignore"):
@@ -1179,7 +1163,7 @@ def raising(found: dict[str, Leaf]) -> dict[str, str]:
     return {start: f"{bytes(found[start + 'raises']).decode()}: {found[start + 'says']!s}" for start in starts}
 
 
-def differences(old: dict[str, Leaf], new: dict[str, Leaf]) -> tuple[list[str], list[str]]:
+def differences(old: dict[str, Leaf], new: dict[str, Leaf], rounding: float) -> tuple[list[str], list[str]]:
     """The differences between two sets of leaves: in results, and in words."""
     results, words = [], []
     for here, there, text in ((new, old, "raises"), (old, new, "raised")):
@@ -1196,7 +1180,7 @@ def differences(old: dict[str, Leaf], new: dict[str, Leaf]) -> tuple[list[str], 
             section = words if isinstance(there, str) else results
             section.append(f"{path}: {'is new' if a is None else 'is missing'}, {shown}")
         elif isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-            if text := difference(a, b):
+            if text := difference(a, b, rounding):
                 results.append(f"{path}: {text}")
         elif isinstance(a, str) and isinstance(b, str):
             if a != b:
@@ -1208,14 +1192,14 @@ def differences(old: dict[str, Leaf], new: dict[str, Leaf]) -> tuple[list[str], 
     return results, words
 
 
-def compare_cases(then: dict[str, dict[str, Leaf]], now: dict[str, dict[str, Leaf]]) -> bool:
+def compare_cases(then: dict[str, dict[str, Leaf]], now: dict[str, dict[str, Leaf]], rounding: float) -> bool:
     """Print all differences, in two sections; True if there is none."""
     found: dict[str, dict[str, list[str]]] = {"results": {}, "words": {}}
     for name in dict.fromkeys((*then, *now)):
         if name not in then or name not in now:
             found["results"][name] = ["is a new case" if name in now else "is a case no more"]
             continue
-        for section, texts in zip(found.values(), differences(then[name], now[name]), strict=True):
+        for section, texts in zip(found.values(), differences(then[name], now[name], rounding), strict=True):
             if texts:
                 section[name] = texts
     for title, section in found.items():
@@ -1226,17 +1210,13 @@ def compare_cases(then: dict[str, dict[str, Leaf]], now: dict[str, dict[str, Lea
     return not any(found.values())
 
 
-def kept_loops() -> set[Path]:
-    """The files in which compiled loops are kept."""
-    return {path for path in Path(os.environ["SYMPFLOW_CACHE_DIR"]).rglob("*.nb?")}
-
-
 def main() -> int:
     """Record or compare; the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("action", choices=("record", "compare"), nargs="?")
     parser.add_argument("file", type=Path, nargs="?")
     parser.add_argument("--only", metavar="PATTERN", default="", help="run the cases whose names match")
+    parser.add_argument("--rounding", type=float, default=0.0, help="part of the largest number that may differ")
     parser.add_argument("--list", action="store_true", help="list the cases")
     given = parser.parse_args()
     names = [name for name in CASES if re.search(given.only, name)]
@@ -1253,18 +1233,13 @@ def main() -> int:
             recorded = pickle.load(file)
         KEPT.update(recorded["pickles"])
         print(f"recorded: {recorded['package']}", flush=True)
-    loops = kept_loops()
     now = run_cases(names)
-    if kept_loops() != loops and "UNCHANGED_AGAIN" not in os.environ:
-        print("Some loops had to be compiled: once more, with all of them loaded.", flush=True)
-        os.environ["UNCHANGED_AGAIN"] = "1"
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
     if given.action == "record":
         with gzip.open(given.file, "wb", compresslevel=4) as file:
             pickle.dump({"package": sympflow.__file__, "cases": now, "pickles": KEPT}, file)
         return 0
     then = {name: found for name, found in recorded["cases"].items() if re.search(given.only, name)}
-    return 0 if compare_cases(then, now) else 1
+    return 0 if compare_cases(then, now, given.rounding) else 1
 
 
 if __name__ == "__main__":
