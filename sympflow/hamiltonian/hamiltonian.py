@@ -13,6 +13,7 @@ from sympflow.arrays import Array, concatenate, is_tensor, per_state
 from sympflow.hamiltonian.times import checked_time
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.formulas import TracedHamiltonian
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.poles import Poles
@@ -561,6 +562,16 @@ class Hamiltonian:
     def local(self) -> LocalHamiltonian | None:
         """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         return self._definition if self._definition.loops else None
+
+    @property
+    def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
+        """What programs are recorded of: the symbolic definition, or functions that were traced; else None."""
+        return self.symbols if self.symbols is not None else self._definition.form
+
+    @property
+    def untraced(self) -> str:
+        """Why functions of Python could not be traced, a clause; "" if they were, or there are none."""
+        return "" if self.form is not None else self._definition.untraced
 
     @property
     def written(self) -> SymbolicHamiltonian | None:

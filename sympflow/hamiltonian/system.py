@@ -621,6 +621,7 @@ class HamiltonianSystem(Hamiltonian):
         self.domain = None if domain is None else domain_of(domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
+        self._definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
 
     @property
     def dt(self) -> float:
@@ -761,6 +762,7 @@ class HamiltonianSystem(Hamiltonian):
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
         if kind in self._tested:
+            self._definition.check_unchanged(like)
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 

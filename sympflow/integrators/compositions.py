@@ -228,7 +228,7 @@ class KineticPotential(Composition):
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         y = to_numpy(y)
         n = y.shape[-1]
-        if y.dtype == np.float64 and self.system.symbols is not None and y.size:
+        if y.dtype == np.float64 and self.system.form is not None and y.size:
             from sympflow.kernels.stages import step_table
             from sympflow.kernels.tangents import step_tangents
 

@@ -26,7 +26,7 @@ from sympflow.compiler.program import Program, Traced, derivatives, gradient, re
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.hamiltonian.local import LocalHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.recorded import evaluator
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room
 from sympflow.kernels.teams import Member, SharedRollouts, meet

@@ -19,14 +19,14 @@ from sympflow.compiler.control import Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, times
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.recorded import evaluator
-from sympflow.kernels.approximations import OnInterval, Ranges, on_interval
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
+    from sympflow.kernels.approximations import OnInterval, Ranges
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.kernels.stage_times import Driving
 
@@ -114,6 +114,8 @@ class Splitting:
 
     def _within_range(self, terms: int) -> Arranged | WithinRange:
         """The stage as a polynomial in its range, if there is one."""
+        from sympflow.kernels.approximations import on_interval
+
         near = on_interval(_of_kick(self.symbols, terms), self.symbols.q[0], *self.ranges[0])
         if near is None:
             return self._arranged(terms)
