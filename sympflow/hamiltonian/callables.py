@@ -200,7 +200,7 @@ def _alike(found: np.ndarray, expected: np.ndarray) -> bool:
     if not (finite == np.isfinite(found)).all():
         return False
     size = np.abs(expected[finite]).max(initial=0.0)
-    return bool((np.abs(found - expected)[finite] <= CLOSE * size).all())
+    return bool((np.abs(found[finite] - expected[finite]) <= CLOSE * size).all())
 
 
 class CallableHamiltonian(Functions):
@@ -236,7 +236,8 @@ class CallableHamiltonian(Functions):
     @classmethod
     def at_time(cls, driven: DrivenCallables, functions: Sequence[Any]) -> CallableHamiltonian:
         """The functions of a driven system at one time, which are not traced again."""
-        now = cls(driven.ndof, *functions, driven.given)
+        now = cls(driven.ndof, *functions)
+        now.given = driven.given
         now.form, now.library = None, driven.library  # type: ignore[method-assign]
         return now
 
@@ -276,7 +277,7 @@ class CallableHamiltonian(Functions):
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
         if self.form is not None and self.library == "numpy" and (is_tensor(like) or self._gradient is None):
             like = np.empty(0)
-        if self.differentiates_itself and not is_tensor(like) and self.library != "numpy":
+        if self.differentiates_itself and not is_tensor(like) and (self.form is None or self.library == "torch"):
             import torch
 
             like = torch.from_numpy(np.empty(0, like.dtype))
@@ -331,19 +332,14 @@ class CallableHamiltonian(Functions):
             return form.value(x)
         if self._gradient is not None or (self.library == "numpy" and not is_tensor(x)):
             return _checked(self._protected(f, name, x), x, name, ())
-        return _with_torch(f, x, name, ())
+        return _with_torch(f, x, name, (), self.untraced)
 
     def _derived(self, name: str, make: Callable[..., Any], f: Any, x: Array, tail: tuple[int, ...]) -> Array:
         """A derivative of V or H at x: by the program, or of a function of tensors by torch."""
         form = self._exact(x)
         if form is not None:
             return getattr(form, name)(x)  # type: ignore[no-any-return]
-        if self.library == "numpy":
-            raise TypeError(
-                f"`{self._name}` has no derivatives, for it could not be traced: {self.untraced}. Change it, or write "
-                "it with torch functions, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
-            )
-        return _with_torch(make(f, self._name), x, self._name, tail)
+        return _with_torch(make(f, self._name), x, self._name, tail, self.untraced)
 
     def hamiltonian(self, y: Array) -> Array:
         return self._value(self._H, y, "hamiltonian")
@@ -482,7 +478,9 @@ def _jacobian(f: Callable[[Array], Array], x: Array) -> Array:
     return torch.stack([jvp(f, x, e)[1] for e in _basis(x)], dim=-1)
 
 
-def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...]) -> Array:
+def _with_torch(
+    f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], untraced: str = ""
+) -> Array:
     """f(x) for a function written with torch; NumPy arrays go through tensors that share their memory."""
     import torch
 
@@ -493,9 +491,10 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
     except (TypeError, RuntimeError, AttributeError, IndexError) as error:
         if isinstance(error, RecursionError) or str(error).startswith(f"`{name}` must"):
             raise
+        traced = f", and could not be traced, for {untraced}" if untraced else ""
         raise TypeError(
-            f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}). Write it with torch functions of "
-            "(..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
+            f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}){traced}. Write it with NumPy's or "
+            "torch's functions of (..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
         ) from error
     if tensor._version != version:
         raise ValueError(f"`{name}` writes into its argument, the state of the run: let it work on a copy, q.clone().")
@@ -555,8 +554,9 @@ class DrivenCallables(Functions):
         if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector, "t, ")
             self.numba_functions = (potential, gradient, hessian_vector)
+        check_flag("check", check)
         self.ndof, self.given, self.separable = ndof, bool(check), potential is not None
-        CallableHamiltonian(ndof, *self._functions, check)  # which refuses what does not fit
+        self._at(0.0)  # which refuses what does not fit
 
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]
