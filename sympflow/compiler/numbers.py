@@ -88,7 +88,10 @@ class Number:
     def __bool__(self) -> bool:
         raise TypeError("a number that is traced has no value yet: write where(condition, a, b) in place of a branch.")
 
-    __float__ = __int__ = __index__ = __bool__
+    def __float__(self) -> float:
+        raise TypeError("a number that is traced has no value yet: write np.cos for math.cos, and no float().")
+
+    __int__ = __index__ = __float__
 
 
 _OF_NUMPY = {

@@ -67,11 +67,11 @@ class TracedArray(np.ndarray):
 
     __int__ = __complex__ = item = tolist = __index__  # type: ignore[assignment]
 
-    def __array_ufunc__(self, function: Any, method: str, *args: Any, out: Any = None, **options: Any) -> Any:
-        name, given = function.__name__, [_plain(x) for x in args]
+    def __array_ufunc__(self, ufunc: Any, method: Any, *inputs: Any, out: Any = None, **kwargs: Any) -> Any:
+        function, name, given = ufunc, ufunc.__name__, [_plain(x) for x in inputs]
         if out is not None and any(_plain(x) is x and method != "__call__" for x in out):
             raise Untraceable(f"it calls {name} with `out`")
-        options = {key: _plain(x) for key, x in options.items() if key != "dtype"}
+        options = {key: _plain(x) for key, x in kwargs.items() if key != "dtype"}
         if name in NATIVE or function.types == ["O" * function.nin + "->O"]:
             called = function
         elif name in ELEMENTS:
@@ -160,7 +160,7 @@ class TracedTensor(TracedArray):
     """The same with the names that torch has: of the properties and methods of tensors."""
 
     @property
-    def dtype(self) -> Any:  # type: ignore[override]
+    def dtype(self) -> Any:
         return _torch().float64
 
     @property
@@ -217,7 +217,7 @@ def _array(x: Any, kind: type[TracedArray] = TracedArray) -> TracedArray:
         made = np.empty((), dtype=object)
         made[()] = x
         return np.ndarray.view(made, kind)
-    return np.ndarray.view(x if np.ndarray.dtype.__get__(x) == object else x.astype(object), kind)
+    return np.ndarray.view(x if np.ndarray.dtype.__get__(x).kind == "O" else x.astype(object), kind)
 
 
 def _wrapped(x: Any, kind: type[TracedArray]) -> Any:
@@ -350,7 +350,7 @@ def _where(condition: Any, *choices: Any) -> Any:
     return np.frompyfunc(_choose, 3, 1)(*map(_objects, (condition, *choices)))
 
 
-def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False, **_: Any) -> Any:  # noqa: A002
+def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False, **_: Any) -> Any:
     if ord in (None, 2, 2.0, "fro"):
         if ord == 2 and axis is None and np.ndim(x) > 1:
             raise Untraceable("numpy.linalg.norm of a matrix has no rule of this order")
@@ -479,16 +479,19 @@ ARRAYS: dict[str, Callable[..., Any]] = {
     "det": _det, "inv": _inv, "solve": _solve, "zeros_like": _like(0.0), "ones_like": _like(1.0),
     "full_like": lambda x, value, **_: np.full(np.shape(x), value).astype(object), "empty_like": _like(0.0),
     "sinc": lambda x: np.frompyfunc(lambda y: _sinc(math.pi * y), 1, 1)(_objects(x)),
-    "real": lambda x: x, "any": _reduced("logical_or"), "all": _reduced("logical_and"), "vecdot": lambda x, y, **_: (x * y).sum(-1),
+    "real": lambda x: x,
+    "any": _reduced("logical_or"), "all": _reduced("logical_and"), "vecdot": lambda x, y, **_: (x * y).sum(-1),
     "linalg_vecdot": lambda x, y, **_: (x * y).sum(-1), "iscomplexobj": lambda x: False,
 }  # fmt: skip
-UNCHANGED = set(
-    """sum prod cumsum cumprod diff roll dot vdot inner outer tensordot einsum matmul trace transpose swapaxes moveaxis
-    matrix_transpose permute_dims rollaxis reshape ravel squeeze expand_dims concatenate concat stack hstack vstack
-    dstack column_stack block split array_split hsplit vsplit dsplit take take_along_axis repeat tile flip fliplr flipud
-    rot90 broadcast_to broadcast_arrays atleast_1d atleast_2d atleast_3d diagonal diag diagflat tril triu kron cross
-    average ndim shape size copy delete insert append pad polyval trapezoid ediff1d meshgrid convolve correlate
-    multi_dot matrix_power gradient vander unstack""".split()
+UNCHANGED = frozenset(  # noqa: SIM905
+    """
+    append array_split atleast_1d atleast_2d atleast_3d average block broadcast_arrays broadcast_to column_stack
+    concat concatenate convolve copy correlate cross cumprod cumsum delete diag diagflat diagonal diff dot
+    dsplit dstack ediff1d einsum expand_dims flip fliplr flipud gradient hsplit hstack inner insert kron matmul
+    matrix_power matrix_transpose meshgrid moveaxis multi_dot ndim outer pad permute_dims polyval prod ravel
+    repeat reshape roll rollaxis rot90 shape size split squeeze stack sum swapaxes take take_along_axis
+    tensordot tile trace transpose trapezoid tril triu unstack vander vdot vsplit vstack
+    """.split()
 )
 """NumPy's functions whose own code takes arrays of objects."""
 
@@ -578,12 +581,12 @@ TORCH: dict[str, Callable[..., Any]] = {
         x if axis is not None else _objects(x).reshape(-1), ord, axis, keepdims),
     "sum": _summed, "prod": lambda x, axis=None, keepdims=False, **_: np.prod(x, axis=axis, keepdims=keepdims),
     "mean": _mean, "var": lambda x, axis=None, correction=1, **_: _variance(x, axis, correction),
-    "diff": lambda x, n=1, axis=-1, **_: np.diff(x, n, axis), "cumsum": lambda x, axis: np.cumsum(x, axis),
+    "diff": lambda x, n=1, axis=-1, **_: np.diff(x, n, axis), "cumsum": np.cumsum,
     "logsumexp": lambda x, axis, keepdims=False: np.frompyfunc(_logaddexp, 2, 1).reduce(
         _objects(x), axis=axis, keepdims=keepdims), "softmax": _softmax,
     "max": _extremes("maximum"), "min": _extremes("minimum"), "amax": _extreme("maximum"), "amin": _extreme("minimum"),
     "maximum": lambda x, y: _each("maximum", x, y), "minimum": lambda x, y: _each("minimum", x, y),
-    "clamp": lambda x, min=None, max=None: _clip(x, min, max), "clamp_min": lambda x, low: _clip(x, low),
+    "clamp": lambda x, min=None, max=None: _clip(x, min, max), "clamp_min": _clip,
     "clamp_max": lambda x, high: _clip(x, None, high), "fmod": lambda x, y: _each("fmod", x, y),
     "remainder": lambda x, y: _each("remainder", x, y), "mod": lambda x, y: _each("remainder", x, y),
     "where": _where, "det": _det, "linalg_det": _det, "linalg_inv": _inv, "inverse": _inv, "linalg_solve": _solve,
@@ -591,7 +594,8 @@ TORCH: dict[str, Callable[..., Any]] = {
     "outer": np.outer, "ger": np.outer, "tensordot": lambda x, y, dims=2, axis=None: np.tensordot(
         x, y, dims if axis is None else axis), "trace": np.trace, "vecdot": lambda x, y, axis=-1: (x * y).sum(axis),
     "linalg_vecdot": lambda x, y, axis=-1: (x * y).sum(axis), "cross": lambda x, y, axis=-1: np.cross(x, y, axis=axis),
-    "linalg_cross": lambda x, y, axis=-1: np.cross(x, y, axis=axis), "addcmul": lambda x, y, z, value=1: x + value * y * z,
+    "linalg_cross": lambda x, y, axis=-1: np.cross(x, y, axis=axis), 
+    "addcmul": lambda x, y, z, value=1: x + value * y * z,
     "unbind": lambda x, axis=0: tuple(np.moveaxis(x, axis, 0)), "split": _chunks,
     "chunk": lambda x, n, axis=0: _chunks(x, -(-np.shape(x)[axis] // n), axis), "unsqueeze": np.expand_dims,
     "squeeze": lambda x, axis=None: np.squeeze(x, axis) if axis is None or np.shape(x)[axis] == 1 else x,
@@ -668,7 +672,7 @@ def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], to
     inputs, args = [], []
     for each in names:
         numbers = [recording.input(name) for name in ([each] if isinstance(each, str) else each)]
-        array = np.empty(len(numbers), dtype=object)
+        array: np.ndarray = np.empty(len(numbers), dtype=object)
         array[:] = numbers
         array = array[0:1].reshape(()) if isinstance(each, str) else array
         array.flags.writeable = False
@@ -684,7 +688,8 @@ def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], to
         raise Untraceable("it is too deep to be traced") from error
     except Exception as error:  # whatever a user's function raises
         shown = str(error).splitlines()[0] if str(error) else ""
-        reason = BRANCH if "is traced has no value yet" in shown else f"{type(error).__name__}: {shown[:160]}"
+        known = {"in place of a branch": BRANCH, "no float()": VALUE}
+        reason = next((r for part, r in known.items() if part in shown), f"{type(error).__name__}: {shown[:160]}")
         raise Untraceable(reason) from error
     if value.shape != () or not isinstance(value[()], Traced | float | int | np.number):
         raise Untraceable(f"it returns an array of shape {value.shape} for one state")

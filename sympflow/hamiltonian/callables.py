@@ -20,7 +20,6 @@ from sympflow.hamiltonian.formulas import TracedHamiltonian
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.times import probe_times
 
-
 MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays
 TRIED = 6  # states at which a traced function is compared with itself
 CLOSE = 1e-9  # of the largest value
@@ -43,6 +42,10 @@ class Functions(Definition):
     untraced: str = ""
     _scene: tuple[Any, ...] = (None, None, None, (0.0, 1.0))
     _functions: tuple[Any, Any, Any, Any]
+
+    @property
+    def given_functions(self) -> bool:  # type: ignore[override]
+        return self.numba_functions is None
 
     def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
         self._scene = y0, domain, inverse_mass, t_span
@@ -67,7 +70,7 @@ class Functions(Definition):
     @property
     def _given_function(self) -> Callable[..., Any]:
         V, H, *_ = self._functions
-        return V if self.separable else H  # type: ignore[no-any-return]
+        return V if self.separable else H
 
     def _traced(self) -> TracedHamiltonian:
         """The program, compared with the functions."""
@@ -91,15 +94,17 @@ class Functions(Definition):
 
     def _values(self, states: np.ndarray, times: Sequence[float]) -> np.ndarray:
         """The function's own values at states, NaN where it fails; finds out which library it is written for."""
-        for library in ("numpy", *(("torch",) if "torch" in sys.modules else ())):
-            self.library, failure, found = library, "", []
+        for name in ("numpy", *(("torch",) if "torch" in sys.modules else ())):
+            self.library, failure, found = name, "", []
             for y, t in zip(states, times, strict=True):
                 try:
                     value = self._single(self._given_function, y, t)
                 except Exception as error:  # whatever a user's function raises
-                    failure = failure or f"{type(error).__name__}: {str(error).splitlines()[0][:160] if str(error) else ''}"
+                    failure = (
+                        failure or f"{type(error).__name__}: {str(error).splitlines()[0][:160] if str(error) else ''}"
+                    )
                     value = np.nan
-                if is_tensor(value) != (library == "torch"):
+                if is_tensor(value) != (name == "torch"):
                     failure, value = failure or "its result is none of NumPy's", np.nan
                 try:
                     found.append(float(value))
@@ -118,7 +123,9 @@ class Functions(Definition):
             import torch
 
             with torch.no_grad():
-                return function(*((torch.tensor(t, dtype=torch.float64),) if self.timed else ()), *map(torch.tensor, given))
+                return function(
+                    *((torch.tensor(t, dtype=torch.float64),) if self.timed else ()), *map(torch.tensor, given)
+                )
         for x in given:
             x.flags.writeable = False
         return function(*((t,) if self.timed else ()), *given)
@@ -131,7 +138,8 @@ class Functions(Definition):
                 continue
             exact = getattr(form, name)(q, *more, *((np.array(times),) if self.timed else ()))
             try:
-                rows = [self._single(function, x, t, *(v[i] for v in more)) for i, (x, t) in enumerate(zip(q, times))]
+                given = zip(q, times, *more, strict=True)
+                rows = [self._single(function, x, t, *v) for x, t, *v in given]
                 found = np.stack([to_numpy(row) if is_tensor(row) else np.asarray(row, dtype=float) for row in rows])
             except Exception as error:  # whatever a user's function raises
                 raise Untraceable(f"`{name}` fails where `{self._name}` does not ({error})") from error
@@ -191,7 +199,11 @@ class Functions(Definition):
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the program, which is traced again."""
-        return {name: value for name, value in vars(self).items() if name not in ("form", "takes_tensors", "_follows_tensors")}
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if name not in ("form", "takes_tensors", "_follows_tensors")
+        }
 
 
 def _alike(found: np.ndarray, expected: np.ndarray) -> bool:
@@ -208,6 +220,8 @@ class CallableHamiltonian(Functions):
 
     time: float | None = None
     """The time at which those of a driven system are taken, for messages."""
+    traced: bool = False
+    """True of those at a time, of a driven system that was traced."""
 
     def __init__(
         self,
@@ -238,7 +252,7 @@ class CallableHamiltonian(Functions):
         """The functions of a driven system at one time, which are not traced again."""
         now = cls(driven.ndof, *functions)
         now.given = driven.given
-        now.form, now.library = None, driven.library  # type: ignore[method-assign]
+        now.form, now.library = None, driven.library
         return now
 
     def take_numba(self, potential: Any, gradient: Any, hessian_vector: Any | None) -> None:
@@ -275,13 +289,14 @@ class CallableHamiltonian(Functions):
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
-        if self.form is not None and self.library == "numpy" and (is_tensor(like) or self._gradient is None):
+        traced = self.traced or self.form is not None
+        if traced and self.library == "numpy" and (is_tensor(like) or self._gradient is None):
             like = np.empty(0)
-        if self.differentiates_itself and not is_tensor(like) and (self.form is None or self.library == "torch"):
+        if self.differentiates_itself and not is_tensor(like) and not (traced and self.library == "numpy"):
             import torch
 
             like = torch.from_numpy(np.empty(0, like.dtype))
-        exact = self.form is not None and self._gradient is None
+        exact = traced and self._gradient is None
         if not self.separable:
             names = "hamiltonian", "gradient", "[q, p]"
             gradient = None if exact else self.gradient
@@ -338,7 +353,7 @@ class CallableHamiltonian(Functions):
         """A derivative of V or H at x: by the program, or of a function of tensors by torch."""
         form = self._exact(x)
         if form is not None:
-            return getattr(form, name)(x)  # type: ignore[no-any-return]
+            return getattr(form, name)(x)
         return _with_torch(make(f, self._name), x, self._name, tail, self.untraced)
 
     def hamiltonian(self, y: Array) -> Array:
@@ -478,9 +493,7 @@ def _jacobian(f: Callable[[Array], Array], x: Array) -> Array:
     return torch.stack([jvp(f, x, e)[1] for e in _basis(x)], dim=-1)
 
 
-def _with_torch(
-    f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], untraced: str = ""
-) -> Array:
+def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], untraced: str = "") -> Array:
     """f(x) for a function written with torch; NumPy arrays go through tensors that share their memory."""
     import torch
 
@@ -584,7 +597,7 @@ class DrivenCallables(Functions):
         """A function of `CallableHamiltonian` of states (..., k), each at its time."""
         form, of_form = self._exact(states[0]), _OF_FORM.get(name)
         if form is not None and (of_form or is_tensor(states[0])):
-            return getattr(form, of_form or "value")(*states, t)  # type: ignore[no-any-return]
+            return getattr(form, of_form or "value")(*states, t)
         if not getattr(t, "ndim", 0):
             return getattr(self._at(t), name)(*states)
         flat = [x.reshape(-1, x.shape[-1]) for x in states]
@@ -611,7 +624,7 @@ class DrivenCallables(Functions):
         """Test them at each of the times (n,)."""
         for t in (0.0,) if times is None else times.tolist():
             now = self._at(t)
-            now.time = t
+            now.time, now.traced = t, self.form is not None
             now.check(states, like, n_given)
 
     @cached_property

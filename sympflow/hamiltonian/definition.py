@@ -54,6 +54,8 @@ class Definition:
         True if bodies may meet, over which a step may leap: then there is `leapt`.
     form : TracedHamiltonian or None
         The program of functions that could be traced: see `sympflow.hamiltonian.formulas`.
+    given_functions : bool
+        True if H is given by functions of Python, which are traced where that is possible.
     untraced : str
         Why functions could not be traced, a clause, once `form` was asked for.
     poles : Poles or None
@@ -77,6 +79,7 @@ class Definition:
     poles: Poles | None = None
     form: TracedHamiltonian | None = None
     untraced: str = ""
+    given_functions: bool = False
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:

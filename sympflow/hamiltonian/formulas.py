@@ -89,7 +89,7 @@ class Entries:
         self._rows = matrix.tolist()
 
     def __getitem__(self, place: tuple[int, int]) -> float:
-        return self._rows[place[0]][place[1]]  # type: ignore[no-any-return]
+        return self._rows[place[0]][place[1]]
 
 
 class TracedHamiltonian:

@@ -351,6 +351,7 @@ def _refuse(functions: Tested, state: Array, k: int, given: float, found: float,
 
 def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
     assert functions.hessian_vector is not None
+    assert functions.gradient is not None
     v = _vectors(x)
     claimed = _products(functions, x, v)
     batch = _numbers(functions.hessian_vector(x, as_like(v, x)))

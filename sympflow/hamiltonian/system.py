@@ -849,6 +849,8 @@ class HamiltonianSystem(Hamiltonian):
             kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
+        if self._definition.given_functions:
+            kind += f", arrays: it could not be traced, for {self.untraced}" if self.form is None else ", traced"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
 
 

@@ -157,7 +157,7 @@ def term_code(splitting: Splitting) -> ArrayCode:
     """The compiled functions of a symbolic system of many terms."""
     from sympflow.kernels.terms import Terms
 
-    symbols = splitting.symbols
+    symbols: Any = splitting.symbols
     M = symbols.inverse_mass
     T: Terms | np.ndarray | None = None
     if M is None or not M.is_diagonal() or M.free_symbols:

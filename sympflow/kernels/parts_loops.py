@@ -19,13 +19,13 @@ from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import fma, times
 from sympflow.compiler.program import Program, gradient
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
 from sympflow.hamiltonian.formulas import recorded
-from sympflow.kernels.stage_times import SymbolicLetters
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
 from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers
+from sympflow.kernels.stage_times import SymbolicLetters
 from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 from sympflow.kernels.threads import NEVER, given
 

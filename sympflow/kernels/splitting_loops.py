@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.hamiltonian.formulas import TracedHamiltonian
+from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import check_size
@@ -78,7 +78,7 @@ class SplittingLoops:
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.traced = self._large = False
         self._form: Any = system.form
-        self._driving: Driving | None = None
+        self._driving: Driving | TracedDriving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Rollouts]
         self._codes: dict[Any, Rollouts] = {}
@@ -118,10 +118,11 @@ class SplittingLoops:
             check_size(system.form)
             check_damping(system, False)
             self._has_force_gradient = self.traced = True
-            self.abreast = LANES_OF_SUMS if system.form.V.is_polynomial() and not self.driven else LANES
+            V = system.form.V
+            self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial() and not self.driven else LANES
             if self.driven:
-                self._driving = system.form.driving
-                self._form = self._driving.form
+                driving = self._driving = system.form.driving
+                self._form = driving.form
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None

@@ -18,16 +18,17 @@ from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, times
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, traced
-from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.formulas import evaluator
+from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
-    from sympflow.kernels.approximations import OnInterval, Ranges
+    from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.kernels.approximations import OnInterval, Ranges
     from sympflow.kernels.stage_times import Driving
 
 __all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange", "shared"]
@@ -58,12 +59,12 @@ class Splitting:
         Intervals of one position in which kicks are polynomials, equal but for rounding; its values are then in V.
     """
 
-    symbols: SymbolicHamiltonian
+    symbols: SymbolicHamiltonian | TracedHamiltonian
     level: int
     monomials: Monomials = ()
     compensated: bool = False
     friction: int | None = None
-    driving: Driving | None = None
+    driving: Driving | TracedDriving | None = None
     ranges: Ranges = ()
 
     @property
@@ -308,7 +309,7 @@ class _Both:
         return [x for program in self._programs for x in program(*values)]
 
 
-def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
+def _of_kick(symbols: Any, terms: int) -> list[Any]:
     """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
     V, M = symbols.V, symbols.inverse_mass
     assert V is not None
@@ -319,7 +320,7 @@ def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
     return [slope, product, (slope * M[0, 0] * product / 2).diff(symbols.q[0])][:terms]
 
 
-def _slopes(symbols: SymbolicHamiltonian, terms: int) -> Program:
+def _slopes(symbols: Any, terms: int) -> Program:
     """∇V, and its second and third derivatives, as many orders as there are terms; rows of the tensors one by one."""
     given = (*symbols.q, *symbols.parameters)
     potential = traced(

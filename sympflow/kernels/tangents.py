@@ -18,8 +18,8 @@ from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import INT, Value
 from sympflow.compiler.functions import fma, times
 from sympflow.compiler.program import Program, derivatives, gradient, traced
-from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.formulas import evaluator
+from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, run_states
 from sympflow.kernels.runs import Numbers, Room

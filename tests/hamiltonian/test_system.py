@@ -266,6 +266,7 @@ def test_bad_definitions_are_named(make, error, message):
 def test_functions_of_the_wrong_kind_are_explained(potential, error, message):
     system = HamiltonianSystem(potential, ndof=2)
     with pytest.raises(error, match=message):
+        system.vector_field(np.zeros((5, 4)))
         system.hamiltonian(np.zeros((5, 4)))
 
 
