@@ -483,16 +483,18 @@ ARRAYS: dict[str, Callable[..., Any]] = {
     "any": _reduced("logical_or"), "all": _reduced("logical_and"), "vecdot": lambda x, y, **_: (x * y).sum(-1),
     "linalg_vecdot": lambda x, y, **_: (x * y).sum(-1), "iscomplexobj": lambda x: False,
 }  # fmt: skip
-UNCHANGED = frozenset(  # noqa: SIM905
-    """
-    append array_split atleast_1d atleast_2d atleast_3d average block broadcast_arrays broadcast_to column_stack
-    concat concatenate convolve copy correlate cross cumprod cumsum delete diag diagflat diagonal diff dot
-    dsplit dstack ediff1d einsum expand_dims flip fliplr flipud gradient hsplit hstack inner insert kron matmul
-    matrix_power matrix_transpose meshgrid moveaxis multi_dot ndim outer pad permute_dims polyval prod ravel
-    repeat reshape roll rollaxis rot90 shape size split squeeze stack sum swapaxes take take_along_axis
-    tensordot tile trace transpose trapezoid tril triu unstack vander vdot vsplit vstack
-    """.split()
-)
+# fmt: off
+UNCHANGED = {
+    "append", "array_split", "atleast_1d", "atleast_2d", "atleast_3d", "average", "block", "broadcast_arrays",
+    "broadcast_to", "column_stack", "concat", "concatenate", "convolve", "copy", "correlate", "cross", "cumprod",
+    "cumsum", "delete", "diag", "diagflat", "diagonal", "diff", "dot", "dsplit", "dstack", "ediff1d", "einsum",
+    "expand_dims", "flip", "fliplr", "flipud", "gradient", "hsplit", "hstack", "inner", "insert", "kron", "matmul",
+    "matrix_power", "matrix_transpose", "meshgrid", "moveaxis", "multi_dot", "ndim", "outer", "pad", "permute_dims",
+    "polyval", "prod", "ravel", "repeat", "reshape", "roll", "rollaxis", "rot90", "shape", "size", "split",
+    "squeeze", "stack", "sum", "swapaxes", "take", "take_along_axis", "tensordot", "tile", "trace", "transpose",
+    "trapezoid", "tril", "triu", "unstack", "vander", "vdot", "vsplit", "vstack",
+}
+# fmt: on
 """NumPy's functions whose own code takes arrays of objects."""
 
 
@@ -594,7 +596,7 @@ TORCH: dict[str, Callable[..., Any]] = {
     "outer": np.outer, "ger": np.outer, "tensordot": lambda x, y, dims=2, axis=None: np.tensordot(
         x, y, dims if axis is None else axis), "trace": np.trace, "vecdot": lambda x, y, axis=-1: (x * y).sum(axis),
     "linalg_vecdot": lambda x, y, axis=-1: (x * y).sum(axis), "cross": lambda x, y, axis=-1: np.cross(x, y, axis=axis),
-    "linalg_cross": lambda x, y, axis=-1: np.cross(x, y, axis=axis), 
+    "linalg_cross": lambda x, y, axis=-1: np.cross(x, y, axis=axis),
     "addcmul": lambda x, y, z, value=1: x + value * y * z,
     "unbind": lambda x, axis=0: tuple(np.moveaxis(x, axis, 0)), "split": _chunks,
     "chunk": lambda x, n, axis=0: _chunks(x, -(-np.shape(x)[axis] // n), axis), "unsqueeze": np.expand_dims,

@@ -622,9 +622,10 @@ class DrivenCallables(Functions):
 
     def check(self, states: np.ndarray, like: Array, n_given: int, times: np.ndarray | None = None) -> None:
         """Test them at each of the times (n,)."""
+        traced = self.form is not None
         for t in (0.0,) if times is None else times.tolist():
             now = self._at(t)
-            now.time, now.traced = t, self.form is not None
+            now.time, now.traced = t, traced
             now.check(states, like, n_given)
 
     @cached_property
