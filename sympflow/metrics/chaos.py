@@ -71,7 +71,7 @@ class Indicator:
 
 def lyapunov(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -93,8 +93,9 @@ def lyapunov(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
-        Splitting methods run compiled on symbolic systems; of others each step is differentiated, which takes longer.
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`. Splitting methods run compiled on
+        symbolic systems; of others each step is differentiated, which takes longer.
     t_span : (float, float), optional
         The default is the system's. With fixed steps the run ends with the last whole one.
     y0 : array_like of shape (..., 2d), optional
@@ -138,7 +139,7 @@ def lyapunov(
 
 def sali(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -191,7 +192,7 @@ def sali(
 
 def gali(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,

@@ -53,7 +53,7 @@ class Escapes:
 
 def escape_times(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -70,8 +70,8 @@ def escape_times(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
-        Of fixed steps.
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`; of fixed steps.
     t_span, y0
         As for `solve`; y0 may be a batch of shape (..., 2d).
     outside : float, domain or callable, optional

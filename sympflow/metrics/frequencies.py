@@ -58,7 +58,7 @@ class Frequencies:
 
 def frequencies(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -79,7 +79,8 @@ def frequencies(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`.
     t_span : (float, float), optional
         The default is the system's. Choose ten periods or more.
     y0 : array_like of shape (..., 2d), optional

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def poincare_section(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -48,7 +48,8 @@ def poincare_section(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`.
     t_span : (float, float), optional
         The default is the system's.
     y0 : array_like of shape (..., 2d), optional
