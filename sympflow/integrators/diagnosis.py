@@ -38,7 +38,7 @@ H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
 
 
-TOO_LONG = 0.05
+TOO_LONG = 0.25
 """Energy error, over the size of the energy, of a run whose step is too long."""
 LARGE = 200  # degrees of freedom
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
@@ -286,7 +286,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if not n or not seen or problem.letters is not None or problem.system.between_impulses is not problem.system:
         return
     width = 2 * system.ndof
-    every = slice(n - 1, None, -max(1, -(-n // seen)))  # the last of all
+    every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
     y = np.concatenate(
         [to_numpy(part).reshape(-1, math.prod(problem.y0.shape[:-1]), width) for part in (problem.y0, outcome.y[every])]
     )[:, :LOOKED_AT].astype(float)
