@@ -16,6 +16,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.registry import build, check_applies
+from sympflow.systems.given import given_system
 
 TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
 """Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
@@ -170,6 +171,7 @@ def choose_step(
     >>> dt = sympflow.choose_step(sympflow.systems.henon_heiles(), "srkn11b", 1e-9)
     """
     integrator = build(method, {})
+    system = given_system(system)
     y = np.asarray(system.y0 if y0 is None else to_numpy(y0), dtype=float)
     if y.ndim == 0 or y.shape[-1] != 2 * system.ndof:
         raise ValueError(f"`y0` must have shape (..., {2 * system.ndof}), states [q, p]; got {y.shape}.")
