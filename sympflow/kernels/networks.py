@@ -115,7 +115,7 @@ class MLPFlowKernel(Kernel):
     def _steps(self, sign: float, y: np.ndarray, h: np.ndarray) -> np.ndarray:
         """Steps of one sign."""
         batch = Batch.whole(np.concatenate([y, np.abs(h)[:, None]], axis=1), 1, ONE, y.shape[1])
-        run_rows(lambda i, _: self._rollouts.run(sign, batch.rows(i), False), len(y), STEP, None)
+        run_rows(lambda i, _: self._rollouts.run(sign, batch.rows(i.start, i.stop), False), len(y), STEP, None)
         return batch.out[:, 0]
 
 

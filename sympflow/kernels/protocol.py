@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,13 +86,21 @@ class Batch(NamedTuple):
         out, n_finite = np.empty((len(y0), len(save), n_out)), np.empty(len(y0), dtype=np.int64)
         return cls(y0, n_steps, save, out, n_finite, 0, np.empty((len(y0), 0)))
 
-    def rows(self, i: slice) -> Batch:
-        """Some of the rows."""
-        if i.start == 0 and i.stop >= len(self.y0):
-            return self
-        arrays = self.y0[i], self.out[i], self.n_finite[i], self.running[i], self.counts[i]
-        y0, out, n_finite, running, counts = arrays
-        return self._replace(y0=y0, out=out, n_finite=n_finite, running=running, counts=counts)
+    def rows(self, begin: int, end: int, stop: np.ndarray | None = None) -> Batch:
+        """Some of the rows, and what stops them."""
+        stop = self.stop if stop is None else stop
+        if begin == 0 and end >= len(self.y0):
+            return self if stop is self.stop else self._replace(stop=stop)
+        y0, n_steps, save, out, finite, first, running, counts, _ = self
+        i = slice(begin, end)
+        return Batch(y0[i], n_steps, save, out[i], finite[i], first, running[i], counts[i], stop)
+
+    @property
+    def ended(self) -> Sequence[int]:
+        """The rows that ended early."""
+        if len(self.n_finite) == 1:
+            return (0,) if self.n_finite[0] < self.n_steps else ()
+        return np.flatnonzero(self.n_finite < self.n_steps).tolist()
 
 
 def run_states(
@@ -130,13 +138,13 @@ def run_states(
             before = _fitting(before, shape)
         _fitting(running, shape)
     out, n_finite = np.empty((N, len(save), y0.shape[1])), np.empty(N, dtype=np.int64)
-    counted = np.zeros(N if counts else 0)
+    counted = np.zeros(N) if counts else NOTHING
     batch = Batch(y0 if start is None else start, task.n_steps, save, out, n_finite, first, running, counted)
 
     def rows(i: slice, stop: np.ndarray) -> None:
         if before is not None:
             running[i] = before[i]
-        rollout(batch.rows(i)._replace(stop=stop))
+        rollout(batch.rows(i.start, i.stop, stop))
 
     run_rows(rows, N, (task.n_steps - first) * work, task.threads)
     if carry is not None:

@@ -167,16 +167,15 @@ class Rollouts:
         """Run the rows of a batch in the lanes of registers; those that end early once more, alone, to find where."""
         size = AT_ONCE if batch.y0.shape[1] > self.n_out else len(batch.y0)
         for k in range(0, len(batch.y0), size or 1):
-            part = batch.rows(slice(k, k + size))
+            part = batch.rows(k, k + size)
             if len(part.y0) < self.fewest:
                 self._run(table, part, closed, 1)
                 continue
             before = part.running.copy() if part.first > 0 else part.running
             self._run(table, part, closed, self.lanes)
-            ended = part.n_finite < part.n_steps if self.lanes > 1 and not part.stop[0] else ()
-            for i in np.flatnonzero(ended):
+            for i in part.ended if self.lanes > 1 and not part.stop[0] else ():
                 part.running[i] = before[i]
-                self._run(table, part.rows(slice(i, i + 1)), closed, 1)
+                self._run(table, part.rows(i, i + 1), closed, 1)
 
     def _run(self, table: Any, batch: Batch, closed: bool, width: int) -> None:
         y0, n_steps, save, out, n_finite, first, running, counts, stop = batch
@@ -196,7 +195,7 @@ class Rollouts:
         if self.n_values > start.shape[1]:
             start = np.concatenate([start, np.zeros((len(states), self.n_values - start.shape[1]))], axis=1)
         keeps = running.shape[-1] > 0
-        left = np.empty((len(y0), self.n_values)) if keeps or self.counted else running
+        left = np.empty((len(y0), self.n_values)) if keeps or self.counted else NEVER
         given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps
         outlets = later if len(later) else NEVER, len(later), outputs  # an empty array has no address
         self.call(name, width, *given, *outlets, n_finite, left, int(keeps or self.counted), stop)
@@ -206,7 +205,7 @@ class Rollouts:
             counts[:], left = left[:, -1], left[:, :-1]
         if keeps:
             running[:] = left
-        for i in np.flatnonzero(n_finite < n_steps) if width == 1 else ():
+        for i in batch.ended if width == 1 else ():
             out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
             if keeps:
                 running[i] = np.nan
