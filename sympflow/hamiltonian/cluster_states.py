@@ -57,13 +57,7 @@ class ClusterStates(LocalStates):
 
 @dataclass(frozen=True)
 class _ClusterAtRest(Rest):
-    """A cluster in a minimum of V.
-
-    Attributes
-    ----------
-    energy : float
-        V there.
-    """
+    """A cluster in a minimum of V."""
 
     energy: float
 

@@ -56,15 +56,7 @@ class LatticeStates(LocalStates):
 
 @dataclass(frozen=True)
 class _LatticeAtRest(Rest):
-    """A lattice at rest, all sites in one of the wells.
-
-    Attributes
-    ----------
-    energy : ndarray
-        Of each site, that of its bonds among it.
-    block : tuple of int
-        Sites along each axis of which densities are taken together.
-    """
+    """A lattice at rest, all sites in one of the wells."""
 
     energy: np.ndarray
     block: tuple[int, ...]
