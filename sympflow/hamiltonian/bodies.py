@@ -37,26 +37,7 @@ CHEAP_PAIRS, MANY_STEPS = 2016, 1000
 
 
 class PairsHamiltonian(LocalHamiltonian):
-    """H = Σ_i |p_i|²/2m_i + Σ_{i<j} V(r_ij), see `HamiltonianSystem.pairs`.
-
-    Positions (..., d) are [q_1, …, q_n], `dim` coordinates each.
-
-    Attributes
-    ----------
-    n_bodies, dim : int
-    masses : ndarray of shape (n,)
-    box : ndarray of shape (dim,) or None
-    cutoff : float or None
-    softening : float
-    V : Expr
-        In the letters `s` = r², `first`, `second` and `c`.
-    columns : ndarray of shape (k, n)
-        The quantities of bodies that V depends on.
-    first, second : tuple of Symbol
-        Their letters, of the two bodies of a pair.
-    c : tuple of Symbol
-        Letters of the parameters, whose values are `constants`.
-    """
+    """H = Σ_i |p_i|²/2m_i + Σ_{i<j} V(r_ij), see `HamiltonianSystem.pairs`."""
 
     loops, noun = "pairs", "system of bodies"
     quadratic_kinetic = True
@@ -311,10 +292,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return not self.softening and self.n_bodies > 1
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
-        """By an energy that is off by more than T + |V| of the start, and a T of more than twice that.
-
-        Unless V by array operations takes long beside the run.
-        """
+        """By an energy that is off by more than T + |V| of the start, and a T of more than twice that."""
         pairs = self.n_bodies * (self.n_bodies - 1) // 2
         T0, T = ((self._of_bodies(y[:, self.ndof :]) ** 2).sum(-1) @ (0.5 / self.masses) for y in (starts, ends))
         found = T > 2 * T0

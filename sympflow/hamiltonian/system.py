@@ -885,19 +885,7 @@ COUNTED = {
 
 
 def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
-    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    count : callable
-        Called with what is evaluated, a value of `COUNTED`, and the states or positions (..., k).
-
-    Returns
-    -------
-    HamiltonianSystem
-        Equal to `system`, so that whatever is kept by system is found by the view too.
-    """
+    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it."""
     view = copy.copy(system)
     vars(view).pop("between_impulses", None)  # the view itself, where there are none
     view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]
