@@ -155,8 +155,8 @@ def train(
         Of "gauss-newton" on a primed flow: how much an error in the energy counts beside those of the coordinates. 10
         by default; 1000 for runs of which only the energy matters, 0 for none.
     runs : int, optional
-        Of a primed flow of a lattice or of like bodies: after the search its numbers are fitted further to the energy
-        errors of so many long runs of a larger ring or cluster; 48 is usual. Large systems lose several times less
+        Of a primed flow of a lattice: after the search its numbers are fitted further to the energy
+        errors of so many long runs of a larger ring; 48 is usual. Large systems lose several times less
         energy then, and the fit takes about twice as long. The default is none.
     checkpoint : path, optional
         Write the state of the run there every `checkpoint_every` steps, atomically; of a primed flow after each start
@@ -454,8 +454,6 @@ def _new_primed(
     elif can_try and _fit_is_untold(asked, session):
         trial = trials.chosen_trial(system, domain, session)
         flow = trial.start.flow(system)
-        if trial.timed:
-            flow.recipe = {"timed": trial.timed}
         return flow, trial.flow
     if system.separable and (dt is None or stages is None or processor is None):
         default = default_primed(system, domain, dt)
