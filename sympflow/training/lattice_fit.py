@@ -41,7 +41,7 @@ def on_piece(system: HamiltonianSystem) -> bool:
 
 
 @dataclass(frozen=True)
-class Piece:
+class LatticePiece:
     """The few sites that a flow of a lattice is fitted on.
 
     Attributes
@@ -63,7 +63,7 @@ class Piece:
     states: LatticeStates
 
     @classmethod
-    def of(cls, lattice: HamiltonianSystem, domain: Domain) -> Piece:
+    def of(cls, lattice: HamiltonianSystem, domain: Domain) -> LatticePiece:
         """The piece of a lattice, for states of a domain of it."""
         found = domain if isinstance(domain, LatticeStates) else LatticeStates.of_states(lattice, domain.sample(DRAWN))
         small = lattice.ndof <= MOST_FITTED
