@@ -14,46 +14,13 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import Array, jvp
-from sympflow.flow.layers import Drift
+from sympflow.flow.layers import Binding, Drift
 from sympflow.flow.potentials import Potential, Time
 from sympflow.hamiltonian.hamiltonian import derivative, direction, length_of_change, step
 from sympflow.hamiltonian.monomials import Monomials, gradient, value
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
-
-
-class Binding:
-    """The system whose functions a flow evaluates; shared by copies of the flow, stored in no file.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem or None
-    made : str
-        The use of them, for messages.
-    """
-
-    def __init__(self, system: HamiltonianSystem | None, made: str = "primed with the V and T of a system") -> None:
-        self._system, self._made = system, made
-
-    @property
-    def known(self) -> bool:
-        return self._system is not None
-
-    @property
-    def system(self) -> HamiltonianSystem:
-        if self._system is None:
-            raise ValueError(
-                f"`flow` is {self._made}, which its file does not hold: give it by "
-                "sympflow.load(path, system=system) or flow.bind(system)."
-            )
-        return self._system
-
-    def bind(self, system: HamiltonianSystem) -> None:
-        self._system = system
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Binding:
-        return Binding(self._system, self._made)
 
 
 class Factor(Protocol):
