@@ -322,15 +322,12 @@ class KernelStepper(Stepper):
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
     ) -> tuple[Array, np.ndarray]:
-        start: dict[str, Any] = {"t0": t0} if self.driven else {}
-        if carry is not None:
-            start["carry"] = carry
         if y0.ndim == 1:
-            states, last, iterations = self.kernel.run(h, y0, n_steps, save, **start)
+            states, last, iterations = self.kernel.run(h, y0, n_steps, save, carry, t0)
             self.iterations += iterations
             return states, np.asarray(last)
         rows = y0.reshape(-1, y0.shape[-1])
-        states, finite, iterations = self.kernel.run_batch(h, rows, n_steps, save, **start)
+        states, finite, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
         self.iterations += iterations
         return states.swapaxes(0, 1).reshape(len(save), *y0.shape), np.asarray(finite).reshape(y0.shape[:-1])
 

@@ -84,7 +84,7 @@ class EnergyRuns(RunsFit):
             return np.full(len(self._x) * (len(self._save) - 1), np.inf)
         self.table.assign(wanted)
         kernel, n = self.flow.kernel_for(self.system), int(self._save[-1])
-        H = self.system.hamiltonian(kernel.run_batch(self.flow.dt, self._x, n, self._save)[0])
+        H = self.system.hamiltonian(kernel.run(self.flow.dt, self._x, n, self._save)[0])
         return ((H[:, 1:] - self._H[:, None]) / self._scale[:, None]).ravel()
 
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:

@@ -311,7 +311,7 @@ class _LossFit(Fit):
     @property
     def losses(self) -> str:
         weights = dict(zip(LOSSES, (getattr(self, weight) for weight in WEIGHTS), strict=True))
-        return "+".join(name for name in sorted(LOSSES) if weights[name])
+        return "+".join(name for name in ("labels", "residual", "matching") if weights[name])
 
 
 @dataclass(frozen=True, kw_only=True)
