@@ -214,13 +214,7 @@ class CollocatedFlow(SystemFlow):
 
     @property
     def bound_system(self) -> HamiltonianSystem:
-        """The system whose H the flow uses.
-
-        Raises
-        ------
-        ValueError
-            If it was loaded without it.
-        """
+        """The system whose H the flow uses."""
         return self._binding.system
 
 
@@ -240,13 +234,7 @@ def _checked_states(states: ArrayLike, ndof: int) -> np.ndarray:
 
 @np.errstate(all="ignore")  # of steps that are too long
 def enough_steps(system: HamiltonianSystem, tableau: collocation.Tableau, dt: float, x: np.ndarray) -> int:
-    """The number of equal steps of a Gauss method with which ψ̄_Δt of states (n, 2d) errs by less than `TOLERANCE`.
-
-    Raises
-    ------
-    ValueError
-        If more steps are needed than a flow may have.
-    """
+    """The number of equal steps of a Gauss method with which ψ̄_Δt of states (n, 2d) errs by less than `TOLERANCE`."""
     spread, order = x.std(axis=0), 2 * len(tableau[1])
     unit = np.where(spread > 0, spread, 1.0)
 

@@ -29,12 +29,7 @@ WORSE = 2.0
 
 
 class PrimedKnown(KnownFlow):
-    """A primed flow, as far as it is known without its map: its table, and its system.
-
-    Attributes
-    ----------
-    shape : PrimedShape
-    """
+    """A primed flow, as far as it is known without its map: its table, and its system."""
 
     symplectic = takes_friction = takes_driving = True
     shape: PrimedShape
@@ -148,13 +143,7 @@ class FrozenFlow(PrimedKnown):
 
     @classmethod
     def of_file(cls, path: Path, system: HamiltonianSystem) -> Self:
-        """Read a flow that ships, of that system.
-
-        Raises
-        ------
-        ValueError
-            If the file is damaged, or the system is not that of the flow.
-        """
+        """Read a flow that ships, of that system."""
         record, arrays = _read(path)
         plan, ndof = record["architecture"]["primed"], record["architecture"]["ndof"]
         shape = PrimedShape.from_dict(plan, ndof)
@@ -201,13 +190,7 @@ class FrozenNetwork(KnownFlow):
 
     @classmethod
     def of_file(cls, path: Path, system: HamiltonianSystem) -> Self | None:
-        """Read a flow that ships, of that system; None if it is none of networks.
-
-        Raises
-        ------
-        ValueError
-            If the file is damaged, or the system is not that of the flow.
-        """
+        """Read a flow that ships, of that system; None if it is none of networks."""
         from sympflow.kernels.networks import NetworkLayer
 
         record, arrays = _read(path)

@@ -53,16 +53,7 @@ class _Told:
 
 
 class KnownFlow:
-    """A flow of a system, as far as it is known without its map.
-
-    Attributes
-    ----------
-    ndof : int
-    dt : float
-        Δt, the longest time of the bare map.
-    provenance : Provenance
-        All that is known of it; its attributes are those of the flow too.
-    """
+    """A flow of a system, as far as it is known without its map."""
 
     kind: ClassVar[str]
     """The method of `solve` that runs it."""
@@ -97,13 +88,7 @@ class KnownFlow:
         return self._origin[1]
 
     def identify(self, system: HamiltonianSystem, domain: Domain | None = None) -> None:
-        """Make this the flow of a system, which it will know again: by its fingerprint, and by its H over a domain.
-
-        Raises
-        ------
-        ValueError
-            If the system has friction, and the family of the flow has not.
-        """
+        """Make this the flow of a system, which it will know again: by its fingerprint, and by its H over a domain."""
         check_for_flows(system, self.takes_friction, self.takes_driving)
         self.lattice_terms = {} if system.local is None else dict(system.local.terms)
         small = self.known_by(system)
@@ -130,12 +115,7 @@ class KnownFlow:
         return same_system(mine, small.fingerprint) and (self.identity is None or self.identity.agrees(small))
 
     def check_ends(self, system: HamiltonianSystem) -> None:
-        """Refuse a lattice with ends of a kind at which the numbers of the flow do not hold.
-
-        Raises
-        ------
-        ValueError
-        """
+        """Refuse a lattice with ends of a kind at which the numbers of the flow do not hold."""
 
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
@@ -220,12 +200,7 @@ class KnownFlow:
         return None
 
     def warn_of_times(self, t: Any) -> None:
-        """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing.
-
-        Warns
-        -----
-        UserWarning
-        """
+        """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing."""
         if not self.unfitted:
             return
         seen = values(t) if is_tensor(t) else np.asarray(t)
@@ -247,12 +222,7 @@ class KnownFlow:
                 return
 
     def warn_of_drive(self, t0: Any, passed: Any) -> None:
-        """Warn where a run over `passed` from t0 leaves the times for which a drive without a period was fitted.
-
-        Warns
-        -----
-        UserWarning
-        """
+        """Warn where a run over `passed` from t0 leaves the times for which a drive without a period was fitted."""
         if self.drive_times is None or t0 is None:
             return
         start, length = (values(each) if is_tensor(each) else np.asarray(each) for each in (t0, passed))
@@ -280,31 +250,11 @@ class KnownFlow:
     # its runs -------------------------------------------------------------------------------------------------
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
-        """Return the compiled loops of the flow with its present weights, the same while these do not change.
-
-        Parameters
-        ----------
-        system : HamiltonianSystem
-            The one of the flow.
-        compensated : bool
-            True for runs that sum with Kahan's compensation.
-
-        Raises
-        ------
-        ValueError
-            If there are none, with the reason.
-        """
+        """Return the compiled loops of the flow with its present weights, the same while these do not change."""
         raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count the evaluations of the system's own functions in a run; a network has none.
-
-        Parameters
-        ----------
-        n_steps, n_saved, n_extra : int
-            Steps, outputs at their ends, and shorter steps to other outputs.
-        backend : {"compiled", "numpy", "torch", "array"}
-        """
+        """Count the evaluations of the system's own functions in a run; a network has none."""
         return {"force_evaluations": 0, "hessian_evaluations": 0}
 
     @property

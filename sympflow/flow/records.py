@@ -43,13 +43,7 @@ STAGE: dict[str, Any] = {
 
 
 class Refused(Exception):
-    """The reason for which a file is refused, and what to do.
-
-    Parameters
-    ----------
-    reason : str
-    remedy : str
-    """
+    """The reason for which a file is refused, and what to do."""
 
     def __init__(self, reason: str, remedy: str = "Save it again with flow.save(path)") -> None:
         super().__init__(reason)
@@ -109,12 +103,7 @@ class Provenance:
 
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
-        """Return what the record tells, all of it checked.
-
-        Raises
-        ------
-        Refused
-        """
+        """Return what the record tells, all of it checked."""
         missing = [name for name in FIELDS if name not in record]
         if missing:
             raise Refused(f"its record has no {', '.join(missing)}")

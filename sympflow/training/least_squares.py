@@ -92,19 +92,7 @@ def damped_step(
     damping: Damping,
     tries: int,
 ) -> tuple[Any, float] | None:
-    """The point after a step that lowers the cost, and the cost there; None if no step of so many does.
-
-    Parameters
-    ----------
-    model : Linearized
-    residuals, cost : callable
-        At any point; the cost is not finite where a point is not admissible.
-    before : float
-        The cost at the point of the model.
-    damping : Damping
-        It grows until a step is accepted.
-    tries : int
-    """
+    """The point after a step that lowers the cost, and the cost there; None if no step of so many does."""
     for _ in range(tries):
         model.damp(damping.value)
         step, predicted = model.newton()
@@ -151,23 +139,6 @@ def levenberg_marquardt(
     A step solves min ‖J s + r‖² + λ‖D s‖² by QR factorizations, never by normal equations; D holds the largest norms
     that the columns of J had. The step is bent by the geodesic acceleration of [3]_, which follows the curved valleys
     of such problems.
-
-    Parameters
-    ----------
-    residuals : callable
-        r(x), (m,); not finite where x is not admissible.
-    linearized : callable
-        r(x) and its Jacobian J(x), (m, n), or in blocks.
-    x : ndarray, shape (n,)
-        The start.
-    iterations : int
-        The most accepted steps.
-    patience, gain : int, float
-        The search ends when `patience` steps together lower the cost by less than this share of it.
-    damping : float
-        The first λ.
-    stop : callable
-        Asked before each step whether to end here. An OutOfTime that r or J raises ends it as well.
     """
 
     def cost_at(x: np.ndarray) -> float:
@@ -199,14 +170,7 @@ def levenberg_marquardt(
 
 @dataclass(frozen=True)
 class Blocks:
-    """A Jacobian in blocks of rows, each some columns of its own times a matrix.
-
-    Parameters
-    ----------
-    columns : (k, m)
-    matrices : (B, k, n)
-        The b-th of B equal blocks of J is the b-th part of the columns, transposed, times the b-th matrix.
-    """
+    """A Jacobian in blocks of rows, each some columns of its own times a matrix."""
 
     columns: np.ndarray
     matrices: np.ndarray
@@ -277,11 +241,6 @@ class GaussNewtonSteps:
     tiny multiple of the weights: a neuron that is saturated at all points may else run off to a step of any slope,
     which no held-out point sees, but an orbit meets after some ten thousand steps. The steps end where `PATIENCE` of
     them on the same points lower the loss by less than 1 %, or none does.
-
-    Attributes
-    ----------
-    finished : str or None
-        Why no more steps are worth while.
     """
 
     needs_residuals: ClassVar[bool] = True
