@@ -17,6 +17,7 @@ from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, 
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
+from sympflow.show.cards import Shown
 
 UNCOMPENSATED = (
     "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
@@ -40,7 +41,7 @@ class Origin:
         return self.identity is None or self.identity.agrees(system)
 
 
-class KnownFlow:
+class KnownFlow(Shown):
     """A flow of a system, as far as it is known without its map.
 
     Attributes
