@@ -154,7 +154,7 @@ class ClockedFlow(SystemFlow):
             potential = PrimedPotential(ndof, self._binding, [(term, Share(float(c)))])
             maps.append(Drift(potential) if kind == "drift" else Kick(potential))
         # A tuple, not a ModuleList: the clock is the only one with parameters, and they are the flow's.
-        self.layers = (*maps, Drift(self.clock))  # type: ignore[assignment]
+        self.layers = (*maps, Drift(self.clock))
         if system is not None:
             self._check(system)
             self.identify(system)

@@ -138,7 +138,7 @@ class CollocatedFlow(SystemFlow):
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         self.register_buffer("weights", torch.tensor(weights, **like), persistent=False)
         # A tuple, not a ModuleList: the layers own nothing.
-        self.layers = tuple(CollocationLayer(self) for _ in range(self.steps))  # type: ignore[assignment]
+        self.layers = tuple(CollocationLayer(self) for _ in range(self.steps))
         if system is not None:
             self.identify(system)
 

@@ -112,7 +112,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
         self._tables: Kept[Tables] = Kept(column._parameters for column in columns_of(self.substeps))
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
-        self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
+        self.layers = tuple(map(self._layer, range(len(self.substeps))))
         if system is not None:
             self.identify(system)
 
@@ -324,7 +324,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         super()._take(system)
         if system.ndof != self.ndof:
             self.ndof = system.ndof
-            self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
+            self.layers = tuple(map(self._layer, range(len(self.substeps))))
         if isinstance(self.domain, LatticeStates):
             self.domain = self.domain.of(system)
 

@@ -217,7 +217,7 @@ class SplitFlow(SystemFlow):
                 c.set(np.eye(1, terms).repeat(c.n, 0) / (c.n if c.power else 1))
         self._maps: Kept[KeptMaps] = Kept(column._parameters for column in self.columns())
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
-        self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))  # type: ignore[assignment]
+        self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))
         if system is not None:
             self._take(system)
             self.identify(system)

@@ -583,7 +583,7 @@ class SympFlow(FlowMap):
         q, p = self._opened(y, t)
         H = torch.zeros_like(y[0])
         for layer in reversed(self.layers):
-            q, p, rate = layer.pull_back(t, q, p)  # type: ignore[operator]
+            q, p, rate = layer.pull_back(t, q, p)
             H = H + rate
         return H.reshape(batch)
 
@@ -620,7 +620,7 @@ class SympFlow(FlowMap):
     def _backwards(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         """The inverses of all layers, the last first."""
         for layer in reversed(self.layers):
-            q, p = layer.inverse(t, q, p)  # type: ignore[operator]
+            q, p = layer.inverse(t, q, p)
         return q, p
 
     def _tangents(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
