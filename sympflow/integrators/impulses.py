@@ -25,20 +25,24 @@ ASIDE = 64 * EPS
 def landings(
     integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True
 ) -> tuple[str, list[float]]:
-    """The times of jumps of H in t at which a run that is `able` is cut, where its steps lose their order; else words.
+    """The times of jumps of H in t at which a run that is `able` is cut; or the warning of one that is not.
 
-    Those are the warning of a run that is not cut.
+    A method of fixed steps is cut where it would lose its order, an adaptive one at all jumps: its steps may be longer
+    than a pulse, which none of them meets.
     """
-    if system.autonomous:
+    if system.autonomous or not math.isfinite(t1) or t0 == t1:
         return "", []
-    label = integrator.label if integrator.forces_at_ends(system) else None
-    dt = integrator.step_length(system)
-    said, times = jumps_met(system, t0, t1, dt, label)
-    if not times or dt is None:
-        return said, []
-    able = able and len(times) <= MOST_LANDINGS and not integrator.keeps
-    known = able and not len(system.jump_times(max(times), max(t0, t1), dt / 4))  # all, for the first ones may be listed
-    return ("", times) if known else (said, [])
+    dt, label = integrator.step_length(system), integrator.label if integrator.forces_at_ends(system) else None
+    step, said = (dt or system.dt) / 4, ""
+    if dt is None:
+        times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
+    else:
+        said, times = jumps_met(system, t0, t1, dt, label)
+    able = able and len(times) <= MOST_LANDINGS and not integrator.keeps and not integrator.forces_beyond(system)
+    # all times are known, of which the first ones may be listed
+    if able and times and not len(system.jump_times(max(times), max(t0, t1), step)):
+        return "", times
+    return said, []
 
 
 def spans(t0: float, t1: float, ends: Sequence[float], jumps: Collection[float]) -> list[tuple[float, float]]:

@@ -399,6 +399,29 @@ def test_what_a_run_gives_where_it_lands_on_jumps(options):
         np.testing.assert_allclose(back.y[..., -1] - [0.5, 0.1], 0, atol=1e-13)
 
 
+PULSE = HamiltonianSystem.from_sympy(
+    p**2 / 2 + q**2 / 200 - 100 * q * sp.Piecewise((1, (t > 50) & (t < sp.Rational(5001, 100))), (0, True)),
+    time="t",
+    y0=[0, 0],
+    t_span=(0, 100),
+    dt=0.1,
+)
+
+
+@pytest.mark.parametrize("method", ["dop853", "rk45", "dopri5", "bosh3", "kahan_li8", "explicit_adams"])
+def test_no_step_leaps_over_a_pulse(method):
+    exact = 1e4 * (math.cos(0.1 * 49.99) - math.cos(0.1 * 50))
+    sol = solve(PULSE, method, t_eval=[100.0])
+    assert sol.y[0, -1] == pytest.approx(exact, rel=1e-3)
+    assert sol.stats["jumps"] == 2
+    if method != "explicit_adams":
+        chunks = [*sol.integrator.steps(PULSE, (0.0, 100.0), sol.y0)]
+        y, h = np.concatenate([chunk[1] for chunk in chunks]), np.concatenate([chunk[2] for chunk in chunks])
+        assert h.sum() == pytest.approx(100)
+        swing = math.hypot(0.1 * y[-1, 0], y[-1, 1])
+        assert swing == pytest.approx(2000 * math.sin(0.0005), rel=1e-3)  # of the pulse, before the last step
+
+
 def test_metrics_of_a_run_that_lands_on_jumps_are_those_of_its_steps():
     ensemble = sympflow.ensemble(LATE, "kahan_li8", y0=np.array([[0.5, 0.1]] * 3), t_eval=[3.0])
     assert switched(1.03, ensemble.y[:, 0, 0], 3.0).max() < 1e-13
@@ -416,6 +439,7 @@ def test_runs_that_do_not_land_on_jumps_warn(tmp_path):
     for run in (
         lambda: solve(LATE, "kahan_li8", store=tmp_path / "run.zarr"),
         lambda: solve(fast, "leapfrog", (0, 10), dt=0.1),
+        lambda: solve(LATE, "mclachlan4"),  # whose forces lie beyond the ends of its steps
         lambda: solve_ivp(LATE, (0, 3), [0.5, 0.1], method=as_scipy("kahan_li8", LATE)),
         lambda: odeint(LATE, torch.tensor([0.5, 0.1]).double(), torch.tensor([0.0, 3.0]), method="kahan_li8"),
         lambda: sympflow.escape_times(LATE, "kahan_li8", outside=5.0),
