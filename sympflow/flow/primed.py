@@ -46,8 +46,8 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Substep, Tables, columns_of, substeps_of
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.fingerprint import check_for_flows
-from sympflow.hamiltonian.local_states import LocalStates
-from sympflow.hamiltonian.monomials import Monomials, monomials
+from sympflow.hamiltonian.lattice_states import LatticeStates
+from sympflow.hamiltonian.monomials import Monomials, in_monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, Scheme, compose, scheme_named
 
@@ -329,7 +329,7 @@ class PrimedFlow(PrimedKnown, SympFlow):
     def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file the V and T of its system; itself.
 
-        The flow of a lattice or of like bodies takes the size of the one that it is given.
+        The flow of a lattice takes the size of the one that it is given.
 
         Raises
         ------
@@ -341,7 +341,7 @@ class PrimedFlow(PrimedKnown, SympFlow):
         if system.ndof != self.ndof:
             self.ndof = system.ndof
             self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
-        if isinstance(self.domain, LocalStates):
+        if isinstance(self.domain, LatticeStates):
             self.domain = self.domain.of(system)
         return self
 
@@ -350,7 +350,7 @@ class PrimedFlow(PrimedKnown, SympFlow):
 
         They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
         exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
-        lattice, or of like bodies, they serve any other one of the same terms: `solve` takes the flow as it is.
+        lattice they serve any other one of the same terms: `solve` takes the flow as it is.
 
         Raises
         ------
@@ -396,6 +396,33 @@ class PrimedFlow(PrimedKnown, SympFlow):
         other = self._of(system, self.shape).requires_grad_(False)
         other.describe(self.description_for(system))
         return other
+
+    def force_gradient_coefficients(self) -> np.ndarray:
+        """−½|∇V|²_{M⁻¹} by the monomials of the kicks (M,); 0 where it is no such polynomial."""
+        system = self.system
+        assert system is not None
+        assert system.symbols is not None
+        e = in_monomials(system.symbols.force_gradient, system.symbols, self.monomials)
+        return np.zeros(len(self.monomials)) if e is None else e
+
+    @torch.no_grad()
+    def take_over(self, other: PrimedFlow) -> None:
+        """Take the numbers of another flow with as many kicks: those of a longer Δt as they are at this one's.
+
+        Polynomials take over force gradients.
+        """
+        shorter = min(self.dt / other.dt, 1.0)
+        theirs = {
+            name: to_numpy(column.table).astype(float) * shorter ** np.array(column.exponents, float)
+            for name, column in other.columns()
+        }
+        mine = dict(self.columns())
+        for name in mine.keys() & theirs.keys():
+            mine[name].set(theirs[name])
+        if self.polynomials is not None and other.gradients is not None:
+            for m, e_m in enumerate(self.force_gradient_coefficients()):
+                for part in ("", "processor_"):
+                    mine[f"{part}polynomials.{m}"].set(e_m * theirs[f"{part}gradients"])
 
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""

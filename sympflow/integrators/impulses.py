@@ -25,16 +25,12 @@ ASIDE = 64 * EPS
 def landings(
     integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True
 ) -> tuple[str, list[float]]:
-    """The times of jumps of H in t at which a run that is `able` is cut; or the warning of one that is not.
-
-    A method of fixed steps is cut where it would lose its order, an adaptive one at all jumps: its steps may be longer
-    than a pulse, which none of them meets.
-    """
+    """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut."""
     if system.autonomous or not math.isfinite(t1) or t0 == t1:
         return "", []
     dt, label = integrator.step_length(system), integrator.label if integrator.forces_at_ends(system) else None
     step, said = (dt or system.dt) / 4, ""
-    if dt is None:
+    if dt is None:  # its steps may be longer than a pulse
         times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
     else:
         said, times = jumps_met(system, t0, t1, dt, label)
@@ -45,33 +41,24 @@ def landings(
     return said, []
 
 
-def spans(t0: float, t1: float, ends: Sequence[float], jumps: Collection[float]) -> list[tuple[float, float]]:
-    """The intervals from t0 to t1 that end at certain times, within which H does not jump."""
-    times = [t0, *ends, t1]
+def spans(t0: float, t1: float, ends: Collection[float], jumps: Sequence[float]) -> list[tuple[float, float, float]]:
+    """The intervals that end at certain times and at jumps of H in t, within which it does not jump; and their ends."""
     aside = math.copysign(ASIDE * max(abs(t0), abs(t1)), t1 - t0)
-    return [(a + aside * (a in jumps), b - aside * (b in jumps)) for a, b in pairwise(times)]
+    fixed = [t0, *ends, t1]
+    met = {next((t for t in fixed if abs(t - jump) <= 4 * abs(aside)), jump) for jump in jumps}
+    times = [t0, *sorted({*ends, *(met - {t0, t1})}, reverse=t1 < t0), t1]
+    return [(a + aside * (a in met), b - aside * (b in met), b) for a, b in pairwise(times)]
 
 
 def pieces_of(integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float) -> list[tuple[float, float]]:
     """The pieces of a run of a system without impulses."""
-    jumps = landings(integrator, system, t0, t1)[1]
-    return spans(t0, t1, [t for t in jumps if t0 != t != t1], {*jumps})
+    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1)[1])]
 
 
 def run_in_pieces(
     run: Run, integrator: Integrator, problem: Problem, jumps: Sequence[float]
 ) -> tuple[Outcome, Problem]:
-    """The outcome of a problem by runs from each impulse, or jump of H in t, to the next, and the problem.
-
-    States are continuous from the right: at an impulse the state is the one after it, whatever the direction of the
-    run. So the impulses of an interval are those that lie after its earlier end and not after its later one.
-
-    Parameters
-    ----------
-    run : callable
-        Runs an integrator on a problem without impulses.
-    jumps : sequence of float
-    """
+    """The outcome of a problem by runs from each impulse, or jump of H in t, to the next, and the problem."""
     t0, t1, times, search = problem.t0, problem.t1, problem.t_eval, problem.events
     low, high = min(t0, t1), max(t0, t1)
     near, sign = 8 * EPS * max(abs(low), abs(high)), 1 if t1 >= t0 else -1
@@ -80,12 +67,11 @@ def run_in_pieces(
         for kick in problem.system.kicks(low - 2 * near, high + 2 * near)
         if low + near < kick.t <= high + near
     }
-    stops = sorted({*kicks, *(t for t in jumps if low < t < high)}, reverse=sign < 0)
     piece = replace(problem, system=problem.system.between_impulses, progress=None)
     found: list[Outcome] = []
-    stopped, done, pieces = None, 0, spans(t0, t1, stops, {*jumps})
-    for i, ((start, end), stop) in enumerate(zip(pieces, [*stops, t1], strict=True)):
-        last = i == len(stops)
+    stopped, done, since, pieces = None, 0, t0, spans(t0, t1, kicks, jumps)
+    for i, (start, end, stop) in enumerate(pieces):
+        last = i == len(pieces) - 1
         piece = replace(piece, t0=start, t1=end)
         if times is not None:
             beyond = (times[done:] - stop) * sign > (near if sign < 0 else -near)
@@ -104,7 +90,7 @@ def run_in_pieces(
             stop_at -= 1
         elif sign < 0 and i:
             first = 1
-        t = np.where(outcome.t == start, stops[i - 1] if i else t0, np.where(outcome.t == end, stop, outcome.t))
+        t = np.where(outcome.t == start, since, np.where(outcome.t == end, stop, outcome.t))
         found.append(replace(outcome, t=t[first:stop_at], y=y[first:stop_at]))
         if stopped is not None or last or (np.ndim(outcome.status) == 0 and outcome.status != 0):
             break
@@ -113,16 +99,16 @@ def run_in_pieces(
             state = kicks[stop](state, sign)
             if search is not None:
                 search.values = [event.value(stop, state) for event in search.events]
-        piece = replace(piece, y0=state)
+        piece, since = replace(piece, y0=state), stop
         if problem.progress is not None:
             problem.progress(abs(stop - t0))
-    merged = _merged(found, problem, pieces, len([t for t in stops[: len(found) - 1] if t in kicks]))
+    merged = _merged(found, problem, pieces, sum(stop in kicks for *_, stop in pieces[: len(found) - 1]))
     if stopped is not None:
         raise interrupted(merged, stopped.outcome.stats["interrupted_at"])
     return merged, replace(problem, diagnosed=False)
 
 
-def _merged(found: list[Outcome], problem: Problem, pieces: list[tuple[float, float]], impulses: int) -> Outcome:
+def _merged(found: list[Outcome], problem: Problem, pieces: list[Any], impulses: int) -> Outcome:
     """The outcomes of runs one after the other as one: counts are added, and what failed first is told."""
     t = np.concatenate([each.t for each in found])
     if problem.t_eval is not None:
@@ -151,7 +137,7 @@ def _merged(found: list[Outcome], problem: Problem, pieces: list[tuple[float, fl
     outcome = Outcome(t, join([each.y for each in found]), status, message, stats)
     if problem.dense_output:
         solutions = tuple(each.sol for each in found if each.sol is not None)
-        outcome.sol = Pieces(solutions, np.array(pieces[: len(found)]))
+        outcome.sol = Pieces(solutions, np.array(pieces)[: len(found), :2])
     return outcome
 
 

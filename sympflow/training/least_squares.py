@@ -1,7 +1,7 @@
 """Levenberg–Marquardt: least squares by Gauss–Newton steps, damped where the linear model fails.
 
-`levenberg_marquardt` minimizes a function of a few numbers in NumPy, `GaussNewton` trains the weights of a flow, one
-step at a time. Both take the steps of `damped_step`; they differ in how they solve the linear problem of a step.
+`levenberg_marquardt` minimizes a function of a few numbers in NumPy, `GaussNewtonSteps` trains the weights of a flow,
+one step at a time. Both take the steps of `damped_step`; they differ in how they solve the linear problem of a step.
 
 References
 ----------
@@ -27,7 +27,6 @@ from torch import Tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.kernels.gauss_newton import bent, damped, factored
 from sympflow.training.losses import Objective
-from sympflow.training.options import LossOptions
 from sympflow.training.session import OutOfTime
 
 PROBE = 0.1  # share of a step over which the residuals' curvature is measured
@@ -270,7 +269,7 @@ def put_weights(parameters: Sequence[Tensor], x: Tensor) -> None:
         w.copy_(part.view_as(w))
 
 
-class GaussNewton:
+class GaussNewtonSteps:
     """Levenberg–Marquardt on the residuals of a flow, one accepted step at a time; it trains networks best.
 
     A step s minimizes ‖J s + r‖² + λ‖D s‖², D the largest norms that the columns of J have had, so that λ bounds
@@ -287,7 +286,7 @@ class GaussNewton:
 
     needs_residuals: ClassVar[bool] = True
 
-    def __init__(self, flow: FlowMap, options: LossOptions) -> None:
+    def __init__(self, flow: FlowMap) -> None:
         if flow.n_parameters > MAX_PARAMETERS:
             raise ValueError(
                 f"`optimizer` 'gauss-newton' keeps a dense Jacobian and takes at most {MAX_PARAMETERS} parameters; the "

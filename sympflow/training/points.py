@@ -5,7 +5,6 @@ Labels say where the exact flow takes sampled states, at several times. They are
 
 from __future__ import annotations
 
-import hashlib
 import math
 import warnings
 from dataclasses import dataclass
@@ -444,14 +443,6 @@ def warn_of_another_system(data: Labelled, system: HamiltonianSystem) -> None:
             UserWarning,
             stacklevel=5,
         )
-
-
-def digest(labels: Labelled) -> str:
-    """The checksum of labels."""
-    content = hashlib.sha256()
-    for array in labels:
-        content.update(np.ascontiguousarray(array).tobytes())
-    return content.hexdigest()
 
 
 def parted(data: Labelled, seed: int) -> tuple[Labelled, Labelled]:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
+from sympflow.arguments import real_number
 from sympflow.training.checkpoint import check_writable
-from sympflow.training.options import is_number
 from sympflow.workers import Crew, Unpicklable, available_cores
 
 Path = str | os.PathLike[str]
@@ -109,7 +109,7 @@ class Session:
     def __post_init__(self) -> None:
         self._began = time.perf_counter()
         budget, callback = self.time_budget, self.callback
-        if budget is not None and not (is_number(budget) and 0 < budget < math.inf):
+        if budget is not None and not (real_number(budget) and 0 < budget < math.inf):
             raise ValueError(f"`time_budget` must be a positive number of seconds; got {budget!r}: leave it out.")
         if callback is not None and not callable(callback):
             raise TypeError(

@@ -353,7 +353,9 @@ def test_a_method_keeps_its_order_at_jumps_or_warns(method, order, t_jump):
             sol = solve(system, method, (0, 3), dt=1 / n, backend="array")
         errors.append(switched(float(t_jump), sol.y[0], sol.t).max())
         said = "`method` {!r} takes forces at the ends" if t_jump == 1 else "`dt` {:g}: H of 'custom' jumps within"
-        assert [str(w.message)[:35] for w in told] == [said.format(method if t_jump == 1 else 1 / n)[:35]] * (order == 1)
+        assert [str(w.message)[:35] for w in told] == [said.format(method if t_jump == 1 else 1 / n)[:35]] * (
+            order == 1
+        )
     if order == 1:
         assert errors[1] > 1e-4
     else:

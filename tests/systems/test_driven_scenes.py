@@ -1,7 +1,6 @@
 """The driven scenes: the truths that their docstrings tell."""
 
 import math
-import re
 import warnings
 
 import numpy as np
@@ -135,7 +134,8 @@ def test_runs_land_on_jumps_within_their_steps():
     ):
         span = t0, t0 + math.copysign(2.0, dt)
         found, finer = (
-            solve(each, "gauss_legendre8", span, dt=h, t_eval=[span[1]], backend="array").y for h in (abs(dt), abs(dt) / 2)
+            solve(each, "gauss_legendre8", span, dt=h, t_eval=[span[1]], backend="array").y
+            for h in (abs(dt), abs(dt) / 2)
         )
         np.testing.assert_allclose(found, finer, rtol=1e-8)
     solve(ramp, "kahan_li8", (0.0, 2.0), dt=0.5, backend="array")  # of a kink there is no word
