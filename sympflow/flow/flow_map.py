@@ -20,7 +20,7 @@ from sympflow.flow.certificate import Certificate
 from sympflow.flow.certification import certify
 from sympflow.flow.files import write
 from sympflow.flow.known import KnownFlow
-from sympflow.flow.records import MAX_DT, MIN_DT, Description
+from sympflow.flow.records import MAX_DT, MIN_DT, Provenance
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.show.cards import Card
@@ -78,7 +78,8 @@ class FlowMap(KnownFlow, nn.Module):
     dt : float
         Δt, the longest time of the bare map.
     history : list of dict
-        Held-out figures over its training in this session; not saved. What else is known of it: see `KnownFlow`.
+        Held-out figures over its training in this session; not saved. What else is known of it, as `domain`, `recipe`,
+        `figures` and `certified`, is its `provenance`: see `sympflow.flow.records.Provenance`.
     """
 
     learned: HamiltonianSystem | None = None
@@ -98,7 +99,7 @@ class FlowMap(KnownFlow, nn.Module):
                 f"`dt` must lie between {MIN_DT:g} and {MAX_DT:g}; got {dt!r}: choose another unit of time."
             )
         self.ndof, self.dt = ndof, float(dt)
-        self.describe(Description())
+        self.provenance = Provenance()
         self.history: list[dict[str, float]] = []
 
     def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
@@ -461,7 +462,7 @@ class FlowMap(KnownFlow, nn.Module):
         RuntimeWarning
             If the flow's certificate is one of other weights: it is left out.
         """
-        write(path, self.kind, self.architecture(), self.dt, self.state_dict(), self.description)
+        write(path, self.kind, self.architecture(), self.dt, self.state_dict(), self.provenance)
 
     # arguments ----------------------------------------------------------------------------------------------
 

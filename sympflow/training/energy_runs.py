@@ -34,20 +34,7 @@ PROBE = 1e-6
 
 
 class EnergyRuns(RunsFit):
-    """Relative energy errors in runs of a lattice, as a function of the frozen parameters of a flow.
-
-    Parameters
-    ----------
-    flow : PrimedFlow
-        Of the system; its numbers are changed.
-    system : HamiltonianSystem
-        The lattice.
-    x : ndarray of shape (N, 2d)
-        Where the runs begin.
-    rest : float
-        H of the system at rest.
-    t_end : float
-    """
+    """Relative energy errors in runs of a lattice, as a function of the frozen parameters of a flow."""
 
     compiled = True
 

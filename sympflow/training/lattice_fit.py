@@ -42,19 +42,7 @@ def on_piece(system: HamiltonianSystem) -> bool:
 
 @dataclass(frozen=True)
 class LatticePiece:
-    """The few sites that a flow of a lattice is fitted on.
-
-    Attributes
-    ----------
-    lattice : HamiltonianSystem
-        The lattice.
-    few : HamiltonianSystem
-        The piece as a lattice, the lattice itself where that is small.
-    system, domain : HamiltonianSystem, Domain
-        The piece by its coordinates, and the states to fit on.
-    states : LatticeStates
-        Those of the same density, of any size.
-    """
+    """The few sites that a flow of a lattice is fitted on."""
 
     lattice: HamiltonianSystem
     few: HamiltonianSystem

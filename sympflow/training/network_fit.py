@@ -43,22 +43,7 @@ BACKWARD = 2.0  # times what a point takes in a validation, that it takes in a s
 
 @dataclass
 class LossRun(Run):
-    """The state of such a fit, and what acts on it.
-
-    Attributes
-    ----------
-    held_out, reference
-        Points of the losses that are never trained on; states, where the exact flow takes them in Δt, and of a driven
-        system the times of the states.
-    tangents : NetworkTangents or None
-        For the residuals and their Jacobian; None where the optimizer needs none, or the flow is no such network.
-    step : int
-        Steps taken.
-    best : dict
-        The weights with the least held-out loss so far.
-    step_seconds : float
-        What the longest step took; before there was one, what it takes at least.
-    """
+    """The state of such a fit, and what acts on it."""
 
     scaling: Scaling
     fit: Resolved
@@ -87,13 +72,7 @@ class LossRun(Run):
         solver: Resolved,
         deadline: Deadline | None = None,
     ) -> LossRun:
-        """A run of a flow with fresh points; labels are made where they have a weight and none are handed in.
-
-        Raises
-        ------
-        OutOfTime
-            If the labels take longer than their share of the time.
-        """
+        """A run of a flow with fresh points; labels are made where they have a weight and none are handed in."""
         fit, solver = fit.resolved(solver, flow.kind), solver.but(steps=200)
         method = optimizer(flow, solver)
         _check_memory(flow, fit, solver)

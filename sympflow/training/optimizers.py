@@ -27,15 +27,7 @@ MEMORY = 30
 
 
 class Optimizer(Protocol):
-    """A method that lowers an objective of the flow that it was made for.
-
-    Attributes
-    ----------
-    finished : str or None
-        Why no more steps on the same points are worth while.
-    needs_residuals : bool
-        True if it lowers a sum of squares by its residuals.
-    """
+    """A method that lowers an objective of the flow that it was made for."""
 
     finished: str | None
     needs_residuals: ClassVar[bool]

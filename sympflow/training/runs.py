@@ -38,19 +38,7 @@ class Advance:
 
 @dataclass
 class Run(ABC):
-    """The state of a run, and the loop that acts on it.
-
-    Attributes
-    ----------
-    history : list of dict
-        The figures of each validation.
-    seconds : float
-        Wall time of the run, and of those that it goes on with.
-    closing : float
-        Seconds that its end takes, which are kept free.
-    unfitted : tuple of (float, float)
-        Intervals of t at which the fit compares the flow with nothing.
-    """
+    """The state of a run, and the loop that acts on it."""
 
     flow: FlowMap
     system: HamiltonianSystem
@@ -219,13 +207,7 @@ class Run(ABC):
         checkpoints.write(path, checkpoints.identity(self.flow, self.system, self.record) | run)
 
     def load(self, path: Path) -> None:
-        """Take over the state of a run with the same flow, system and options.
-
-        Raises
-        ------
-        ValueError
-            If the file is not a checkpoint, or one of another run.
-        """
+        """Take over the state of a run with the same flow, system and options."""
         state = checkpoints.read_same(path, checkpoints.identity(self.flow, self.system, self.record))
         try:
             self.restore(state)
@@ -236,13 +218,7 @@ class Run(ABC):
 
 @dataclass
 class Unstarted(Run):
-    """A run for which there was no time: what it was to start from took longer. The flow stays as it is.
-
-    Parameters
-    ----------
-    reached : str
-        How far that got.
-    """
+    """A run for which there was no time: what it was to start from took longer. The flow stays as it is."""
 
     reached: str
 

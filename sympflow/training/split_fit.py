@@ -56,15 +56,7 @@ class SplitRun(SearchRun):
         solver: GaussNewton = GaussNewton(),  # noqa: B008
         deadline: Deadline | None = None,
     ) -> SplitRun:
-        """A run of a flow that is bound to its system.
-
-        Raises
-        ------
-        ValueError
-            If the system cannot be compiled, or no solution from the domain exists up to Δt.
-        OutOfTime
-            If the labels take longer than their share of the time.
-        """
+        """A run of a flow that is bound to its system."""
         deadline = Session().deadline if deadline is None else deadline
         solver = solver.but(restarts=8, steps=150)
         problem = SplitProblem(flow, system, domain, fit, solver, deadline)

@@ -37,17 +37,6 @@ def default_primed(
 
     ω is the fastest frequency of the linearized motion, √ of the largest eigenvalue of M⁻¹∇²V, that 99 % of the states
     of the domain stay below. The processor costs nothing over a long run, and is larger than the kernel for that.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        Separable.
-    domain : Domain, optional
-        Ω; the default is that of the system.
-    dt : float, optional
-        Δt.
-    phase : float
-        Another ω Δt, where no Δt is given.
     """
     omega = frequency(system, system.domain if domain is None else domain)
     if dt is None:
@@ -248,13 +237,7 @@ def _rounded(dt: float) -> float:
 
 
 def scaling_of(domain: Domain, dt: float, seed: int) -> Scaling:
-    """The units of x and t, from samples of the domain.
-
-    Raises
-    ------
-    ValueError
-        If the squares of its states overflow.
-    """
+    """The units of x and t, from samples of the domain."""
     x = states(domain, SCALING_SAMPLES, seed, Stream.SCALING)
     if not np.abs(x).max() < math.sqrt(np.finfo(float).max) / SCALING_SAMPLES:
         raise ValueError(f"`domain` has states as large as {np.abs(x).max():.1e}, whose squares overflow: shrink it.")

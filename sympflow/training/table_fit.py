@@ -81,19 +81,7 @@ RESIDUALS = 10  # at least, at Δt, for each number of the table; half as many f
 
 @dataclass
 class TableRun(SearchRun):
-    """The state of such a fit, and what acts on it.
-
-    Attributes
-    ----------
-    tried : PrimedFlow or None
-        A flow like this one from a trial, which the result of an interrupted run is to be no worse than.
-    runs : RunsFit or None
-        Long runs, to which the best tables are fitted in the end.
-    kept_start : bool
-        Whether the flow is returned as it was given.
-    at_start, at_end : ndarray
-        Differences from the exact flow at the held-out labels: of the flow as it was given, and as it is.
-    """
+    """The state of such a fit, and what acts on it."""
 
     flow: PrimedFlow
     scaling: Scaling
@@ -132,13 +120,6 @@ class TableRun(SearchRun):
         """A run for labels made on the spot, or for the `data` of the options.
 
         `made_runs` gives the `runs` of a flow.
-
-        Raises
-        ------
-        ValueError
-            If T is not ½ pᵀM⁻¹p, no solution from the domain exists up to Δt, or the data have no labels at Δt.
-        OutOfTime
-            If the labels take longer than their share of the time.
         """
         deadline = Session().deadline if deadline is None else deadline
         fractions = FRACTIONAL_TIMES
@@ -493,13 +474,7 @@ class StackedFit(Problem):
 
 
 class RunsFit(Problem):
-    """Errors in long runs by the frozen parameters of a table.
-
-    Attributes
-    ----------
-    record : dict
-        The choices of the runs, for the recipe of a flow.
-    """
+    """Errors in long runs by the frozen parameters of a table."""
 
     record: dict[str, Any]
 
@@ -550,20 +525,7 @@ class LossProblem(Problem):
 
 
 class TableFit(Problem):
-    """The labels' residuals as a function of parameters on which the table at each time depends affinely.
-
-    Parameters
-    ----------
-    step : TableStep
-    labels : Labels
-    offset, design : (J, n), (J, n, f)
-        The coefficients at the label times are offset + design · θ.
-    unit : (2d,)
-        Residuals are divided by it.
-    weight : (J,)
-    slope : (J, N, 2d), optional
-        Of the energy, in such units that an error δ counts by slope·δ besides.
-    """
+    """The labels' residuals as a function of parameters on which the table at each time depends affinely."""
 
     def __init__(
         self,

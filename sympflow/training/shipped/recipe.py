@@ -34,28 +34,7 @@ class Judge(Protocol):
 
 @dataclass(frozen=True)
 class Recipe:
-    """A flow that ships.
-
-    Parameters
-    ----------
-    scene, name : str
-        Its file is SCENE-NAME.safetensors.
-    system : callable
-        The system.
-    fit : Fit
-        The flow, and its fit.
-    judge : Judge
-        Measures it when it is trained.
-    solver : Solver
-    further : tuple of (LossFit, Solver)
-        Fits of the flow after the first.
-    domain : callable, optional
-        Ω of a system; the default is its own.
-    after : str, optional
-        The name of the recipe with the same kicks and the same processor whose table, continued to this Δt, is where
-        the search starts: deep valleys are found at a long Δt, and followed to a short one; and found without
-        polynomials, and followed with them.
-    """
+    """A flow that ships."""
 
     scene: str
     name: str
@@ -120,11 +99,6 @@ def made(
 
     `earlier` gives, by a recipe and the name of the one that it comes after, a flow that was made before. `workers`
     share the recipes, a number of them being processes: those that come after others when these are made.
-
-    Raises
-    ------
-    ValueError
-        If a recipe comes after one that is neither made nor given.
     """
     flows: dict[tuple[str, str], FlowMap] = {}
     left = list(recipes)
