@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -147,7 +146,7 @@ _SIMPLER: dict[str, Callable[..., Any]] = {
     "add": _sum,
     "sub": _difference,
     "mul": _product,
-    "times": partial(_product, name="times"),
+    "times": lambda a, b: _product(a, b, "times"),
     "div": _quotient,
     "neg": _negative,
     "pow": _power,
