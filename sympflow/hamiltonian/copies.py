@@ -72,7 +72,7 @@ def two_copies(system: HamiltonianSystem, omega: float) -> ExactParts:
     check_parts_conservative(system)
     import sympy as sp
 
-    d, symbols = system.ndof, system.symbols
+    d, symbols = system.ndof, system.written
     squares = np.diag(natural_scale(system) ** 2)
     B, K = (omega * np.block([[one, -one], [-one, one]]) for one in (np.linalg.inv(squares), squares))
     coupling = Coupling(B, K, np.zeros(2 * d))

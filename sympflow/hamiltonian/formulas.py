@@ -10,7 +10,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,12 @@ from sympflow.arrays import Array, assemble, is_tensor
 from sympflow.compiler.functions import apply
 from sympflow.compiler.program import Program, Recording, Traced, gradient, tangent, traced
 
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
 __all__ = ["Formula", "Letter", "TracedDriving", "TracedHamiltonian", "TracedLetters", "evaluator", "recorded"]
 
+MOST_IN_SYMBOLS = 300  # operations
 _POLYNOMIAL = {"add", "sub", "mul", "times", "neg", "fma"}
 
 
@@ -145,9 +149,26 @@ class TracedHamiltonian:
         H = traced(lambda *x: [V.program(*x[:n])[0] + T.program(*x[n:])[0]], *(s.name for s in letters))
         self.V, self.H = V, Formula(H, letters)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "written"}
+
     @property
     def parametric(self) -> TracedHamiltonian:
         return self
+
+    @cached_property
+    def written(self) -> SymbolicHamiltonian | None:
+        """The same in symbols, for methods that look for parts of H; None of a long one."""
+        if len(self.H) > MOST_IN_SYMBOLS:
+            return None
+        from sympflow.hamiltonian.recorded import NotRecorded, in_symbols
+        from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+
+        try:
+            symbols = SymbolicHamiltonian(in_symbols(self.H.program), time="t" if self.time else None)
+        except (NotRecorded, ValueError, TypeError):
+            return None
+        return symbols if (symbols.ndof, symbols.separable) == (self.ndof, self.separable) else None
 
     @cached_property
     def size(self) -> int:

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, per_state
-from sympflow.hamiltonian.formulas import recorded
+from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.times import checked_time
 
 if TYPE_CHECKING:
     from sympflow.compiler.program import Program
-    from sympflow.hamiltonian.formulas import TracedHamiltonian
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.poles import Poles
@@ -593,8 +592,11 @@ class Hamiltonian:
 
     @property
     def written(self) -> SymbolicHamiltonian | None:
-        """The symbolic definition, or that of a few bodies in pairs, written out when it is asked for; else None."""
-        return self.symbols if self.local is None else self.local.written
+        """The symbolic definition, or that of a few bodies or a traced function, written when asked for; else None."""
+        if self.local is not None:
+            return self.local.written
+        form = self.form
+        return form.written if isinstance(form, TracedHamiltonian) else form
 
     @cached_property
     def expression(self) -> str | None:

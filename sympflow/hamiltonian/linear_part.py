@@ -219,10 +219,10 @@ def linear_part(system: Scene) -> LinearPart:
     if system.stiffness_matrix is not None:
         K = system.stiffness_matrix
         part = LinearPart(inverse_mass(system), K, _equilibrium(system, K), None, _interval(system))
-    elif system.symbols is not None:
-        part = read_off(system.symbols.H, system.symbols.q, system.symbols.p, _interval(system))
     elif system.local is not None:
         return system.local.linear_and_rest(_interval(system))[0]
+    elif system.written is not None:
+        part = read_off(system.written.H, system.written.q, system.written.p, _interval(system))
     else:
         raise ValueError(
             f"`system` {system.name!r} is given by functions, from which no linear part can be read: pass "

@@ -422,7 +422,8 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
         If a part is not solved exactly, or the parts do not add up to H.
     """
     check_parts_conservative(system)
-    if system.symbols is None:
+    by_arrays = system.local is not None or (system.stiffness_matrix is not None and expressions is None)
+    if system.written is None or by_arrays:
         if expressions is not None:
             raise ValueError("`parts` are read as symbols, which the system has not: define it with from_sympy.")
         if system.local is not None:
@@ -438,7 +439,7 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
 def _detected(system: HamiltonianSystem) -> ExactParts:
     import sympy as sp
 
-    symbols = system.symbols
+    symbols = system.written
     assert symbols is not None
     try:
         linear = linear_part(system)
@@ -485,7 +486,7 @@ def _has_pair(variables: set[sp.Symbol], symbols: SymbolicHamiltonian) -> bool:
 def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactParts:
     import sympy as sp
 
-    symbols = system.symbols
+    symbols = system.written
     assert symbols is not None
     parts = [_parsed(expression, system) for expression in expressions]
     difference = sp.expand(sp.Add(*parts) - symbols.H)
@@ -518,18 +519,19 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
 
 def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
     """A part in the symbols q1 … pd of the system."""
-    assert system.symbols is not None
+    symbols = system.written
+    assert symbols is not None
     if not isinstance(expression, str):
         raise ValueError(f"`parts` must be expressions as text; got {expression!r}.")
-    words, time = set(re.findall(r"[A-Za-z_]\w*", expression)), system.symbols.time
+    words, time = set(re.findall(r"[A-Za-z_]\w*", expression)), symbols.time
     try:
         part = parse(expression, {name: value for name, value in system.params.items() if name in words}, time)
     except (ValueError, TypeError) as error:
         raise ValueError(f"`parts` has one that is not admissible: {error}") from None
-    known = {s.name for s in (*system.symbols.q, *system.symbols.p)} | {"q", "p", getattr(time, "name", "q")}
+    known = {s.name for s in (*symbols.q, *symbols.p)} | {"q", "p", getattr(time, "name", "q")}
     if foreign := {s.name for s in part.free_symbols} - known:
         raise ValueError(f"`parts` has {', '.join(sorted(foreign))}, which the system has not: leave it out.")
-    first = {"q": system.symbols.q[0], "p": system.symbols.p[0]}
+    first = {"q": symbols.q[0], "p": symbols.p[0]}
     return part.xreplace({s: first[s.name] for s in part.free_symbols if s.name in first})
 
 

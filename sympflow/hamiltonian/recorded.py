@@ -9,9 +9,10 @@ from typing import Any
 import sympy as sp
 
 from sympflow.compiler.functions import apply, where
+from sympflow.compiler.program import Program, Traced
 from sympflow.hamiltonian.removable import sinc
 
-__all__ = ["NotRecorded", "calculated", "can_be_recorded", "check_recorded"]
+__all__ = ["NotRecorded", "calculated", "can_be_recorded", "check_recorded", "in_symbols"]
 
 
 class NotRecorded(ValueError):
@@ -64,6 +65,22 @@ _RULES: dict[type, Callable[..., Any]] = {
 # fmt: on
 
 
+EXACT = 2.0**53
+# fmt: off
+_SYMBOLS: dict[str, Callable[..., sp.Expr]] = {
+    "add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y, "times": lambda x, y: x * y,
+    "div": lambda x, y: x / y, "neg": lambda x: -x, "fma": lambda x, y, z: x * y + z,
+    "pow": lambda x, n: x ** (sp.nsimplify(n) if n.is_Float and 2 * n % 1 == 0 else n), "sqrt": sp.sqrt,
+    "abs": sp.Abs, "sign": sp.sign, "floor": sp.floor, "mod": sp.Mod, "min": sp.Min, "max": sp.Max, "lt": sp.Lt,
+    "le": sp.Le, "eq": sp.Eq, "and": sp.And, "or": sp.Or, "not": sp.Not,
+    "where": lambda c, x, y: sp.Piecewise((x, c), (y, True)), "exp": sp.exp, "expm1": lambda x: sp.exp(x) - 1,
+    "log": sp.log, "log1p": lambda x: sp.log(1 + x), "sin": sp.sin, "cos": sp.cos, "tan": sp.tan, "asin": sp.asin,
+    "acos": sp.acos, "atan": sp.atan, "atan2": sp.atan2, "sinh": sp.sinh, "cosh": sp.cosh, "tanh": sp.tanh,
+    "asinh": sp.asinh, "acosh": sp.acosh, "atanh": sp.atanh, "erf": sp.erf, "erfc": sp.erfc,
+}
+# fmt: on
+
+
 def _heaviside(x: Any, at_zero: Any = 0.5) -> Any:
     return where(apply("eq", x, 0.0), at_zero, where(x > 0.0, 1.0, 0.0))
 
@@ -109,6 +126,29 @@ def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
     if rule is None:
         raise NotRecorded(f"{f.func.__name__} is in no table of the compiler.")
     return rule(*(value(x) for x in f.args))
+
+
+def in_symbols(program: Program) -> sp.Expr:
+    """The one output of a program as an expression, in real symbols of the names of its inputs.
+
+    Raises
+    ------
+    NotRecorded
+        If an operation has no SymPy form.
+    """
+    known: dict[int, Any] = {x.order: sp.Symbol(repr(x), real=True) for x in program.inputs}
+
+    def given(x: Any) -> sp.Expr:
+        if isinstance(x, Traced):
+            return known[x.order]
+        return sp.Integer(int(x)) if math.isfinite(x) and x % 1 == 0 and abs(x) < EXACT else sp.Float(x)
+
+    for x in program.operations:
+        rule = _SYMBOLS.get(x.name)
+        if rule is None:
+            raise NotRecorded(f"{x.name} has no form in symbols.")
+        known[x.order] = rule(*map(given, x.args))
+    return given(program.outputs[0])
 
 
 def _sum(terms: Sequence[Any]) -> Any:

@@ -135,12 +135,12 @@ def _linear_flow(system: HamiltonianSystem, t: np.ndarray, y0: np.ndarray) -> np
 
     With S = LLᵀ the variables z = Lᵀx rotate, z' = LᵀJL z, so the error is that of the phase alone: ε·ω·t.
     """
-    if system.symbols is None:
+    if system.written is None:
         return None
     import sympy
 
-    variables = [*system.symbols.q, *system.symbols.p]
-    H = system.symbols.H
+    variables = [*system.written.q, *system.written.p]
+    H = system.written.H
     if not H.is_polynomial(*variables) or any(sum(m) not in (0, 2) for m in sympy.Poly(H, *variables).monoms()):
         return None
     S = np.asarray(system.hessian(np.zeros(len(variables))))
