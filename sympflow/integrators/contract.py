@@ -20,7 +20,8 @@ Its duties:
    that is none of H, which only `vector_field` holds.
 11. `takes_driving` is False, and a driven system, H(t, q, p), is refused before the integrator sees it; or the method
    takes H and its derivatives at the times of its stages, t + c·h, as `system.vector_field(y, t + c * h)` does. Where
-   c is 0 or 1, `forces_at_ends(system)` says so, and a jump of H that the steps meet is warned of.
+   c is 0 or 1, `forces_at_ends(system)` says so, and a run is cut at the jumps of H; where c lies outside of these,
+   `forces_beyond(system)` says so, and the jumps are warned of.
 
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
 duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
@@ -31,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import Field, dataclass, fields
 from enum import Enum
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -43,6 +44,7 @@ from sympflow.arrays import Array, is_tensor, jvp, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.progress import Progress
+from sympflow.show.cards import cut
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
@@ -228,6 +230,10 @@ class Integrator:
         """Return True if a step takes a force at its end or beyond it, of first order where H jumps there in t."""
         return False
 
+    def forces_beyond(self, system: HamiltonianSystem) -> bool:
+        """Return True if a step takes a force at a time outside of it, so that it meets jumps beyond its ends."""
+        return False
+
     def check(self, system: HamiltonianSystem) -> None:
         """Raise a ValueError with the reason if the method does not apply to the system."""
 
@@ -410,3 +416,14 @@ def differentiated(
 @cache
 def _field_names(cls: type) -> tuple[str, ...]:
     return tuple(f.name for f in fields(cls))
+
+
+def method_text(integrator: Integrator, dt: float | None = None) -> str:
+    """A method and its options in words: those that differ from the defaults, and the step."""
+    known: tuple[Field[Any], ...] = fields(integrator)  # type: ignore[arg-type]
+    given = {f.name: (getattr(integrator, f.name), f.default) for f in known if f.init and f.repr}
+    options = {name: value for name, (value, default) in given.items() if value is not None and value != default}
+    if dt is not None:
+        options["dt"] = dt
+    shown = (f"{name} = {v:.6g}" if isinstance(v, float) else f"{name} = {v}" for name, v in options.items())
+    return ", ".join([integrator.label, *(cut(text, 40) for text in shown)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,8 +15,10 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.show.cards import Card, Shown, numbers
 from sympflow.systems.given import given_system
 
 WINDOW = 256  # steps between which orbits that have left are put aside
@@ -25,8 +28,8 @@ HALVINGS = 48
 Outside = Callable[[np.ndarray], np.ndarray]
 
 
-@dataclass(frozen=True)
-class Escapes:
+@dataclass(frozen=True, repr=False)
+class Escapes(Shown):
     """When and where orbits left a region.
 
     Attributes
@@ -45,6 +48,10 @@ class Escapes:
     state: np.ndarray = field(repr=False)
     status: Any
     message: str
+
+    def card(self) -> Card:
+        facts = {"time": numbers(self.time), "state": numbers(self.state), "status": numbers(self.status)}
+        return Card("Escapes", facts, self.message)
 
     @property
     def success(self) -> bool:
@@ -191,6 +198,9 @@ def escapes(orbits: Orbits, region: Outside, backend: str) -> tuple[np.ndarray, 
             f"`method` {integrator.name!r} has no fixed steps of the states, after which escapes are looked for: use "
             "a splitting method such as 'kahan_li8', or 'gauss_legendre6'."
         )
+    told, _ = landings(integrator, orbits.system, *orbits.t_span, able=False)
+    if told:
+        warnings.warn(told, RuntimeWarning, stacklevel=3)
     rows = orbits.rows
     most = max(1, MOST_VALUES // (WINDOW * rows.shape[1]))
     with naming_plugin(integrator):
