@@ -137,10 +137,13 @@ class Kernel(Protocol):
         True if all states that a run saves up to its last finite step are finite numbers.
     backend : str
         The name of what runs, of `stats["backend"]`.
+    remark : str
+        A sentence on the end of the last run of a single state that could not go on.
     """
 
     saves_finite: bool
     backend: str = "compiled"
+    remark: str = ""
 
     def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
         """`n_steps` steps from one state.
