@@ -708,8 +708,8 @@ _SPACING = Fraction(7, 40)  # of the kicks, squared, in steps
 def corrector_maps(order: int, sign: int = 1) -> tuple[tuple[str, float], ...]:
     """Return the processor of drift–kick–drift steps with small kicks: kicks and drifts in units of the step.
 
-    Kicks bᵢ and −bᵢ at ±aᵢ, aᵢ = i√(7/40), with Σ 2bᵢ sinh(aᵢz) = ((z/2)/sinh(z/2) − 1)/z up to z^(order − 2), remove the
-    errors ε dt² … ε dt^(order − 1) of the energy.
+    Kicks bᵢ and −bᵢ at ±aᵢ, aᵢ = i√(7/40), with Σ 2bᵢ sinh(aᵢz) = ((z/2)/sinh(z/2) − 1)/z up to z^(order − 2), remove
+    the errors ε dt² … ε dt^(order − 1) of the energy.
 
     Parameters
     ----------

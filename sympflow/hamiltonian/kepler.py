@@ -48,7 +48,7 @@ def stumpff(X: Any, beta: Any) -> tuple[Any, Any, Any, Any]:
     """G₀ to G₃ of any X: the series of X halved so often that it is short, and the theorem of the double argument."""
 
     def halved(part: Any) -> tuple[Any, Numbers]:
-        large = SHORT < apply("abs", beta * part * part)
+        large = apply("abs", beta * part * part) > SHORT
         return large, [where(large, 0.5 * part, part)]
 
     def doubled(part: Any, *G: Any) -> tuple[Any, Numbers]:
@@ -60,7 +60,7 @@ def stumpff(X: Any, beta: Any) -> tuple[Any, Any, Any, Any]:
 
     (part,) = repeated(halved, [X])
     _, *G = repeated(doubled, [part, *series(part, beta, TERMS)])
-    return tuple(G)  # type: ignore[return-value]
+    return tuple(G)
 
 
 def repeated(body: Callable[..., tuple[Any, Numbers]], values: Numbers) -> Numbers:
@@ -83,8 +83,8 @@ def repeated(body: Callable[..., tuple[Any, Numbers]], values: Numbers) -> Numbe
 
 def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any) -> Any:
     """The X of a time t ≥ 0 by Laguerre's method, kept between the ends that are known; nearly to rounding."""
-    bound = where(0.0 < beta, beta, 1.0)
-    most = where(0.0 < beta, (bound * t / mu) + 2.0 / apply("sqrt", bound), math.inf)  # E grows by nt + 2 at most
+    bound = where(beta > 0.0, beta, 1.0)
+    most = where(beta > 0.0, (bound * t / mu) + 2.0 / apply("sqrt", bound), math.inf)  # E grows by nt + 2 at most
 
     def turn(X: Any, low: Any, high: Any, going: Any) -> tuple[Any, Numbers]:
         G0, G1, G2, G3 = stumpff(X, beta)
@@ -96,8 +96,8 @@ def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any) -> Any:
         new = X - 5.0 * f / (slope + root)
         between = where(high < math.inf, 0.5 * (low + high), 2.0 * X)
         new = where((low <= new) & (new <= high), new, between)
-        again = (CLOSE * apply("abs", new) < apply("abs", new - X)) & (0.0 < going)
-        return again, [where(0.0 < going, new, X), low, high, where(again, going - 1.0, 0.0)]
+        again = (CLOSE * apply("abs", new) < apply("abs", new - X)) & (going > 0.0)
+        return again, [where(going > 0.0, new, X), low, high, where(again, going - 1.0, 0.0)]
 
     first = apply("min", t / r, most)
     return repeated(turn, [first, 0.0 * first, most + 0.0 * first, 0.0 * first + float(MOST)])[0]
@@ -133,10 +133,10 @@ def kepler_flow(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any) -> tuple[Nu
     r = apply("sqrt", square)
     inverse, eta = 1.0 / r, dot(x, v)
     beta = 2.0 * mu * inverse - dot(v, v)
-    bound = where(0.0 < beta, beta, 1.0)
+    bound = where(beta > 0.0, beta, 1.0)
     period = 2.0 * math.pi * mu / (bound * apply("sqrt", bound))
-    t = t - where(0.0 < beta, period * apply("floor", t / period + 0.5), 0.0)
-    sign = where(t < 0.0, -1.0, 1.0)
+    t = t - where(beta > 0.0, period * apply("floor", t / period + 0.5), 0.0)
+    sign = where(t < 0.0, 0.0 * t - 1.0, 1.0)
     t, eta, zeta = t * sign, eta * sign, mu - beta * r
     X = solved(*map(_still, (r, eta, zeta, beta, mu, t)))
     f, g, df, dg, _, other = coefficients(X, stumpff(X, beta), r, inverse, eta, zeta, mu, t)

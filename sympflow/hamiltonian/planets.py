@@ -1,4 +1,4 @@
-"""Planets about a star: a gravitational system that knows its star, and the coordinates in which Kepler's motion is cut.
+"""Planets about a star: a system that knows its star, and the coordinates in which Kepler's motion is cut.
 
 A frame has the planets in their order from the star, positions x and velocities v of each relative to a centre, about
 which its motion is Kepler's with μ, and the rest of H, the interaction: a potential in Jacobi's coordinates.
@@ -7,9 +7,9 @@ which its motion is Kepler's with μ, and the rest of H, the interaction: a pote
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,9 +17,6 @@ from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, is_tensor, like, stack, to_numpy
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
-
-if TYPE_CHECKING:
-    from sympflow.hamiltonian.system import HamiltonianSystem
 
 COORDINATES = ("jacobi", "democratic")
 ELEMENTS = ("a", "e", "inc", "node", "peri", "M")
@@ -47,10 +44,14 @@ def gravity(units: Any) -> float:
     names = [x.strip() for x in units.split(",")] if isinstance(units, str) else units
     tables = LENGTHS, TIMES, MASSES
     if not isinstance(names, list | tuple) or len(names) != 3:
-        raise ValueError(f"`units` must be names of a length, a time and a mass, such as 'AU, day, solar mass'; got {units!r}.")
+        raise ValueError(
+            f"`units` must be names of a length, a time and a mass, such as 'AU, day, solar mass'; got {units!r}."
+        )
     for name, table in zip(names, tables, strict=True):
         if not isinstance(name, str) or name not in table:
-            raise ValueError(f"`units` has {name!r}, which is none of {', '.join(map(repr, table))}: take one of these.")
+            raise ValueError(
+                f"`units` has {name!r}, which is none of {', '.join(map(repr, table))}: take one of these."
+            )
     length, time, mass = (table[name] for name, table in zip(names, tables, strict=True))
     return mass * time**2 / length**3
 
@@ -80,7 +81,12 @@ class Frame:
     """
 
     def __init__(
-        self, local: PairsHamiltonian, G: float, y0: np.ndarray, coordinates: str = "jacobi", encounter: float | None = 1.0
+        self,
+        local: PairsHamiltonian,
+        G: float,
+        y0: np.ndarray,
+        coordinates: str = "jacobi",
+        encounter: float | None = 1.0,
     ) -> None:
         self.local, self.G, self.coordinates, self.encounter = local, G, coordinates, encounter
         masses = self.masses = local.masses
@@ -88,7 +94,7 @@ class Frame:
         q, v = self._bodies(np.asarray(y0, dtype=float))
         x, u = q[1:] - q[0], v[1:] - v[0]
         self.elements = elements_of(x, u, G * (masses[0] + masses[1:]))
-        a, e = self.elements[:, 0], self.elements[:, 1]
+        a, e = self.elements[:, :2].T
         self.size = np.where(e < 1, np.abs(a), np.linalg.norm(x, axis=-1))
         massive = masses[1:] > 0
         by_size = 1 + np.argsort(self.size, kind="stable")
@@ -97,7 +103,9 @@ class Frame:
         self.sums = masses[0] + np.concatenate([[0.0], np.cumsum(masses[self.order])])
         self.jacobi = coordinates == "jacobi"
         heavy, light = (self.sums[1:], self.sums[self.inside]) if self.jacobi else (masses[:1], masses[:1])
-        self.mu = G * np.concatenate([np.broadcast_to(heavy, self.order.shape), np.broadcast_to(light, self.test.shape)])
+        self.mu = G * np.concatenate(
+            [np.broadcast_to(heavy, self.order.shape), np.broadcast_to(light, self.test.shape)]
+        )
         self.periods = 2 * np.pi * np.sqrt(self.size**3 / (G * (masses[0] + masses[1:])))
 
     @cached_property
@@ -124,7 +132,7 @@ class Frame:
     # transformations ----------------------------------------------------------------------------------------------
 
     def relative(self, q: Array) -> tuple[Array, Array]:
-        """Vectors of the bodies (..., n, 3) as those of the planets (..., n − 1, 3), Jacobi's, and of the centre (..., 3)."""
+        """Jacobi's vectors (..., n − 1, 3) of vectors of the bodies (..., n, 3), and that of the centre (..., 3)."""
         R = q[..., 0, :]
         x, centres = [], [R]
         for i, w in zip(self.order.tolist(), self.weights, strict=True):
@@ -227,23 +235,24 @@ class Frame:
 
     def check(self, method: str) -> None:
         """Raise a ValueError where some body is no planet of the star: bound to another one, or not bound at all."""
-        masses, q = self.masses, None
+        masses = self.masses
         if masses[1:].max() >= masses[0]:
             i = 1 + int(np.argmax(masses[1:]))
             raise ValueError(
-                f"`method` {method!r} needs the star as body 0, and body {i} is as heavy: put the heaviest first, or take "
-                "the splitting 'kinetic', such as 'srkn11b'."
+                f"`method` {method!r} needs the star as body 0, and body {i} is as heavy: put the heaviest first, or "
+                "take the splitting 'kinetic', such as 'srkn11b'."
             )
-        i, j = self.pairs
+        one, other = self.pairs
         x, v = states_of(self.elements, self.G * (masses[0] + masses[1:]))
-        d, u = (y[i - 1] - y[j - 1] for y in (x, v))
-        r, q = np.linalg.norm(d, axis=-1), (u * u).sum(-1) / 2
-        bound = (q < self.G * (masses[i] + masses[j]) / r) & (r < MOON * np.maximum(self._hill(i), self._hill(j)))
+        d, u = (y[one - 1] - y[other - 1] for y in (x, v))
+        r = np.linalg.norm(d, axis=-1)
+        close = r < MOON * np.maximum(self._hill(one), self._hill(other))
+        bound = close & ((u * u).sum(-1) / 2 < self.G * (masses[one] + masses[other]) / r)
         if bound.any():
             k = int(np.argmax(bound))
             raise ValueError(
-                f"`method` {method!r} has each body on an orbit about the star, and bodies {i[k]} and {j[k]} are bound to "
-                "each other: take the splitting 'kinetic', such as 'srkn11b', or one body in place of both."
+                f"`method` {method!r} has each body on an orbit about the star, and bodies {one[k]} and {other[k]} are "
+                "bound to each other: take the splitting 'kinetic', such as 'srkn11b', or one body in place of both."
             )
 
     def _hill(self, i: np.ndarray) -> np.ndarray:
@@ -267,28 +276,30 @@ def _joined(x: Array, y: Array, axis: int = -2) -> Array:
 
 
 def _nan_where(condition: Any, x: Array) -> Any:
-    return x[..., 0, 0].detach() * 0 + condition * math.nan if is_tensor(x) else np.where(condition, np.nan, 0.0)
+    """NaN where the condition (...) holds, else 0, of the kind of x."""
+    if is_tensor(x):
+        return (0 * x[..., 0, 0].detach()).masked_fill(condition, math.nan)
+    return np.where(condition, np.nan, 0.0).astype(x.dtype)
 
 
-def frame_of(system: HamiltonianSystem, method: str) -> Frame:
+def frame_of(method: str, name: str, local: Any, y0: Any) -> Frame:
     """The frame of a system of planets, or of any star and bodies in pairs that attract each other as these do.
 
     Raises
     ------
     ValueError
-        If the system is none, or has no `y0`.
+        If the system, of that name and piece, is none, or has no `y0`.
     """
-    local = system.local
     if isinstance(local, PlanetsHamiltonian):
         return local.frame
     G = None if not isinstance(local, PairsHamiltonian) else newtonian(local)
-    if G is None or system.y0 is None:
+    if G is None or y0 is None:
         raise ValueError(
-            f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
+            f"`method` {method!r} is for planets about a star, which {name!r} is not: make it by "
             "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
         )
     assert isinstance(local, PairsHamiltonian)
-    return Frame(local, G, np.asarray(to_numpy(system.y0)))
+    return Frame(local, G, np.asarray(to_numpy(y0)))
 
 
 def newtonian(local: PairsHamiltonian) -> float | None:
@@ -329,9 +340,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return other
 
 
-def checked_planets(
-    masses: Any, elements: Any, y0: Any, G: Any, units: Any
-) -> tuple[np.ndarray, float, np.ndarray]:
+def checked_planets(masses: Any, elements: Any, y0: Any, G: Any, units: Any) -> tuple[np.ndarray, float, np.ndarray]:
     """Masses, G and the state y0 that `HamiltonianSystem.planets` is given, tested.
 
     Raises
@@ -349,18 +358,23 @@ def checked_planets(
     except (TypeError, ValueError):
         raise TypeError(f"`masses` must be an array (n,) of numbers, the star's first; got {given!r}.") from None
     if masses.ndim != 1 or len(masses) < 2:
-        raise ValueError(f"`masses` must be those of a star and one planet or more, an array (n,); got shape {masses.shape}.")
+        raise ValueError(
+            f"`masses` must be those of a star and one planet or more, an array (n,); got shape {masses.shape}."
+        )
     if not (np.isfinite(masses) & (masses >= 0)).all():
         i = int(np.argmin(np.isfinite(masses) & (masses >= 0)))
-        raise ValueError(f"`masses` must be positive, or 0 of bodies that are not felt; that of body {i} is {masses[i]:g}: change it.")
+        raise ValueError(
+            f"`masses` must be positive, or 0 of bodies that are not felt; that of body {i} is {masses[i]:g}: "
+            "change it."
+        )
     if masses[1:].max() >= masses[0]:
         i = 1 + int(np.argmax(masses[1:]))
         raise ValueError(
-            f"`masses` must begin with the star, the heaviest body, and that of body {i} is {masses[i]:g}: put it first, or "
-            "make the system by HamiltonianSystem.pairs."
+            f"`masses` must begin with the star, the heaviest body, and that of body {i} is {masses[i]:g}: put it "
+            "first, or make the system by HamiltonianSystem.pairs."
         )
     if (elements is None) == (y0 is None):
-        raise ValueError("`elements` or `y0` must be given, one of them: the orbits, or the states [q, p].")
+        raise ValueError("`elements` or `y0` must be given, one of them: the orbits, or the state [q, p].")
     if y0 is None:
         y0 = placed(masses, G, _checked_elements(elements, len(masses) - 1))
     y0 = np.array(to_numpy(y0), dtype=float)
@@ -375,8 +389,10 @@ def _checked_elements(elements: Any, n: int) -> np.ndarray:
         unknown = [name for name in elements if name not in ELEMENTS]
         if unknown or "a" not in elements:
             what = f"has {unknown[0]!r}" if unknown else "must have 'a'"
-            raise ValueError(f"`elements` {what}: the names are {', '.join(ELEMENTS)}, of which all but a are 0 by default.")
-        columns: Sequence[Any] = [elements.get(name, 0.0) for name in ELEMENTS]
+            raise ValueError(
+                f"`elements` {what}: the names are {', '.join(ELEMENTS)}, of which all but a are 0 by default."
+            )
+        columns: Any = [elements.get(name, 0.0) for name in ELEMENTS]
     else:
         columns = np.moveaxis(np.asarray(elements, dtype=float), -1, 0) if np.ndim(elements) else ()
     try:
@@ -384,7 +400,9 @@ def _checked_elements(elements: Any, n: int) -> np.ndarray:
     except ValueError:
         table = np.empty((0, 0))
     if table.shape != (n, 6):
-        raise ValueError(f"`elements` must give {', '.join(ELEMENTS)} of {n} planets: arrays ({n},), or one of shape ({n}, 6).")
+        raise ValueError(
+            f"`elements` must give {', '.join(ELEMENTS)} of {n} planets: arrays ({n},), or one of shape ({n}, 6)."
+        )
     a, e, inclination = table[:, :3].T
     for bad, name, remedy in (
         (~np.isfinite(table).all(-1), "numbers that are not finite", "give finite ones"),

@@ -422,19 +422,19 @@ class HamiltonianSystem(Hamiltonian):
         dt: float | None = None,
         energy_scale: float | None = None,
     ) -> HamiltonianSystem:
-        """Planets about a star: H = Σ_i |p_i|²/(2 m_i) − G Σ_{i<j} m_i m_j/r_ij, for the methods of the splitting "kepler".
+        """Planets about a star: H = Σ_i |p_i|²/(2 m_i) − G Σ_{i<j} m_i m_j/r_ij, for methods of the splitting "kepler".
 
         States are inertial, y = [q, p]; ``q.reshape(n, 3)`` are the places of the bodies, the star first. The methods
-        "wisdom_holman" and "kepler_aba864" have coordinates of their own inside of a run only. All other methods take the
-        system as one of `pairs`.
+        "wisdom_holman" and "kepler_aba864" have coordinates of their own inside of a run only. All other methods take
+        the system as one of `pairs`.
 
         Parameters
         ----------
         masses : array_like of shape (n,)
             The star's first, which is the heaviest.
         elements : mapping of str to array_like of shape (n − 1,), or array_like of shape (n − 1, 6)
-            Heliocentric orbital elements of the planets: "a", "e", "inc", "node" (of the ascending node), "peri" (the
-            argument of the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Of hyperbolas
+            Heliocentric orbital elements of the planets: "a", "e", "inc", "node" (ascending), "peri" (the argument of
+             the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Of hyperbolas
             e > 1 and a < 0. The centre of mass is at rest at the origin.
         y0 : array_like of shape (6n,)
             In place of elements: the initial state.

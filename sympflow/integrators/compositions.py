@@ -629,7 +629,7 @@ class KeplerInteraction(Composition):
     """H of planets about a star: Kepler's motion of each, exactly | all else, their interaction.
 
     In Jacobi's coordinates the interaction is a potential, so that every scheme keeps its order. In democratic
-    heliocentric ones it holds the motion of the star too, half of it before a kick and half after, which is of order 2.
+    heliocentric ones it holds the motion of the star too, half before a kick and half after, which is of order 2.
     """
 
     breakdown: ClassVar[Failure | None] = Failure.ENCOUNTER
@@ -650,7 +650,7 @@ class KeplerInteraction(Composition):
             )
         if system.friction is not None:
             self.check_friction(0.0)
-        self.frame = frame_of(system, method)
+        self.frame = frame_of(method, system.name, system.local, system.y0)
         self.frame.check(method)
         self.substeps = _paired([(s.kind, s.one) for s in scheme.substeps])
         self.before: list[tuple[float, float]] = []
@@ -658,8 +658,8 @@ class KeplerInteraction(Composition):
         if corrector is not None:
             if [s[:2] for s in scheme.substeps] != [("drift", 0.5), ("kick", 1.0), ("drift", 0.5)]:
                 raise ValueError(
-                    f"`corrector` goes with the steps of 'wisdom_holman', and method {method!r} makes other ones: leave it "
-                    "out."
+                    f"`corrector` goes with the steps of 'wisdom_holman', and method {method!r} makes other ones: "
+                    "leave it out."
                 )
             self.before, self.after = (_paired(corrector_maps(corrector, sign)) for sign in (1, -1))
 
@@ -677,7 +677,7 @@ class KeplerInteraction(Composition):
 
     def _moved(self, y: Array, h: Any, maps: Sequence[tuple[float, float]], sign: float = 1.0) -> Array:
         frame = self.frame
-        h = h if hasattr(h, "ndim") else like(np.asarray(h, dtype=float), y)
+        h = like(np.asarray(h, dtype=float), y) if isinstance(h, int | float) else h
         x, v, Q, U = frame.into(y)
         for kick, drift in maps:
             if kick:
@@ -718,12 +718,12 @@ def _paired(maps: Sequence[tuple[str, float]]) -> list[tuple[float, float]]:
 
 
 SPLITTINGS: dict[str, type[Composition]] = {
-    "kepler": KeplerInteraction,
     "kinetic": KineticPotential,
     "linear": LinearRest,
     "mollified": MollifiedLinearRest,
     "midpoint": MidpointLinearRest,
     "parts": SolvableParts,
     "copies": TwoCopies,
+    "kepler": KeplerInteraction,
 }
 """The splittings by the name that the option `splitting` takes."""

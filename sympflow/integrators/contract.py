@@ -95,8 +95,8 @@ class Failure(Enum):
     UNSOLVED = "The implicit step could not be solved: Newton's iteration did not converge", "Reduce `dt`"
     CLOCK = "T + B or c − V ceased to be positive and finite", "Reduce `dt`, or raise `shift` above the energy"
     ENCOUNTER = (
-        "Two planets came closer to each other than `encounter` Hill radii, where Kepler's motion about the star is not "
-        "most of theirs",
+        "Two planets came closer to each other than `encounter` Hill radii, where they are no longer on orbits about "
+        "the star",
         "Follow the encounter with the splitting 'kinetic', such as method 'dop853' or 'srkn11b' with short steps",
     )
     STALLED = (

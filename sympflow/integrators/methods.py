@@ -45,9 +45,9 @@ _COPIES = (
     "Mech. Dyn. Astron. 121 (2015) 211–231"
 )
 _KEPLER = (
-    "J. Wisdom and M. Holman, Symplectic maps for the n-body problem, Astron. J. 102 (1991) 1528–1538; H. Rein, D. Tamayo "
-    "and G. Brown, High-order symplectic integrators for planetary dynamics and their implementation in REBOUND, Mon. "
-    "Not. R. Astron. Soc. 489 (2019) 4632–4640"
+    "J. Wisdom and M. Holman, Symplectic maps for the n-body problem, Astron. J. 102 (1991) 1528–1538; H. Rein, D. "
+    "Tamayo and G. Brown, High-order symplectic integrators for planetary dynamics and their implementation in "
+    "REBOUND, Mon. Not. R. Astron. Soc. 489 (2019) 4632–4640"
 )
 _LOGARITHMIC = (
     "S. Mikkola and K. Tanikawa, Celest. Mech. Dyn. Astron. 74 (1999) 287–295; M. Preto and S. Tremaine, Astron. J. "
@@ -95,8 +95,9 @@ TRIPLES: dict[str, Triple] = {
         for name in ("leapfrog", "blanes_moan4", "kahan_li8")
     },
 }
-"""The splitting methods. `kepler_*` are for planets about a star, `linear_*` have the exact linear flow, `*_parts` any number of parts, `tao*` are for any H, on
-two copies of phase space, `log_*` have steps that are equal on the logarithmic Hamiltonian."""
+"""The splitting methods. `wisdom_holman` and `kepler_*` are for planets, `linear_*` have the exact linear flow,
+`*_parts` any number of parts, `tao*` are for any H, on two copies of phase space, `log_*` have steps that are equal on
+the logarithmic Hamiltonian."""
 
 CLASSES: dict[str, str] = {
     "rk45": "scipy_methods:RK45",

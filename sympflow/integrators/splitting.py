@@ -153,8 +153,8 @@ class Splitting(OwnStepper):
         of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the copies; a run
         keeps both, and is symplectic in their phase space [3]_.
     corrector : int, optional
-        For the splitting "kepler" and drift–kick–drift steps, as of "wisdom_holman": the order of a symplectic corrector,
-        3, 5, … 17, which is applied at the start, and its inverse to each output. It removes errors of the energy of
+        For the splitting "kepler" and drift–kick–drift steps, as of "wisdom_holman": the order of a symplectic
+        corrector, 3, 5, … 17, which is applied at the start, and its inverse to each output. It removes errors of
         first order in the masses of the planets, and costs nothing in between.
     shift : float, optional
         For the logarithmic clock: c, above the energy; default E + |E|, which is 0 for a bound system.

@@ -16,14 +16,14 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler.control import INT, Code, Type, Value
+from sympflow.compiler.control import Code, Type, Value
 from sympflow.compiler.functions import where
 from sympflow.hamiltonian.kepler import coefficients, dot, kepler_flow, moved, series
 from sympflow.hamiltonian.planets import Frame
@@ -43,8 +43,8 @@ AWAY = 1e3  # of the largest orbit: where lanes without a planet are
 WORK = 250  # nanoseconds of a stage
 ONE = np.ones(1, dtype=np.int64)
 ROWS = ("Gm", "mu", "weight", "ratio", "over", "mass", "star", "share")
-"""Constants of each planet: Gm, μ, its share in the mass up to it, that mass over the one before, 1 over that, m, the G m
-of the star, its mass as a part of the star's."""
+"""Constants of each planet: Gm, μ, its share in the mass up to it, that mass over the one before, 1 over that, m, the
+G m of the star, its mass as a part of the star's."""
 
 Substeps = Sequence[tuple[float, float]]
 """Kicks and the drifts after them, one after the other, of a step or a processor, times its length."""
@@ -77,9 +77,13 @@ class KeplerCode(Rollouts):
         code, type = room.code, Type("double", LANES)
         kick, drift = (code.splat(numbers(i), LANES) for i in range(2))
         table = room.data(0)
-        known = [[code.load(table, (len(ROWS) * g + i) * LANES, type) for i in range(len(ROWS))] for g in range(self.groups)]
+        known = [
+            [code.load(table, (len(ROWS) * g + i) * LANES, type) for i in range(len(ROWS))] for g in range(self.groups)
+        ]
         c = [dict(zip(ROWS, rows, strict=True)) for rows in known]
-        state = [[code.load(room.state, NUMBERS * g + LANES * i, type) for i in range(2 * AXES)] for g in range(self.groups)]
+        state = [
+            [code.load(room.state, NUMBERS * g + LANES * i, type) for i in range(2 * AXES)] for g in range(self.groups)
+        ]
         x, v = ([group[k : k + AXES] for group in state] for k in (0, AXES))
         if not self.jacobi:
             x = self._jumped(x, v, c, 0.5 * kick)
@@ -117,7 +121,9 @@ class KeplerCode(Rollouts):
                         theirs = w * c[one]["Gm"]
                         a[other] = [p - code.shuffle(q * theirs, zero, back) for p, q in zip(a[other], d, strict=True)]
                     if self.watches:
-                        near = square < code.load(limits, ((one * self.groups + other) * LANES + k) * LANES, square.type)
+                        near = square < code.load(
+                            limits, ((one * self.groups + other) * LANES + k) * LANES, square.type
+                        )
                         close = near if close is None else close | near
         if close is not None:
             t = t + self._met(room, code.any(close), h, t)
@@ -133,7 +139,9 @@ class KeplerCode(Rollouts):
             own = own * inverses[g] * inverses[g] * inverses[g]
             weighted = [c[g]["mass"] * p for p in a[g]]
             outer = [_suffix(code, p, zero) + q for p, q in zip(weighted, behind, strict=True)]
-            behind = [q + code.splat(code.total(p), LANES) for p, q in zip(weighted, behind, strict=True)] if g else behind
+            behind = (
+                [q + code.splat(code.total(p), LANES) for p, q in zip(weighted, behind, strict=True)] if g else behind
+            )
             change = [c[g]["ratio"] * p + c[g]["over"] * q + own * y for p, q, y in zip(a[g], outer, x[g], strict=True)]
             new.append([p + t * q for p, q in zip(v[g], change, strict=True)])
         return new[::-1]
@@ -216,7 +224,7 @@ def drifted(x: Vectors, v: Vectors, mu: Value, t: Value, r: Value, inverse: Valu
     worst = code.apply("max", (code.apply("max", (errors[0], errors[1])), 1e16 * (d * d)))
     size = code.apply("abs", (beta * square,))
     late = 2.0 * code.apply("abs", (t - c[1],))
-    bad = (square < worst) | (LONGEST < size) | (code.apply("abs", (t,)) < late)
+    bad = (square < worst) | (size > LONGEST) | (code.apply("abs", (t,)) < late)
 
     def again() -> Vectors:
         types = [value.type for value in (*x, *v, mu, t)]
@@ -243,7 +251,16 @@ def constants(frame: Frame, groups: int) -> tuple[np.ndarray, np.ndarray]:
     table = np.zeros((len(ROWS), groups * LANES))
     m, S = masses[frame.order], frame.sums
     table[:, :] = np.array([0.0, G * S[-1], 0.0, 1.0, 0.0, 0.0, G * masses[0], 0.0])[:, None]
-    table[:, :n] = [G * m, frame.mu[:n], m / S[1:], S[1:] / S[:-1], 1 / S[:-1], m, np.full(n, G * masses[0]), m / masses[0]]
+    table[:, :n] = [
+        G * m,
+        frame.mu[:n],
+        m / S[1:],
+        S[1:] / S[:-1],
+        1 / S[:-1],
+        m,
+        np.full(n, G * masses[0]),
+        m / masses[0],
+    ]
     limits = np.zeros((groups * LANES, groups * LANES))
     i, j = np.triu_indices(n, 1)
     limits[i, j] = limits[j, i] = frame.limits
@@ -282,13 +299,18 @@ class KeplerLoops:
         return np.ascontiguousarray(groups).reshape(len(y), -1)
 
     def states(self, rows: np.ndarray, y0: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """The states (..., n, 2d) at times (n,) of running ones, of runs from y0 (..., 2d), whose centre moves on a line."""
-        _, _, Q, U = (z[..., None, :] for z in self.frame.into(y0))
-        planets = rows.reshape(*rows.shape[:-1], self.code.groups, 2 * AXES, LANES).swapaxes(-1, -2)
-        planets = planets.reshape(*rows.shape[:-1], -1, 2 * AXES)[..., : len(self.frame.order), :]
-        y = self.frame.out(planets[..., :AXES], planets[..., AXES:], Q + times[:, None] * U, U + 0 * times[:, None])
+        """The states (..., n, 2d) after times (n,) of running ones, of runs from y0 (..., 2d)."""
+        y = self.moved(rows, y0[..., None, :], times)
         y[..., times == 0, :] = y0[..., None, :]
         return y
+
+    def moved(self, rows: np.ndarray, y0: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """The states of running ones (..., n_values), after times since those y0 (..., 2d)."""
+        *_, Q, U = self.frame.into(y0)
+        planets = rows.reshape(*rows.shape[:-1], self.code.groups, 2 * AXES, LANES).swapaxes(-1, -2)
+        planets = planets.reshape(*rows.shape[:-1], -1, 2 * AXES)[..., : len(self.frame.order), :]
+        centre = Q + times[..., None] * U
+        return self.frame.out(planets[..., :AXES], planets[..., AXES:], centre, U + 0 * centre)
 
 
 class KeplerKernel(Kernel):
@@ -363,7 +385,9 @@ class KeplerKernel(Kernel):
             else:
                 code.rollout_batch(columns, *rest)
 
-        out, n_finite, _ = run_states(rows, start, n_steps, save, threads, carry, start.shape[1], WORK * len(self.columns))
+        out, n_finite, _ = run_states(
+            rows, start, n_steps, save, threads, carry, start.shape[1], WORK * len(self.columns)
+        )
         return Run(loops.states(out, y0, save * h), n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
@@ -376,7 +400,4 @@ class KeplerKernel(Kernel):
         self.loops.code.rollout_batch(
             self._table(lengths, columns), start, 1, ONE, out, n_finite, NEVER, 0, running, False
         )
-        x, v, Q, U = self.loops.frame.into(y)
-        planets = out[:, 0].reshape(len(y), -1, 2 * AXES, LANES).swapaxes(-1, -2).reshape(len(y), -1, 2 * AXES)
-        planets = planets[:, : x.shape[1]]
-        return Steps(self.loops.frame.out(planets[..., :AXES], planets[..., AXES:], Q + lengths[:, None] * U, U))
+        return Steps(self.loops.moved(out[:, 0], y, lengths))
