@@ -334,6 +334,17 @@ class PlanetsHamiltonian(PairsHamiltonian):
     def frame(self) -> Frame:
         return Frame(self, self.params["G"], self.start, self.coordinates, self.encounter)
 
+    def remark(self, q: np.ndarray) -> str:
+        i, j = self.frame.pairs
+        if not len(i):
+            return ""
+        x = q.reshape(-1, 3)
+        distance = np.linalg.norm(x[i] - x[j], axis=-1)
+        ratio = distance / self.frame.hill_radii(i, j)
+        k = int(np.argmin(ratio))
+        one, other = sorted((int(i[k]), int(j[k])))
+        return f"the nearest planets, {one} and {other}, are {distance[k]:.4g} apart, {ratio[k]:.3g} Hill radii."
+
     def with_params(self, values: Mapping[str, Any]) -> Self:
         other = super().with_params(values)
         vars(other).pop("frame", None)
