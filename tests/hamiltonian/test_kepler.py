@@ -81,7 +81,9 @@ def test_backwards_batches_and_tensors():
     assert np.median(np.abs(np.array(back[0]) - x)) < 1e-14
     one = kepler_flow([a[7] for a in x], [a[7] for a in v], 1.3, t[7])
     assert [a[7] for a in (*there[0], *there[1])] == [*one[0], *one[1]]
-    tensors = kepler_flow(*[[torch.tensor(a) for a in z] for z in (x, v)], torch.tensor(1.3).double(), torch.tensor(t))
+    tensors = kepler_flow(
+        *[[torch.tensor(a) for a in z] for z in (x, v)], torch.tensor(1.3, dtype=torch.float64), torch.tensor(t)
+    )
     assert np.allclose(torch.stack(tensors[0]).numpy(), there[0], rtol=1e-9)
 
 

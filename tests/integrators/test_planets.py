@@ -149,7 +149,7 @@ def test_long_drifts_and_eccentric_orbits():
         [1.0, 1e-5, 1e-6], elements={"a": [1.0, 40.0], "e": [0.99, 0.9], "M": [3.0, 0.1]}
     )
     for dt in (0.1, 2.0, 40.0, -3.0):
-        t = np.sign(dt) * np.abs(dt) * np.arange(6)
+        t = np.sign(dt) * np.abs(dt) * np.arange(3)
         runs = [
             solve(system, "wisdom_holman", (0, t[-1]), dt=abs(dt), t_eval=t, backend=b).y for b in ("auto", "array")
         ]
