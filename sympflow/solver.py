@@ -26,12 +26,11 @@ from sympflow.arguments import (
 )
 from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable, to_numpy
 from sympflow.events import EventSearch, parse
-from sympflow.hamiltonian.scales import default_step
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, report_lanes, run_and_search
-from sympflow.integrators.choosing import check_tolerance, choose_method, step_for
+from sympflow.integrators.base import report_lanes, run_and_search
+from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling
+from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling, warn_of_long_steps
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
@@ -236,8 +235,8 @@ def solve(
     steps_chosen = tol is not None and "tol" not in integrator.options()
     if tol is not None and steps_chosen:
         integrator = replace(integrator, dt=step_for(integrator, problem, tol, tol_of))  # type: ignore[type-var]
-    elif system.step_is_open and isinstance(integrator, FixedStep) and not integrator.trained and readable(y_start):
-        integrator = replace(integrator, dt=integrator.dt or default_step(system, to_numpy(y_start)))
+    elif system.step_is_open and readable(y_start):
+        integrator = with_step(integrator, system, to_numpy(y_start))
     sol = _shown(integrator, problem, action, rows, progress)
     if (
         tol is not None
@@ -357,6 +356,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         check_domain(outcome, integrator, between, action)
         if problem.store is None and not failed and between is system:
             warn_of_loss(outcome, integrator, system, y_start, stacklevel=4)
+    if problem.diagnosed and rows is None and not failed and problem.store is None and readable(outcome.y):
+        warn_of_long_steps(outcome, integrator, problem, stacklevel=4)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     sol = (Solution if problem.store is None else StoredSolution)(
         t=outcome.t,
@@ -380,11 +381,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
 
 
 def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
-    """The solution of a batch whose trajectories have parameters of their own.
-
-    Those whose values are numbers of one run are solved together, and where the method or the system has no such run,
-    those of equal values.
-    """
+    """The solution of a batch whose trajectories have parameters of their own."""
     states = problem.y0.reshape(-1, problem.y0.shape[-1])
     groups = []
     alike = action == "ignore" and problem.system.between_impulses is problem.system
@@ -535,11 +532,7 @@ def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> N
 
 
 def _run_endless(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
-    """The outcome of a run to an infinite end, and the problem with the end that was reached.
-
-    Where the method looks for events as it goes, and its grid costs nothing, it is one run, of `MOST_OPEN_STEPS` at
-    most; else there are ever longer ones.
-    """
+    """The outcome of a run to an infinite end, and the problem with the end that was reached."""
     search, size = problem.events, math.prod(problem.y0.shape)
     assert search is not None
     length = integrator.step_length(problem.system) or problem.system.dt

@@ -23,16 +23,29 @@ from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.times import check_period, probe_times
+from sympflow.show.cards import Card, Shown, cut, numbers
 
 if TYPE_CHECKING:
     import sympy
 
+    from sympflow.hamiltonian.lattice_states import LatticeStates
     from sympflow.hamiltonian.linear_part import LinearPart
     from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.hamiltonian.local_states import LocalStates
     from sympflow.hamiltonian.symbolic import Kick
 
 MOST_DEGREES = 1_000_000
+UNNAMED = "custom"
+TYPESET = 400
+"""Characters of an H that notebooks typeset."""
+GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
+PROPER = {"henon_heiles": "Hénon–Heiles"}
+SHOWN_NAMES = (
+    *("autonomous", "conservative", "damping", "domain", "dt", "energy_scale", "exact", "expression", "force"),
+    *("from_sympy", "gradient", "hamiltonian", "hessian", "kinetic", "lattice", "linear_part", "name", "ndof", "pairs"),
+    *("params", "period", "potential", "separable", "symbols", "t_span", "vector_field", "velocity"),
+    *("with_force", "with_params", "y0"),
+)
+"""The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
 
@@ -53,7 +66,7 @@ class Parameters(dict[str, Any]):
         return Parameters, (dict(self),)
 
 
-class HamiltonianSystem(Hamiltonian):
+class HamiltonianSystem(Hamiltonian, Shown):
     """A Hamiltonian system x' = J∇H(x), x = [q, p]; with `time` H(t, x); with `damping` p' = −∂H/∂q − Γp.
 
     Parameters
@@ -146,7 +159,7 @@ class HamiltonianSystem(Hamiltonian):
         time: bool = False,
         period: float | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "custom",
+        name: str = UNNAMED,
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 100.0),
@@ -198,7 +211,7 @@ class HamiltonianSystem(Hamiltonian):
         time: str | sympy.Symbol | None = None,
         period: float | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "custom",
+        name: str = UNNAMED,
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 100.0),
@@ -479,25 +492,22 @@ class HamiltonianSystem(Hamiltonian):
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
     ) -> HamiltonianSystem:
-        """A few sites of a lattice, or a few bodies, with the same terms: what a flow for a large one is fitted on.
+        """A few sites of a lattice with the same terms: what a flow for a large one is fitted on.
 
-        A ring has as many bonds for each site as the inside of a large lattice, whatever the ends of that are. Bodies
-        have a piece if they are of one kind and mass, without `box`, and V has a minimum and a short range, so that it
-        holds a few of them together.
+        A ring has as many bonds for each site as the inside of a large lattice, whatever the ends of that are.
 
         Parameters
         ----------
         sites : int or sequence of ints, optional
             Sites along each axis; the default is 6 of a lattice of one axis, 4 by 4 of one of two and 3 by 3 by 3 of
-            one of three, more where bonds reach farther. Of bodies their number: 4, 7 or 13 in one, two or three
-            dimensions.
+            one of three, more where bonds reach farther.
         boundary : str, or one for each axis
-            As in `lattice`; of lattices only.
+            As in `lattice`.
 
         Returns
         -------
         HamiltonianSystem
-            With `sympflow.LatticeStates` or `sympflow.ClusterStates` of the same energy density as its domain, where
+            With `sympflow.LatticeStates` of the same energy density as its domain, where
             the system has a domain or a `y0` from which that is found. Arrays in `params` are cut to the first sites.
 
         Raises
@@ -527,19 +537,18 @@ class HamiltonianSystem(Hamiltonian):
         scene = None, self.t_span, self.dt, None
         return HamiltonianSystem._of_pieces(local, self.damping, self.name, domain, *scene)
 
-    def local_states(self) -> LocalStates | None:
+    def local_states(self) -> LatticeStates | None:
         """The states, for any size, at the energy density of the domain, or else of `y0`; None without both."""
         domain = self.domain
         if domain is None and self.y0 is None:
             return None
-        from sympflow.hamiltonian.domain import states_of
-        from sympflow.hamiltonian.local_states import DRAWN, LocalStates
+        from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 
-        if isinstance(domain, LocalStates):
+        if isinstance(domain, LatticeStates):
             return domain
         states = self.y0 if domain is None else domain.sample(DRAWN)
         assert states is not None
-        return states_of(self, states)
+        return LatticeStates.of_states(self, states)
 
     @cached_property
     def _few_sites(self) -> HamiltonianSystem:
@@ -918,7 +927,39 @@ class HamiltonianSystem(Hamiltonian):
             kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
-        return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
+        degrees = f"{self.ndof:,} degree{'s' * (self.ndof > 1)} of freedom"
+        named = self.title if self.name == UNNAMED and self.symbols is not None else f"{self.name}({params})"
+        return f"<HamiltonianSystem {named}: {degrees}, {kind}>"
+
+    @property
+    def title(self) -> str:
+        """The name and the parameters as they are printed; H where the name says nothing."""
+        params = parameters_text(self.params, GREEK, " = ")
+        name = PROPER.get(self.name, self.name.replace("_", " "))
+        if self.name == UNNAMED and self.symbols is not None:
+            name = cut(f"H = {self.symbols.written[0]}", 60)
+        return name + (f", {params}" if params else "")
+
+    def card(self) -> Card:
+        H, formula = "" if self.symbols is None else str(self.symbols.H), ""
+        if 0 < len(H) <= TYPESET:
+            import sympy
+
+            formula = "H = " + sympy.latex(self.symbols.H)  # type: ignore[union-attr]
+        facts = {
+            "H": "" if formula else H,
+            "parameters": parameters_text(self.params, GREEK, " = "),
+            "degrees of freedom": f"{self.ndof:,}",
+            "structure": repr(self).rsplit("freedom, ", 1)[-1].rstrip(">"),
+            "y0": "" if self.y0 is None else numbers(self.y0),
+            "t_span": f"{self.t_span[0]:g} … {self.t_span[1]:g}",
+            "dt": "" if self._dt is None else f"{self._dt:g}",
+            "domain": "" if self.domain is None else repr(self.domain),
+        }
+        return Card(self.title, facts, formula=formula)
+
+    def __dir__(self) -> list[str]:
+        return [*SHOWN_NAMES]
 
 
 def _check_no_time(time: object) -> None:
@@ -960,19 +1001,7 @@ COUNTED = {
 
 
 def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
-    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    count : callable
-        Called with what is evaluated, a value of `COUNTED`, and the states or positions (..., k).
-
-    Returns
-    -------
-    HamiltonianSystem
-        Equal to `system`, so that whatever is kept by system is found by the view too.
-    """
+    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it."""
     view = copy.copy(system)
     vars(view).pop("between_impulses", None)  # the view itself, where there are none
     view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]

@@ -27,10 +27,9 @@ from sympflow.compiler.control import Code, Type, Value
 from sympflow.compiler.functions import where
 from sympflow.hamiltonian.kepler import coefficients, dot, kepler_flow, moved, series
 from sympflow.hamiltonian.planets import Frame
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
+from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts, zeros
 from sympflow.kernels.runs import Numbers, Room
-from sympflow.kernels.threads import NEVER
 
 __all__ = ["KeplerKernel", "Substeps"]
 
@@ -325,8 +324,6 @@ class KeplerKernel(Kernel):
         The processor and its inverse; empty for none.
     """
 
-    saves_finite = True
-
     def __init__(self, loops: KeplerLoops, substeps: Substeps, before: Substeps = (), after: Substeps = ()) -> None:
         self.loops, self.before, self.after, self.step_itself = loops, before, after, [*before, *substeps, *after]
         *rest, last = substeps
@@ -340,19 +337,16 @@ class KeplerKernel(Kernel):
         entries = np.asarray(h, dtype=float)[..., None, None] * np.asarray(columns)
         return np.ascontiguousarray(entries), np.zeros(len(columns), dtype=np.int64)
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
-        loops, columns = self.loops, self._table(h, self.columns)
-        self.remark, start = "", loops.rows(y0[None])[0]
+    def runs(self, task: Task) -> Run:
+        loops, columns, start = self.loops, self._table(task.h, self.columns), self.loops.rows(task.y0)
         if self.before:
-            tables = self._table(h, self.before), columns, self._table(h, [self.columns[-1], *self.after])
-            rollout = partial(loops.code.rollout_processed, *tables)
+            after = self._table(task.h, [self.columns[-1], *self.after])
+            run = partial(loops.code.run_processed, self._table(task.h, self.before), columns, after)
         else:
-            rollout = partial(loops.code.rollout, columns)
-        work = WORK * len(self.columns)
-        rows, n_finite, _ = run_state(rollout, start, n_steps, save, carry, len(start), work)
-        if n_finite < n_steps:
-            self.remark = self._pair()
-        return Run(loops.states(rows, y0, save * h), n_finite)
+            run = partial(loops.code.run, columns)
+        rows, n_finite, _ = run_states(run, task._replace(y0=start), start.shape[1], WORK * len(self.columns))
+        self.remark = self._pair() if len(start) == 1 and n_finite[0] < task.n_steps else ""
+        return Run(loops.states(rows, task.y0, task.save * task.h), n_finite)
 
     def _pair(self) -> str:
         """A clause on the planets that met."""
@@ -366,38 +360,11 @@ class KeplerKernel(Kernel):
         radii = frame.encounter * distance[k] / np.sqrt(frame.limits[k])
         return f" Bodies {one} and {other} were {distance[k]:.4g} apart, {radii:.3g} Hill radii."
 
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-    ) -> Run:
-        loops, columns = self.loops, self._table(h, self.columns)
-        code, start = loops.code, loops.rows(y0)
-        tables = self._table(h, self.before), columns, self._table(h, [self.columns[-1], *self.after])
-
-        def rows(_: slice, *rest: Any) -> None:
-            if self.before:
-                code.rollout_processed_batch(*tables, *rest)
-            else:
-                code.rollout_batch(columns, *rest)
-
-        out, n_finite, _ = run_states(
-            rows, start, n_steps, save, threads, carry, start.shape[1], WORK * len(self.columns)
-        )
-        return Run(loops.states(out, y0, save * h), n_finite)
-
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
         columns = [*self.step_itself, (0.0, 0.0), (0.0, 0.0)]
         rows = self.loops.rows(y)
         start = np.concatenate([rows, np.arange(len(y), dtype=float)[:, None]], axis=1)
-        out, n_finite = np.empty((len(y), 1, rows.shape[1])), np.empty(len(y), dtype=np.int64)
-        running = np.empty((len(y), 0))
-        self.loops.code.rollout_batch(
-            self._table(lengths, columns), start, 1, ONE, out, n_finite, NEVER, 0, running, False
-        )
-        return Steps(self.loops.moved(out[:, 0], y, lengths))
+        batch = Batch.whole(start, 1, ONE, rows.shape[1])
+        self.loops.code.run(self._table(lengths, columns), batch, False)
+        return Steps(self.loops.moved(batch.out[:, 0], y, lengths))

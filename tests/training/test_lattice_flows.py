@@ -9,7 +9,7 @@ import sympflow
 from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
 from sympflow.flow.primed import PrimedFlow
 from sympflow.training import energy_runs, table_fit
-from sympflow.training.lattice_fit import TAIL, Piece
+from sympflow.training.lattice_fit import TAIL, LatticePiece
 
 BOND = "r**2/2 + r**4/4"
 FIT = {"restarts": 1, "steps": 8, "points": 20, "label_times": 3, "reference_states": 10, "progress": False}
@@ -50,7 +50,7 @@ def test_a_piece_has_the_states_of_the_lattice():
     of_box = ring(6, domain=Box([-0.5] * 12, [0.5] * 12)).piece().domain
     assert 0.01 < of_box.bounds[0] < of_box.bounds[1] < 1
     large = ring(200)
-    fitted = Piece.of(large, LatticeStates((0.1, 0.3)).of(large))
+    fitted = LatticePiece.of(large, LatticeStates((0.1, 0.3)).of(large))
     assert fitted.domain.bounds == (0.1, TAIL * 0.3)  # a few neighbours have more than all of them
     assert fitted.states.bounds == (0.1, 0.3)
     assert ring(200).piece(8).domain is None
@@ -142,10 +142,10 @@ def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
     lattice = ring(domain=LatticeStates(0.2))
     with pytest.raises(ValueError, match=r"^`runs` must be a positive integer; got 0"):
         train(lattice, flow=flow, runs=0, **FIT)
-    with pytest.raises(ValueError, match=r"^`runs` are of lattices and like bodies that keep their energy, and"):
+    with pytest.raises(ValueError, match=r"^`runs` are of lattices that keep their energy, and"):
         train(ring(damping=0.1, domain=LatticeStates(0.2)), dt=0.2, runs=4, **FIT)
     pendulum = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", domain=Box([-1, -1], [1, 1]))
-    with pytest.raises(ValueError, match=r"^`runs` are of lattices and like bodies that keep their energy, and"):
+    with pytest.raises(ValueError, match=r"^`runs` are of lattices that keep their energy, and"):
         train(pendulum, dt=0.5, runs=4, **FIT)
     with pytest.raises(ValueError, match=r"^`runs` begin in states of a larger piece of the system, and `data`"):
         train(lattice, runs=4, data=([0.1], np.zeros((1, 512)), np.zeros((1, 512))))
