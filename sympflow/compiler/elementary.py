@@ -20,7 +20,7 @@ from functools import partial
 from typing import Any
 
 from sympflow.compiler.control import DOUBLE, LOWERED, Type, Value
-from sympflow.compiler.functions import fma, where
+from sympflow.compiler.functions import OF_SCIPY, SPECIAL, fma, where
 
 __all__ = ["LOWERED"]
 
@@ -495,6 +495,17 @@ def _mod_far(x: Value, y: Value) -> Value:
 
 for _name in ("asin", "acos", "atan2", "sinh", "cosh", "asinh", "acosh", "atanh", "erf", "erfc", "lgamma"):
     _lowered(_name, inline=0)(partial(_by_library, name=_name))
+
+
+def _by_scipy(*args: Value, name: str) -> Value:
+    """The value that SciPy gives, lane by lane, with a number after the arguments that Cython's functions have."""
+    code, type = args[0].code, args[0].type
+    symbol = f"{SPECIAL}{name}"
+    return code.lanes(lambda *lane: code.external(symbol, lane, DOUBLE, "i32 0"), args, type)
+
+
+for _name in OF_SCIPY:
+    _lowered(_name, inline=0)(partial(_by_scipy, name=_name))
 
 
 # the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.12 from 16 on, below by

@@ -115,6 +115,33 @@ def _chosen(sign: float) -> Callable[..., tuple[Any, Any]]:
     return partials
 
 
+def _no_tensors(name: str) -> Callable[..., Any]:
+    """The function of tensors, which there is not."""
+
+    def function(*args: Any) -> Any:
+        raise TypeError(f"{name} is not a function of tensors: pass NumPy arrays.")
+
+    return function
+
+
+def _by_last(slope: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
+    """Derivatives of a function of an order, a number, and of x."""
+
+    def partials(y: Any, order: Any, x: Any) -> tuple[Any, Any]:
+        if not isinstance(order, float | int):
+            raise NotImplementedError(
+                "the order of a special function must be a number, by which it has no derivative."
+            )
+        return 0.0, slope(y, order, x)
+
+    return partials
+
+
+def _bessel(name: str, before: float, after: float) -> Callable[..., Any]:
+    """The derivative of a Bessel function, half of a sum of those of the orders before and after."""
+    return lambda y, n, x: 0.5 * (before * apply(name, n - 1.0, x) + after * apply(name, n + 1.0, x))
+
+
 _TWO_OVER_ROOT_PI = 2.0 / np.sqrt(np.pi)
 
 # fmt: off
@@ -163,8 +190,27 @@ FUNCTIONS: dict[str, Function] = {
     "lgamma": Function(_special("gammaln"), "lgamma", lambda y, x: (apply("digamma", x),), 160),
     "digamma": Function(_special("psi"), "digamma", lambda y, x: (apply("trigamma", x),), 160),
     "trigamma": Function(_trigamma, _trigamma_of_tensors, _no_further, 160),
+    "gamma": Function(_special("gamma"), _no_tensors("gamma"), lambda y, x: (y * apply("digamma", x),), 160),
+    "gammainc": Function(_special("gammainc"), _no_tensors("gammainc"), _by_last(
+        lambda y, s, x: apply("pow", x, s - 1.0) * apply("exp", -x) / apply("gamma", s)), 200),
+    "gammaincc": Function(_special("gammaincc"), _no_tensors("gammaincc"), _by_last(
+        lambda y, s, x: -(apply("pow", x, s - 1.0) * apply("exp", -x)) / apply("gamma", s)), 200),
+    "jv": Function(_special("jv"), _no_tensors("jv"), _by_last(_bessel("jv", 1.0, -1.0)), 300),
+    "yv": Function(_special("yv"), _no_tensors("yv"), _by_last(_bessel("yv", 1.0, -1.0)), 300),
+    "iv": Function(_special("iv"), _no_tensors("iv"), _by_last(_bessel("iv", 1.0, 1.0)), 300),
+    "kv": Function(_special("kv"), _no_tensors("kv"), _by_last(_bessel("kv", -1.0, -1.0)), 300),
+    "ellipk": Function(_special("ellipk"), _no_tensors("ellipk"), lambda y, m: (
+        (apply("ellipe", m) - (1.0 - m) * y) / (2.0 * m * (1.0 - m)),), 200),
+    "ellipe": Function(_special("ellipe"), _no_tensors("ellipe"), lambda y, m: (
+        (y - apply("ellipk", m)) / (2.0 * m),), 200),
+    "expi": Function(_special("expi"), _no_tensors("expi"), lambda y, x: (apply("exp", x) / x,), 200),
+    "exp1": Function(_special("exp1"), _no_tensors("exp1"), lambda y, x: (-(apply("exp", -x) / x),), 200),
+    "dawsn": Function(_special("dawsn"), _no_tensors("dawsn"), lambda y, x: (1.0 - 2.0 * x * y,), 200),
 }
 # fmt: on
+OF_SCIPY = ("gamma", "gammainc", "gammaincc", "jv", "yv", "iv", "kv", "ellipk", "ellipe", "expi", "exp1", "dawsn")
+"""Functions of `scipy.special` that compiled code calls, at their addresses."""
+SPECIAL = "scipy_special_"  # with which their names in code begin
 
 
 def apply(name: str, *args: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import re
 import threading
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import llvmlite.binding as llvm
 
 from sympflow.compiler import elementary  # noqa: F401  (code of functions, which texts are made of)
+from sympflow.compiler.functions import SPECIAL
 
 __all__ = ["Host", "address", "compiled", "host"]
 
@@ -55,6 +57,7 @@ def _target(level: int = 2) -> Any:
 
 _LOCK = threading.RLock()
 _LOADED: dict[str, Any] = {}
+_RESOLVED: set[str] = set()
 
 
 def compiled(text: str, name: str, signature: Any) -> Any:
@@ -72,6 +75,8 @@ def compiled(text: str, name: str, signature: Any) -> Any:
     """
     key = hashlib.sha256("\0".join([text, *map(str, host()), llvm.llvm_version_info.__repr__()]).encode()).hexdigest()
     with _LOCK:
+        if SPECIAL in text:
+            _resolve(set(re.findall(rf"@({SPECIAL}\w+)\(", text)))
         engine = _LOADED.get(key)
         if engine is None:
             code = _stored(key)
@@ -80,6 +85,22 @@ def compiled(text: str, name: str, signature: Any) -> Any:
                 _store(key, code)
             engine = _LOADED[key] = _engine(code)
     return signature(engine.get_function_address(name))
+
+
+def _resolve(names: set[str]) -> None:
+    """Tell the linker where functions of `scipy.special` are, of the names that a text has."""
+    from scipy.special import cython_special
+
+    capsules = cython_special.__pyx_capi__
+    for symbol in names - _RESOLVED:
+        name = symbol.removeprefix(SPECIAL)
+        capsule = capsules[f"__pyx_fuse_1{name}" if f"__pyx_fuse_1{name}" in capsules else name]
+        ctypes.pythonapi.PyCapsule_GetName.restype = ctypes.c_char_p
+        ctypes.pythonapi.PyCapsule_GetPointer.restype = ctypes.c_void_p
+        kind = ctypes.pythonapi.PyCapsule_GetName(ctypes.py_object(capsule))
+        place = ctypes.pythonapi.PyCapsule_GetPointer(ctypes.py_object(capsule), ctypes.c_char_p(kind))
+        llvm.add_symbol(symbol, place)
+        _RESOLVED.add(symbol)
 
 
 def address(array: Any) -> int:

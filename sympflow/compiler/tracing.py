@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler.functions import apply
+from sympflow.compiler.functions import OF_SCIPY, apply
 from sympflow.compiler.program import Program, Recording, Traced
 
 __all__ = ["TracedArray", "Untraceable", "trace"]
@@ -328,6 +328,8 @@ ELEMENTS: dict[str, Callable[..., Any]] = {
     "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0), "heaviside": _heaviside,
     "logaddexp": _logaddexp, "expit": _sigmoid, "log_expit": lambda x: -_softplus(-x),
     "xlogy": lambda x, y: _choose(apply("eq", x, 0.0), 0.0, x * apply("log", y)),
+    **{name: _of(name) for name in OF_SCIPY}, **{f"{f}{n}": lambda x, f=f, n=n: apply(f"{f}v", float(n), x)
+       for f in "jyik" for n in (0, 1)},
     "clip": lambda x, low, high: apply("min", apply("max", x, low), high),
 }
 # fmt: on

@@ -38,12 +38,19 @@ ELEMENTARY = (
 )
 SPECIAL = (
     "erf", "erfc", "gamma", "loggamma", "besselj", "bessely", "besseli", "besselk", "airyai", "airybi",
-    "elliptic_k", "elliptic_e", "LambertW",
+    "elliptic_k", "elliptic_e", "LambertW", "lowergamma", "uppergamma", "Ei",
 )
 # fmt: on
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Max", "Min", "Rational", "DiracDelta")},
     "ln": sp.log,
+    "log10": lambda x: sp.log(x) / sp.log(10),
+    "log2": lambda x: sp.log(x) / sp.log(2),
+    "log1p": lambda x: sp.log(1 + x),
+    "expm1": lambda x: sp.exp(x) - 1,
+    "hypot": lambda x, y: sp.sqrt(x**2 + y**2),
+    "Mod": sp.Mod,
+    "mod": sp.Mod,
     "abs": sp.Abs,
     "max": sp.Max,
     "min": sp.Min,

@@ -55,6 +55,13 @@ _RULES: dict[type, Callable[..., Any]] = {
     sp.asinh: lambda x: apply("asinh", x), sp.acosh: lambda x: apply("acosh", x),
     sp.atanh: lambda x: apply("atanh", x), sp.erf: lambda x: apply("erf", x),
     sp.erfc: lambda x: apply("erfc", x), sp.Abs: abs, sp.sign: lambda x: apply("sign", x),
+    sp.besselj: lambda n, x: apply("jv", n, x), sp.bessely: lambda n, x: apply("yv", n, x),
+    sp.besseli: lambda n, x: apply("iv", n, x), sp.besselk: lambda n, x: apply("kv", n, x),
+    sp.gamma: lambda x: apply("gamma", x), sp.loggamma: lambda x: where(x > 0.0, apply("lgamma", x), float("nan")),
+    sp.lowergamma: lambda s, x: apply("gamma", s) * apply("gammainc", s, x),
+    sp.uppergamma: lambda s, x: apply("gamma", s) * apply("gammaincc", s, x),
+    sp.elliptic_k: lambda m: apply("ellipk", m), sp.Ei: lambda x: apply("expi", x),
+    sp.polygamma: lambda n, x: apply({0.0: "digamma", 1.0: "trigamma"}[n], x),
     sp.sinc: _sinc, sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
     sp.Max: _folded("max"), sp.Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
     sp.Not: lambda x: apply("not", x),
@@ -76,7 +83,8 @@ _SYMBOLS: dict[str, Callable[..., sp.Expr]] = {
     "where": lambda c, x, y: sp.Piecewise((x, c), (y, True)), "exp": sp.exp, "expm1": lambda x: sp.exp(x) - 1,
     "log": sp.log, "log1p": lambda x: sp.log(1 + x), "sin": sp.sin, "cos": sp.cos, "tan": sp.tan, "asin": sp.asin,
     "acos": sp.acos, "atan": sp.atan, "atan2": sp.atan2, "sinh": sp.sinh, "cosh": sp.cosh, "tanh": sp.tanh,
-    "asinh": sp.asinh, "acosh": sp.acosh, "atanh": sp.atanh, "erf": sp.erf, "erfc": sp.erfc,
+    "asinh": sp.asinh, "acosh": sp.acosh, "atanh": sp.atanh, "erf": sp.erf, "erfc": sp.erfc, "jv": sp.besselj,
+    "yv": sp.bessely, "iv": sp.besseli, "kv": sp.besselk, "gamma": sp.gamma, "ellipk": sp.elliptic_k, "expi": sp.Ei,
 }
 # fmt: on
 
@@ -89,7 +97,15 @@ def can_be_recorded(f: sp.Expr) -> bool:
     """True if `calculated` has a rule for every function in an expression."""
     functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
     known = (sp.Piecewise, sp.Heaviside, sinc, sp.logic.boolalg.BooleanAtom)
-    return all(a.func in _RULES or isinstance(a, known) for a in functions)
+    return all(a.func in _RULES or isinstance(a, known) for a in functions) and all(_takes_order(a) for a in functions)
+
+
+def _takes_order(f: sp.Basic) -> bool:
+    """True unless the order of a special function is none that the table has."""
+    if isinstance(f, sp.polygamma):
+        return f.args[0] in (0, 1)
+    ordered = (sp.besselj, sp.bessely, sp.besseli, sp.besselk, sp.lowergamma, sp.uppergamma)
+    return not isinstance(f, ordered) or bool(f.args[0].is_number)
 
 
 def check_recorded(f: sp.Expr) -> None:
