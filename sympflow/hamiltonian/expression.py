@@ -49,8 +49,6 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "log1p": lambda x: sp.log(1 + x),
     "expm1": lambda x: sp.exp(x) - 1,
     "hypot": lambda x, y: sp.sqrt(x**2 + y**2),
-    "Mod": sp.Mod,
-    "mod": sp.Mod,
     "abs": sp.Abs,
     "max": sp.Max,
     "min": sp.Min,

@@ -2,10 +2,12 @@
 
 import math
 import pickle
+import re
 
 import numpy as np
 import pytest
 import torch
+from scipy import special
 
 from sympflow import HamiltonianSystem, lyapunov, solve
 from sympflow.compiler.program import gradient
@@ -212,8 +214,8 @@ SYSTEMS = {
         ("(p1**2 + p2**2)/2*(1 + q1**2*sin(t)**2) + q1**4/4 + q2**4/4", {"time": "t"}),
     ),
 }
-ANY = ["gauss_legendre4", "implicit_midpoint", "rk4"]
-METHODS = [*ANY, "verlet", "srkn11b", "chin4a", "kahan_li8"]
+ANY = ["gauss_legendre4", "implicit_midpoint", "rk4", "tao4"]
+METHODS = [*ANY, "verlet", "srkn11b", "chin4a", "kahan_li8", "strang_parts", "linear_kahan_li6", "log_kahan_li8"]
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -224,6 +226,12 @@ def test_every_method_runs_as_for_the_same_text(kind, method):
     if not system.separable and method not in ANY:
         return
     same = HamiltonianSystem.from_sympy(text, **options)
+    try:
+        solve(same, method, (0, 0.1), Y0, dt=0.05)
+    except ValueError as error:
+        with pytest.raises(ValueError, match=re.escape(str(error)[:20])):
+            solve(system, method, (0, 0.1), Y0, dt=0.05)
+        return
     for y0 in (Y0, Y0 * np.linspace(0.5, 1, 9)[:, None]):
         found, expected = (solve(s, method, (0, 2), y0, dt=0.05) for s in (system, same))
         assert found.stats["backend"] == expected.stats["backend"] == "compiled"
@@ -236,6 +244,34 @@ def test_every_method_runs_as_for_the_same_text(kind, method):
         np.testing.assert_allclose(*values, rtol=1e-13, atol=1e-13, err_msg=name)
         tensors = getattr(system, name)(torch.tensor(states), *t)
         np.testing.assert_allclose(tensors, values[1], rtol=1e-13, atol=1e-13, err_msg=name)
+
+
+SPECIAL = {
+    "besselj(0, q) + bessely(2, q) + besseli(1, q) + besselk(1, q)": lambda q: (
+        special.j0(q) + special.yv(2, q) + special.iv(1, q) + special.k1(q)
+    ),
+    "gamma(q) + loggamma(q)": lambda q: special.gamma(q) + special.gammaln(q),
+    "lowergamma(2.5, q) - uppergamma(2.5, q)": lambda q: (
+        special.gamma(2.5) * (special.gammainc(2.5, q) - special.gammaincc(2.5, q))
+    ),
+    "elliptic_k(q/4) + Ei(q)": lambda q: special.ellipk(q / 4) + special.expi(q),
+    "log10(q) + log2(q) + log1p(q) + hypot(q, 2)": lambda q: np.log10(q) + np.log2(q) + np.log1p(q) + np.hypot(q, 2),
+    "erf(q) + erfc(q/2)": lambda q: special.erf(q) + special.erfc(q / 2),
+}
+
+
+@pytest.mark.parametrize("text", SPECIAL)
+def test_special_functions_are_compiled(text):
+    given = HamiltonianSystem(lambda q: SPECIAL[text](q[..., 0]), ndof=1, y0=[1.3, 0.1])
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + {text}", y0=[1.3, 0.1])
+    q = np.linspace(0.4, 1.7, 9)[:, None]
+    np.testing.assert_allclose(given.force(q), system.force(q), rtol=1e-12)
+    for method in ("verlet", "srkn11b", "gauss_legendre4"):
+        runs = [solve(s, method, (0, 0.4), dt=0.05) for s in (given, system)]
+        assert [run.stats["backend"] for run in runs] == ["compiled"] * 2
+        reference = solve(system, method, (0, 0.4), dt=0.05, backend="array")
+        for run in runs:
+            np.testing.assert_allclose(run.y, reference.y, rtol=1e-12)
 
 
 def test_deviation_vectors_run_compiled():
