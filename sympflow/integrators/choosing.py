@@ -67,7 +67,7 @@ def _candidates(
         yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
     if plain and not is_tensor(y0) and y0.dtype == np.float64 and _falls_to_the_origin(system, y0):
         yield "log_kahan_li8", "V falls without bound at q = 0, where its steps become shorter"
-    if system.local is not None and system.local.frame is not None:
+    if system.local is not None and system.local.frame is not None and system.local.frame.crossing() is None:
         yield "wisdom_holman", "planets move about a star"
     if system.separable and system.quadratic_kinetic:
         yield "srkn11b", "the kinetic energy is ½ pᵀM⁻¹p"

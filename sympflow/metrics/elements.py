@@ -69,7 +69,7 @@ def elements(solution: Solution | ArrayLike, system: HamiltonianSystem | None = 
         raise ValueError(f"`about` must be 'star' or 'jacobi'; got {about!r}.")
     frame = _frame(system)
     if about == "jacobi":
-        x, v, *_ = frame.into(y) if frame.jacobi else Frame(frame.local, frame.G, system.y0).into(y)
+        x, v, *_ = frame.into(y) if frame.jacobi else Frame(frame.local, frame.G, np.asarray(system.y0)).into(y)
         order = np.argsort(frame.bodies)
         inside = frame.sums[1:] if not len(frame.test) else np.append(frame.sums[1:], frame.sums[frame.inside])
         x, v, mu = x[..., order, :], v[..., order, :], frame.G * inside[order]

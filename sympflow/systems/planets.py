@@ -64,9 +64,12 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
     .. [2] E. M. Standish, "JPL planetary and lunar ephemerides, DE405/LE405", JPL Interoffice Memorandum 312.F-98-048,
        1998: masses.
     """
-    names = PLANETS[:planets] if isinstance(planets, int) and not isinstance(planets, bool) else planets
-    known = isinstance(names, list | tuple) and bool(names) and set(names) <= set(PLANETS)
-    if not known or len(set(names)) < len(names) or (isinstance(planets, int) and not 1 <= planets <= 8):
+    names: Sequence[str] = ()
+    if isinstance(planets, list | tuple):
+        names = planets
+    elif isinstance(planets, int) and not isinstance(planets, bool) and 1 <= planets <= len(PLANETS):
+        names = PLANETS[:planets]
+    if not names or not {*names} <= {*PLANETS} or len({*names}) < len(names):
         raise ValueError(f"`planets` must be a number from 1 to 8, or names of {', '.join(PLANETS)}; got {planets!r}.")
     rows = [PLANETS.index(name) for name in names]
     masses = np.concatenate([[1.0], 1 / SUN_OVER_PLANET[rows]])
