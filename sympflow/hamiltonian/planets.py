@@ -249,7 +249,7 @@ class Frame:
         close = r < MOON * np.maximum(self._hill(one), self._hill(other))
         bound = close & ((u * u).sum(-1) / 2 < self.G * (masses[one] + masses[other]) / r)
         if bound.any():
-            one, other = sorted(int(i[bound][0]) for i in (one, other))
+            first, second = sorted(int(i[bound][0]) for i in (one, other))
             raise ValueError(
                 f"`method` {method!r} has each body on an orbit about the star, and bodies {first} and {second} are "
                 "bound to each other: take the splitting 'kinetic', such as 'srkn11b', or one body in place of both."
