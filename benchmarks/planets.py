@@ -4,8 +4,8 @@
     python benchmarks/planets.py --years 1e5                       the comparison at length
     python benchmarks/planets.py --figure docs/figures/planets.png eccentricities over 200,000 years
 
-The energy error is the largest of 40 outputs, relative to |H(y0)|; times are processor times of whole calls of `solve`, the least
-of the repeats, on one thread. REBOUND runs from the same state, without safe mode.
+The energy error is the largest of 40 outputs, relative to |H(y0)|; times are processor times of whole calls of `solve`,
+the least of the repeats, on one thread. REBOUND runs from the same state, without safe mode.
 """
 
 # ruff: noqa: E402

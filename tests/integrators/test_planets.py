@@ -98,6 +98,16 @@ def test_windows_stores_and_dense_outputs(options, tmp_path):
     assert np.array_equal(dense.sol(whole.t), whole.y)
 
 
+@pytest.mark.parametrize("options", [{}, {"corrector": 5}])
+def test_a_window_without_outputs(options):
+    method = sympflow.get("wisdom_holman")(dt=50.0, **options)
+    kernel = method.composed(GIANTS).kernel(False)
+    y0 = GIANTS.y0 * np.ones((3, 1))
+    none = kernel.run(50.0, y0, 4, np.empty(0, dtype=np.int64))
+    assert none.states.shape == (3, 0, 24)
+    assert none.n_finite.tolist() == [4, 4, 4]
+
+
 def test_momentum_and_angular_momentum_are_kept():
     sol = solve(GIANTS, "kepler_aba864", (0, 400_000.0), dt=100.0, save_every=100)
     q, p = (x.reshape(4, 3, -1) for x in (sol.y[:12], sol.y[12:]))
