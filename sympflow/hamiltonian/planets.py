@@ -182,7 +182,8 @@ class Frame:
             u = _joined(star[..., None, :], v) + U[..., None, :]
             q, u = q[..., self._places, :], u[..., self._places, :]
         p = u * like(self.inertia[:, None], u)
-        return _joined(q.reshape(*q.shape[:-2], -1), p.reshape(*p.shape[:-2], -1), -1)
+        d = self.local.ndof
+        return _joined(q.reshape(*q.shape[:-2], d), p.reshape(*p.shape[:-2], d), -1)
 
     # the two flows of the splitting, by array operations ------------------------------------------------------------
 
