@@ -108,6 +108,11 @@ class Frame:
         )
         self.periods = 2 * np.pi * np.sqrt(self.size**3 / (G * (masses[0] + masses[1:])))
 
+    @property
+    def longest_step(self) -> float:
+        """The longest time between two kicks."""
+        return float(self.periods.min()) / FEWEST_STEPS
+
     @cached_property
     def bodies(self) -> np.ndarray:
         """The bodies in the order of the coordinates."""

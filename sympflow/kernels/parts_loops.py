@@ -19,12 +19,13 @@ from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import fma, times
 from sympflow.compiler.program import Program, gradient
+from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
-from sympflow.kernels.one_steps import Lettered, recorded
 from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers
+from sympflow.kernels.stage_times import SymbolicLetters
 from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 from sympflow.kernels.threads import given
 
@@ -62,7 +63,7 @@ class PartMaps:
 
     def __init__(self, parts: ExactParts, filters: bool) -> None:
         self.parts, self.ndof, self.filters = parts, parts.ndof, filters
-        self.lettered = [Lettered(part, [part.H]) for part in parts.rest]
+        self.lettered = [SymbolicLetters(part, [part.H]) for part in parts.rest]
         self._arranged: dict[int, Arranged] = {}
 
     def arranged(self, code: int) -> Arranged:
@@ -210,13 +211,10 @@ class PartsCode(Rollouts):
     def prepared(self, table: Columns) -> Columns:
         return table
 
-    def own_columns(self, table: Columns, values: np.ndarray, width: int) -> Columns:
-        """The columns (n, m, size) of the rows whose numbers are `values` (n, 1), for every `width` of them."""
+    def own_entries(self, table: Columns, values: np.ndarray) -> Columns:
+        """The columns (n, m, size) of the rows whose numbers are `values` (n, 1)."""
         entries, kinds = table
-        own = entries[values[:, 0].astype(int)]
-        groups = -(-len(own) // width)
-        full = np.concatenate([own, np.repeat(own[-1:], groups * width - len(own), axis=0)])
-        return np.ascontiguousarray(full.reshape(groups, width, *own.shape[1:]).transpose(0, 2, 3, 1)), kinds
+        return entries[values[:, 0].astype(int)], kinds
 
     def columns(self, groups: Sequence[Sequence[int]], entries: np.ndarray) -> Columns:
         """The columns (n, k, size) of groups of maps, whose numbers are (n, m, size), and their kinds (k,)."""

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from sympflow.hamiltonian.domain import Tube
-from sympflow.hamiltonian.planets import gravity, placed
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 PLANETS = ("Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
@@ -64,6 +63,8 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
     .. [2] E. M. Standish, "JPL planetary and lunar ephemerides, DE405/LE405", JPL Interoffice Memorandum 312.F-98-048,
        1998: masses.
     """
+    from sympflow.hamiltonian.planets import gravity, placed
+
     names: Sequence[str] = ()
     if isinstance(planets, list | tuple):
         names = planets
