@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test pytest slow lint bench docs clean
+.PHONY: help demo test pytest slow lint dist bench docs clean
 
 help:  ## Show the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -41,6 +41,12 @@ lint: .venv/installed-test  ## Lint, types and the direction of imports
 docs: .venv/installed-test  ## The documentation, into site/
 	$(BIN)/python docs/diagrams.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+dist: .venv/installed-test  ## Wheel and sdist in dist/, checked, and installed for each Python that is found
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/python tests/installed.py dist
 
 bench: .venv/installed  ## The figures that the docs quote, again, into docs/measured (hours on a quiet machine)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[bench]'

@@ -108,7 +108,7 @@ def test_the_code_on_a_page_is_not_wider_than_it():
 
 
 def test_formulas_are_tex_that_can_be_typeset():
-    pytest.importorskip("math_core", reason='formulas need pip install "sympflow[docs]"')
+    pytest.importorskip("math_core", reason='formulas need pip install ".[docs]"')
     mathml = runpy.run_path(str(ROOT / "docs" / "typeset.py"))["mathml"]
     assert "<mfrac>" in mathml(r"\frac{1}{2}")
     with pytest.raises(ValueError, match="frca"):
@@ -168,8 +168,8 @@ class Page(HTMLParser):
 @pytest.mark.slow
 def test_the_site_is_whole(tmp_path):
     """No warning, raw TeX, dead link, page that no list leads to, image without words, or script from the network."""
-    pytest.importorskip("mkdocs", reason='the site needs pip install "sympflow[docs]"')
-    pytest.importorskip("mkdocstrings", reason='the site needs pip install "sympflow[docs]"')
+    pytest.importorskip("mkdocs", reason='the site needs pip install ".[docs]"')
+    pytest.importorskip("mkdocstrings", reason='the site needs pip install ".[docs]"')
     site = tmp_path / "site"
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(site)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}

@@ -390,7 +390,7 @@ def test_sums_over_pairs_by_numba_functions_are_those_by_a_formula():
 
 def test_without_numba_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    with pytest.raises(ImportError, match=r"^`pair` must be a Numba function.*sympflow\[numba\]"):
+    with pytest.raises(ImportError, match=r"^`pair` must be a Numba function.*pip install numba"):
         pair_functions(lennard_jones, np.ones((2, 2)), 2)
 
 
