@@ -1,7 +1,7 @@
 """Installs a wheel as a user would, without constraints, for each Python that is found, and tries what it promises.
 
-    python tests/installed.py dist          # every interpreter python3.11 … python3.14 on the path, or of pyenv
-    python tests/installed.py dist 3.12     # one of them
+python tests/installed.py dist          # every interpreter python3.11 … python3.14 on the path, or of pyenv
+python tests/installed.py dist 3.12     # one of them
 """
 
 from __future__ import annotations
