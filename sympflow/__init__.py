@@ -99,6 +99,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.domain import EnergySublevel as EnergySublevel
     from sympflow.hamiltonian.domain import Tube as Tube
     from sympflow.hamiltonian.doubling import doubled as doubled
+    from sympflow.hamiltonian.lattice_states import LatticeStates as LatticeStates
     from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
     from sympflow.integrators.choosing import choose_step as choose_step
