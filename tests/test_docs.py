@@ -1,6 +1,7 @@
 """The code of the documentation is run: every Python block of README and docs, page by page, in order."""
 
 import importlib.util
+import json
 import os
 import re
 import runpy
@@ -55,6 +56,19 @@ def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.setattr(registry, "_registered", dict(registry._registered))
     runpy.run_path(str(script), run_name="page")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_printed_outputs_are_those_of_the_code(monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    outputs = runpy.run_path(str(ROOT / "docs" / "outputs.py"))
+    for name in outputs["PAGES"]:
+        text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+        assert outputs["page_with_outputs"](text) == text
+    notebook = json.loads(outputs["NOTEBOOK"].read_text(encoding="utf-8"))
+    assert any(cell.get("outputs") for cell in notebook["cells"])
+    assert outputs["notebook_with_outputs"](json.loads(json.dumps(notebook))) == notebook
 
 
 @pytest.mark.slow

@@ -15,6 +15,8 @@ from sympflow.interop.scipy import as_scipy
 from sympflow.systems.chains import EPSILON, MASS, SIGMA
 from sympflow.systems.pairs import pair_functions
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 Y1, Y2 = np.array([1.0, 0.3]), np.array([0.3, 0.6, 0.1, 0.2])
 SQUARE = {"potential": lambda q: (q**2).sum(-1) / 2, "ndof": 1}
 QUARTIC = {"potential": lambda q: (q**4).sum(-1) / 4, "ndof": 2}
