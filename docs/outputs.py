@@ -1,6 +1,6 @@
-"""Outputs on pages and in the notebook: what a block prints stands below it, and is written by `python docs/outputs.py`.
+"""Outputs on pages and in the notebook, as `python docs/outputs.py` writes them.
 
-A ```text block after a ```python block holds its output; a test compares them. The notebook is made of `tutorial.md`'s cells.
+A ```text block after a ```python block holds what this prints; a test compares them.
 """
 
 from __future__ import annotations
