@@ -1,12 +1,14 @@
 """The table of functions: values of arrays and tensors, derivatives, machine code of every row."""
 
+from functools import partial
+
 import mpmath
 import numpy as np
 import pytest
 import torch
 from test_functions_in_code import run
 
-from sympflow.compiler.functions import FUNCTIONS, apply
+from sympflow.compiler.functions import FUNCTIONS, OF_SCIPY, apply
 from sympflow.compiler.program import derivatives, traced
 
 CONDITIONS = {"lt", "le", "eq", "and", "or", "not"}
@@ -49,7 +51,7 @@ def exact(name):
     return EXACT.get(name) or getattr(mpmath, name)
 
 
-NUMERIC = [name for name in FUNCTIONS if name not in CONDITIONS | {"where"}]
+NUMERIC = [name for name in FUNCTIONS if name not in CONDITIONS | {"where", *OF_SCIPY}]
 
 
 @pytest.mark.parametrize("name", NUMERIC)
@@ -84,6 +86,43 @@ def test_derivatives(name):
             with mpmath.workdps(40):
                 expected = float(mpmath.diff(along, mpmath.mpf(place[i])))
             assert slope == pytest.approx(expected, rel=1e-13, abs=1e-14)
+
+
+ORDERED = {"gammainc", "gammaincc", "jv", "yv", "iv", "kv"}
+OF_MPMATH = {
+    "gammainc": lambda s, x: mpmath.gammainc(s, 0, x, regularized=True),
+    "gammaincc": lambda s, x: mpmath.gammainc(s, x, regularized=True),
+    "jv": mpmath.besselj,
+    "yv": mpmath.bessely,
+    "iv": mpmath.besseli,
+    "kv": mpmath.besselk,
+    "expi": mpmath.ei,
+    "exp1": mpmath.e1,
+    "dawsn": lambda x: mpmath.sqrt(mpmath.pi) / 2 * mpmath.exp(-(x**2)) * mpmath.erfi(x),
+}
+
+
+@pytest.mark.parametrize("name", OF_SCIPY)
+def test_functions_of_scipy_at_their_addresses(name):
+    f = OF_MPMATH.get(name) or getattr(mpmath, name)
+    for order, x in ((2.5, 0.7), (1.0, 0.3)):
+        place = (order, x) if name in ORDERED else (x,)
+        expected = float(f(*map(mpmath.mpf, place)))
+        assert apply(name, *place) == pytest.approx(expected, rel=1e-14)
+        arrays = [np.full(3, v) for v in place]
+        for width in (1, 2, 8):
+            found = run(lambda *v: apply(name, *v), *arrays, width=width)
+            np.testing.assert_array_equal(found, apply(name, *arrays))
+        of_number = partial(apply, name, *place[:-1])
+        slope = traced(lambda y, of=of_number: derivatives([of(y)], [y])[0], "y")(x)[0]
+        with mpmath.workdps(30):
+            of_x = partial(f, *map(mpmath.mpf, place[:-1]))
+            exact_slope = float(mpmath.diff(of_x, mpmath.mpf(x)))
+        assert slope == pytest.approx(exact_slope, rel=1e-12)
+        with pytest.raises(TypeError, match="is not a function of tensors"):
+            apply(name, *map(torch.tensor, place))
+    with pytest.raises(NotImplementedError, match="order of a special function"):
+        traced(lambda n: derivatives([apply("jv", n, 0.5)], [n])[0], "n")
 
 
 def test_the_derivative_of_a_power_by_its_exponent_and_of_a_constant_power():
