@@ -39,6 +39,9 @@ class Recording:
     def __init__(self) -> None:
         self._known: dict[Any, Traced] = {}
 
+    def __len__(self) -> int:
+        return len(self._known)
+
     def input(self, name: str) -> Traced:
         """Return a number that is given when the program is called."""
         return self._number("input", (name,))

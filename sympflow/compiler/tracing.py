@@ -21,7 +21,7 @@ from sympflow.compiler.program import Program, Recording, Traced
 
 __all__ = ["TracedArray", "Untraceable", "trace"]
 
-MOST_OPERATIONS = 200_000  # recorded of one function
+MOST_OPERATIONS = 50_000  # recorded of one function
 LARGEST_COFACTORS = 3  # of matrices; larger ones are eliminated
 
 
@@ -655,6 +655,35 @@ def _torch_rule(name: str) -> Callable[..., Any] | None:
 # recording ---------------------------------------------------------------------------------------------------------
 
 
+class _Recorded(Recording):
+    """Recorded operations of a function, in which roots are powers, as they are in formulas."""
+
+    _inside = False
+
+    def record(self, name: str, args: Sequence[Any]) -> Any:
+        if len(self) > MOST_OPERATIONS:
+            raise Untraceable(f"it has more than {MOST_OPERATIONS:,} operations for one state")
+        found = None if self._inside or len(args) != 2 else self._as_power(name, *args)
+        if found is None:
+            return super().record(name, args)
+        base, n, factor = found
+        self._inside = True
+        power = super().record("pow", (base, n))
+        self._inside = False
+        return power if factor is None else super().record("mul", (factor, power))
+
+    def _as_power(self, name: str, a: Any, b: Any) -> tuple[Any, float, Any] | None:
+        """A power of a root, or a quotient by a root or a power: its base, its exponent, a factor."""
+        if name == "div" and isinstance(b, Traced):
+            if b.name == "sqrt":
+                return b.args[0], -0.5, a
+            if b.name == "pow" and isinstance(n := b.args[1], float):
+                root = isinstance(x := b.args[0], Traced) and x.name == "sqrt" and n % 2 == 1
+                return (x.args[0], -n / 2, a) if root else (x, -n, a)
+        root = name == "pow" and isinstance(a, Traced) and a.name == "sqrt" and isinstance(b, float | int)
+        return (a.args[0], b / 2, None) if root and b % 2 == 1 else None
+
+
 def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
     """Record a function of arrays, which returns one number.
 
@@ -671,7 +700,7 @@ def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], to
     Untraceable
         With the reason.
     """
-    recording = Recording()
+    recording = _Recorded()
     kind = TracedTensor if torch else TracedArray
     inputs, args = [], []
     for each in names:

@@ -102,8 +102,8 @@ class Definition:
     def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
         """Take what a system knows beside its functions, with which they are traced."""
 
-    def check_unchanged(self, y: Array) -> None:
-        """Raise a ValueError if a function has other values than when it was traced."""
+    def check_unchanged(self) -> None:
+        """Raise a ValueError if a function has another value than when it was traced."""
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""

@@ -72,12 +72,14 @@ class HamiltonianSystem(Hamiltonian, Shown):
     Parameters
     ----------
     potential : callable, optional
-        V(q), q of shape (..., d), returning (...). Then H = ½ pᵀM⁻¹p + V(q) is separable. Without `gradient`
-        it must be written with torch functions, and is differentiated automatically. With Numba functions
-        (`potential`, `gradient` and `hessian_vector`) the system runs compiled. A function that writes into q is a
-        ValueError; so is a gradient that is none of V: see `check_functions`.
+        V(q), q of shape (..., d), returning (...), written with NumPy or torch. Then H = ½ pᵀM⁻¹p + V(q) is separable.
+        It is traced once, differentiated exactly and compiled; `program` is what was traced. A function that cannot be
+        traced, such as one that branches on a value, runs as it is, and `repr` says why: then it must be written with
+        torch, or have a `gradient`. With Numba functions (`potential`, `gradient` and `hessian_vector`) the system runs
+        compiled. A function that writes into q is a ValueError; so is a gradient that is none of V: see
+        `check_functions`.
     hamiltonian : callable, optional
-        H(q, p), written with torch functions, for a system that is not separable. Give this or `potential`.
+        H(q, p), for a system that is not separable. Give this or `potential`.
     ndof : int
         Degrees of freedom d.
     mass : float or array_like of shape (d,) or (d, d), optional
@@ -841,7 +843,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
         if kind in self._tested:
-            self._definition.check_unchanged(like)
+            self._definition.check_unchanged()
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 

@@ -332,7 +332,7 @@ def test_a_function_that_has_changed_is_refused():
     STATE["k"] = 1.0
     solve(system, "verlet", (0, 1), Y0, dt=0.1)
     STATE["k"] = 2.0
-    with pytest.raises(ValueError, match=r"^`potential` has other values than when it was traced"):
+    with pytest.raises(ValueError, match=r"^`potential` has another value than when it was traced"):
         solve(system, "verlet", (0, 1), Y0, dt=0.1)
     assert solve(HamiltonianSystem(changing, ndof=2), "verlet", (0, 1), Y0, dt=0.1).stats["backend"] == "compiled"
 
