@@ -35,6 +35,11 @@ def library(x: Array) -> Any:
     return np
 
 
+def library_name(x: Array) -> str:
+    """Return "torch" for a tensor and "numpy" for an array."""
+    return "torch" if is_tensor(x) else "numpy"
+
+
 def concatenate(parts: Sequence[Array]) -> Array:
     """Join arrays along the last axis."""
     if is_tensor(parts[0]):

@@ -7,8 +7,7 @@ walks the grid, finds what is not finite, places the outputs and looks for event
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt, check_not_followed
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, join, lanes, stack
+from sympflow.arrays import Array, finite_states, is_tensor, join, lanes, library_name, stack
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import (
@@ -31,30 +30,12 @@ from sympflow.integrators.contract import (
     interrupted,
 )
 from sympflow.integrators.grid import Grid, distinct
+from sympflow.integrators.steppers import ArraySteps, Stepper, rollout, shorter_steps
 from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
 from sympflow.kernels.carry import Carry
 
 if TYPE_CHECKING:
-    from sympflow.kernels.protocol import Kernel
     from sympflow.storage.runs import RunStore
-
-__all__ = [
-    "FINISHED",
-    "CountingStepper",
-    "FixedStep",
-    "Integrator",
-    "KernelStepper",
-    "Outcome",
-    "OwnStepper",
-    "Problem",
-    "Recorder",
-    "Stepper",
-    "Steps",
-    "checked_state",
-    "compiled_loops",
-    "rollout",
-    "run_and_search",
-]
 
 FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
 """The values of `stats["backend"]` of compiled loops."""
@@ -98,8 +79,20 @@ class FixedStep(Integrator):
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of one run, for states such as the problem's y0."""
         self.check_library(problem.y0)
-        counted = _is_counted(type(self))  # type: ignore[arg-type]
-        return (CountingStepper if counted else Stepper)(self, problem)
+        cls = type(self)
+        if not _overridden(cls):  # type: ignore[arg-type]
+            return self.own_stepper(problem)
+        inner = None if _steps_itself(cls) else self.own_stepper(problem)  # type: ignore[arg-type]
+        return Stepper(self, problem, OwnSteps(self, problem, inner, _is_counted(cls)))  # type: ignore[arg-type]
+
+    def own_stepper(self, problem: Problem) -> Stepper:
+        """Return the stepper of one run of a class whose duties no subclass outside of the package overrides."""
+        return Stepper(self, problem, OwnSteps(self, problem, None, _is_counted(type(self))))  # type: ignore[arg-type]
+
+    @classmethod
+    def overrides(cls, duty: str) -> bool:
+        """Tell whether a class outside of the package defines a duty anew, such as "step"."""
+        return duty in _overridden(cls)  # type: ignore[arg-type]
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Force and force-gradient evaluations of n_steps steps, n_saved saved states, n_extra shorter steps.
@@ -125,14 +118,13 @@ class FixedStep(Integrator):
 
         Also the index of the last finite state of each trajectory, and the backend that ran.
         """
+        if not _steps_itself(type(self)):  # type: ignore[arg-type]
+            stepper = self.own_stepper(problem)
+            return *stepper.rollout(problem.y0, h, n_steps, save, problem.t0), stepper.backend
         states, finite = rollout(
             lambda k, y: self.checked_step(problem.system, problem.t0 + k * h, y, h), problem.y0, n_steps, save
         )
-        return states, finite, "torch" if is_tensor(problem.y0) else "numpy"
-
-    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str, t: Any = 0.0) -> Array:
-        """`step` on the backend of the run that it belongs to; t, a number or one for each state, of driven systems."""
-        return self.checked_step(system, t, y, h)
+        return states, finite, library_name(problem.y0)
 
     def run(self, problem: Problem) -> Outcome:
         return GridRun(self, problem).outcome()
@@ -154,53 +146,22 @@ class FixedStep(Integrator):
             yield np.array([grid.time(k)]), y[None], np.array([grid.remainder])
 
 
-@dataclass(frozen=True)
-class OwnStepper(FixedStep):
-    """A fixed-step integrator with a stepper of its own; a subclass that overrides a duty of `FixedStep` is asked."""
-
-    def own_stepper(self, problem: Problem) -> Stepper:
-        """Return the stepper of one run, for states such as the problem's y0."""
-        raise NotImplementedError(f"{type(self).__name__} must define own_stepper().")
-
-    @classmethod
-    def overrides(cls, duty: str) -> bool:
-        """Tell whether a subclass of a built-in class defines a duty anew, such as "step"."""
-        return duty in _overridden(cls)  # type: ignore[arg-type]
-
-    def stepper(self, problem: Problem) -> Stepper:
-        asked = _overridden(type(self))  # type: ignore[arg-type]
-        return super().stepper(problem) if asked else self.own_stepper(problem)
-
-    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        if self.overrides("step"):
-            return super().rollout(problem, h, n_steps, save)
-        stepper = self.own_stepper(problem)
-        states, finite = stepper.rollout(problem.y0, h, n_steps, save, problem.t0)
-        return states, finite, stepper.backend
-
-    def substep(self, system: HamiltonianSystem, y: Array, h: Any, backend: str, t: Any = 0.0) -> Array:
-        if self.overrides("step"):
-            return super().substep(system, y, h, backend, t)
-        asked = "auto" if backend == "compiled" else "array"
-        return self.own_stepper(Problem(system, 0.0, 0.0, y, backend=asked)).shorter_from(t, y, h)
-
-
-@cache
-def _overridden(cls: type[OwnStepper]) -> frozenset[str]:
-    """Return the duties that a subclass of a built-in class defines anew: its stepper must ask them."""
-    duties = ("step", "rollout", "substep", "evaluations")
-    return frozenset(name for name in duties if not _definer(cls, name).__module__.startswith("sympflow."))
-
-
 def _definer(cls: type, name: str) -> type:
     """Return the class of which an attribute is inherited."""
     return next(base for base in cls.__mro__ if name in vars(base))
 
 
 @cache
-def _steps_one_by_one(cls: type[FixedStep]) -> bool:
-    """True if the `rollout` of a class calls its `step`, and nothing else."""
-    return _definer(cls, "rollout") in (FixedStep, OwnStepper)
+def _overridden(cls: type[FixedStep]) -> frozenset[str]:
+    """Return the duties that classes outside of the package define: their runs must ask them."""
+    duties = ("step", "rollout", "evaluations")
+    return frozenset(name for name in duties if not _definer(cls, name).__module__.startswith("sympflow."))
+
+
+@cache
+def _steps_itself(cls: type[FixedStep]) -> bool:
+    """True if runs are made of calls of `step`."""
+    return "step" in _overridden(cls) or _definer(cls, "own_stepper") is FixedStep  # type: ignore[arg-type]
 
 
 @cache
@@ -209,268 +170,44 @@ def _is_counted(cls: type[FixedStep]) -> bool:
     return cls.__mro__.index(_definer(cls, "evaluations")) > cls.__mro__.index(_definer(cls, "step"))
 
 
-# one run of a method -------------------------------------------------------------------------------
+class OwnSteps(ArraySteps):
+    """The steps that an integrator defines by its duties `step`, `rollout` and `evaluations`."""
 
-
-_ADVICE = re.compile(r"(, or use|: use|\. Use) backend='array'\.$")
-
-
-class Stepper:
-    """One run of a fixed-step integrator: all that a run changes or counts is here.
-
-    This one runs array operations, by the integrator's own `rollout`, `substep` and `evaluations`.
-
-    Attributes
-    ----------
-    backend : str
-        The means of the run, for `stats["backend"]`: "compiled", "numpy", "torch", or the name of another library.
-    compiled : bool
-        True if the steps run in compiled loops.
-    saves_finite : bool
-        True if the states that `rollout` saves up to the last finite one are known to be finite.
-    """
-
-    compiled: bool = False
-    saves_finite: bool = False
-    counts_itself: ClassVar[bool] = False
-    """True if `evaluations` tells those that were made so far, whatever the steps."""
-    remark: str = ""
-    """Why a run of a formula is not compiled, for its message."""
-
-    def __init__(self, integrator: FixedStep, problem: Problem, told: Sequence[str] = ()) -> None:
-        if told and problem.system.symbols is not None:
-            self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
-        self.integrator, self.system, self.problem = integrator, problem.system, problem
-        self.backend = "torch" if is_tensor(problem.y0) else "numpy"
-
-    @property
-    def takes_carry(self) -> bool:
-        """True if `rollout` takes a carry: unless the steps are those of a `rollout` that a class has of its own."""
-        return _steps_one_by_one(type(self.integrator))  # type: ignore[arg-type]
-
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
-    ) -> tuple[Array, np.ndarray]:
-        """Return the states (len(save), ..., 2d) after the steps `save` (sorted counts in 0 … n_steps) of length h.
-
-        Also the index of the last finite state of each trajectory, of shape y0.shape[:-1]. With a `carry` the run from
-        y0 goes on from there: see `kernels.protocol.Kernel.run`.
-        """
-        if carry is not None:
-            integrator, system = self.integrator, self.problem.system
-            return rollout(
-                lambda k, y: integrator.checked_step(system, t0 + k * h, y, h), y0, n_steps, save, carry=carry
-            )
-        whole = y0 is self.problem.y0 and t0 == self.problem.t0
-        seen = self.problem
-        piece = seen if whole else Problem(seen.system, t0, t0 + n_steps * h, y0, backend=seen.backend)
-        states, finite, self.backend = self.integrator.rollout(piece, h, n_steps, save)
-        return states, finite
-
-    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        """Return the states a step of length h, a number or one for each state, after y (..., 2d).
-
-        `t` is the time of y, a number or one for each state, which the functions of a driven system take.
-        """
-        system = self.problem.system
-        times = () if system.autonomous else (t,)
-        return self.integrator.substep(system, y, h, self.backend, *times)
-
-    def shorter_from(self, t: Any, y: Array, h: Any) -> Array:
-        """`shorter`, by one of a class that may not know the time, which is then not needed."""
-        return self.shorter(y, h) if self.system.autonomous else self.shorter(y, h, t)
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        """Evaluations of the force and its derivatives so far, if it made so many steps, saves and shorter steps."""
-        return self.integrator.evaluations(n_steps, n_saved, n_extra, self.backend)
-
-    def more_stats(self) -> dict[str, int]:
-        """Further entries of the statistics."""
-        return {}
-
-
-class CountingStepper(Stepper):
-    """A run whose forces are counted, on a view of the system; of a batch together as one, as everywhere."""
-
-    counts_itself = True
-
-    def __init__(self, integrator: FixedStep, problem: Problem) -> None:
-        super().__init__(integrator, problem)
-        self.counts = {"force_evaluations": 0, "hessian_evaluations": 0}
-        self.problem = replace(problem, system=counting_view(problem.system, self._count))
+    def __init__(
+        self, integrator: FixedStep, problem: Problem, inner: Stepper | None = None, counted: bool = False
+    ) -> None:
+        self.integrator, self.problem, self.inner = integrator, problem, inner
+        self.takes_carry = _definer(type(integrator), "rollout") is FixedStep
+        if counted:
+            self.counts = {"force_evaluations": 0, "hessian_evaluations": 0}
+            self.problem = replace(problem, system=counting_view(problem.system, self._count))
 
     def _count(self, what: str, x: Array) -> None:
-        together = math.prod(self.problem.y0.shape[:-1])
+        assert isinstance(self.counts, dict)
+        together = math.prod(self.problem.y0.shape[:-1])  # of a batch together as one, as everywhere
         self.counts[what] = self.counts.get(what, 0) + max(1, math.prod(x.shape[:-1]) // together)
 
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        return dict(self.counts)
-
-
-class KernelStepper(Stepper):
-    """A run in compiled loops."""
-
-    compiled = True
-    takes_carry = True
-
-    def __init__(self, integrator: FixedStep, problem: Problem, kernel: Kernel) -> None:
-        self.integrator, self.system, self.problem = integrator, problem.system, problem
-        self.kernel, self.backend, self.saves_finite = kernel, kernel.backend, kernel.saves_finite
-        self.driven = self.system is not None and not self.system.autonomous  # a flow alone steps without a system
-        self.iterations = 0
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        if self.inner is not None:
+            return self.inner.shorter(y, h, t)
+        return self.integrator.checked_step(self.problem.system, t, y, h)
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
     ) -> tuple[Array, np.ndarray]:
-        start: dict[str, Any] = {"t0": t0} if self.driven else {}
-        if carry is not None:
-            start["carry"] = carry
-        if y0.ndim == 1:
-            states, last, iterations = self.kernel.run(h, y0, n_steps, save, **start)
-            self.iterations += iterations
-            return states, np.asarray(last)
-        rows = y0.reshape(-1, y0.shape[-1])
-        states, finite, iterations = self.kernel.run_batch(h, rows, n_steps, save, **start)
-        self.iterations += iterations
-        return states.swapaxes(0, 1).reshape(len(save), *y0.shape), np.asarray(finite).reshape(y0.shape[:-1])
+        if not self.takes_carry:
+            part, end = self.problem, t0 + n_steps * h
+            if not (y0 is part.y0 and t0 == part.t0):
+                part = Problem(part.system, t0, end, y0, backend=part.backend)
+            states, finite, self.backend = self.integrator.rollout(part, h, n_steps, save)
+            return states, finite
+        if self.inner is None:
+            return super().rollout(y0, h, n_steps, save, t0, carry)
+        self.backend = self.inner.backend
+        return self.inner.rollout(y0, h, n_steps, save, t0, carry)
 
-    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        start = (np.broadcast_to(t, y.shape[:-1]).reshape(-1),) if self.driven else ()
-        if y.ndim == 2 and np.shape(h) == (len(y),):
-            states, iterations = self.kernel.step(h, y, *start)
-        else:
-            rows = np.ascontiguousarray(y).reshape(-1, y.shape[-1])
-            states, iterations = self.kernel.step(np.broadcast_to(h, y.shape[:-1]).reshape(-1), rows, *start)
-        self.iterations += iterations
-        return states.reshape(y.shape)
-
-
-def compiled_loops(
-    make: Callable[[], Any],
-    y0: Array,
-    backend: str,
-    compensated: bool = False,
-    reason: str | None = None,
-    told: list[str] | None = None,
-) -> Any:
-    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations."""
-    if backend == "array":
-        reason = "`backend` is 'array': choose 'auto'."
-    elif is_tensor(y0):
-        reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
-    elif y0.dtype != np.float64:
-        reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
-    asked = reason is None
-    if reason is None:
-        try:
-            return make()
-        except ValueError as error:
-            reason = str(error)
-    if backend == "compiled":
-        raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
-    if compensated:
-        needed = "" if reason.startswith("`compensated`") else "`compensated` sums need compiled loops. "
-        raise ValueError(needed + reason) from None
-    if told is not None and backend == "auto" and asked:
-        told.append(reason)
-    return None
-
-
-def rollout(
-    step: Callable[[int, Array], Array],
-    y: Array,
-    n_steps: int,
-    save: np.ndarray,
-    block: int = 64,
-    carry: Carry | None = None,
-) -> tuple[Array, np.ndarray]:
-    """States at the counts `save` of n_steps times `step(k, y)`, and the last finite count of each trajectory."""
-    k = 0
-    if carry is not None and carry.running is not None:
-        k, y = carry.steps, carry.running
-    tensor = is_tensor(y)
-    out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
-    wanted = save.tolist()
-    position = 0
-    finite = np.where(finite_states(y, in_any_lane=True), n_steps, -1)
-    if wanted and wanted[0] == 0:
-        out.append(y) if tensor else out.__setitem__(0, y)
-        position = 1
-    with np.errstate(all="ignore"):
-        while k < n_steps and (finite == n_steps).any():
-            start, y_start = k, y
-            for k in range(start, min(start + block, n_steps)):
-                y = checked_state(step(k, y), y)
-                if position < len(wanted) and wanted[position] == k + 1:
-                    if tensor:
-                        out.append(y)
-                    else:
-                        out[position] = y
-                    position += 1
-            k += 1
-            failed = (finite == n_steps) & ~finite_states(y, in_any_lane=True)
-            if failed.any():
-                z = y_start
-                for j in range(start, k):
-                    z = step(j, z)
-                    first = failed & (finite == n_steps) & ~finite_states(z, in_any_lane=True)
-                    finite = np.where(first, j, finite)
-    if carry is not None:
-        carry.advance(n_steps, y)
-    if tensor:
-        out += [full_of_nan(y)] * (len(wanted) - len(out))
-        out = stack(out, axis=0) if out else y[None][:0]
-    return out, np.asarray(finite)
-
-
-def checked_state(y_next: Any, y: Array) -> Array:
-    """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
-    shape, tensor = getattr(y_next, "shape", None), is_tensor(y)
-    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == tensor:
-        if tensor and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
-            raise TypeError(
-                "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
-                "whose step takes arrays only says so by `arrays_only`."
-            )
-        return y_next
-    what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
-    raise TypeError(
-        f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
-        f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
-    )
-
-
-def _gradients_are_on() -> bool:
-    import torch
-
-    return torch.is_grad_enabled()
-
-
-def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:
-    """Replace the states y, those at grid points `count`, by those a step later where the remainder h is not 0."""
-    extra = remainder.nonzero()[0]
-    if not extra.size:
-        return y
-    h = remainder[extra]
-    first, last = int(extra[0]), int(extra[-1])
-    together = last - first == len(extra) - 1  # nearly always, and a slice is copied ten times sooner
-    rows: Any = slice(first, last + 1) if together and not is_tensor(y) else extra
-    states = y[rows]
-    lengths, t = h, np.zeros(())
-    if y.ndim != 2:
-        lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
-    if not stepper.system.autonomous:
-        start = grid.t0 + count[extra] * grid.h
-        t = np.broadcast_to(start.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
-    if not is_tensor(y):
-        with np.errstate(all="ignore"):
-            y[rows] = checked_state(stepper.shorter_from(t, states, lengths.astype(y.dtype)), states)
-        return y
-    import torch
-
-    h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
-    advanced = checked_state(stepper.shorter_from(t, states, h_extra), states)
-    return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        return self.integrator.evaluations(n_steps, n_saved, n_extra, backend)
 
 
 # the driver ----------------------------------------------------------------------------------------
@@ -667,7 +404,7 @@ class GridRun:
             t, y = grid.time(k + j), states[j]
 
             def dense(s: float, t: float = t, y: Array = y) -> Array:
-                return stepper.shorter_from(t, y, s - t)
+                return stepper.shorter(y, s - t, t)
 
             if search.step(t, y, grid.time(k + j + 1), states[j + 1], dense, inner[j]):
                 return j + 1, True
@@ -686,10 +423,10 @@ class GridRun:
 
             with torch.no_grad():
                 repeated = states[:, None].expand(-1, parts - 1, -1)
-                return self.stepper.shorter_from(t, repeated, torch.as_tensor(lengths).to(repeated))
+                return self.stepper.shorter(repeated, torch.as_tensor(lengths).to(repeated), t)
         with np.errstate(all="ignore"):
             repeated = np.repeat(states[:, None], parts - 1, axis=1)
-            return self.stepper.shorter_from(t, repeated, lengths.astype(states.dtype))
+            return self.stepper.shorter(repeated, lengths.astype(states.dtype), t)
 
     def _search_remainder(self, search: EventSearch, y: Array) -> bool:
         """Search the last, shorter step of an interval that dt does not divide."""
@@ -697,7 +434,7 @@ class GridRun:
         t = grid.time(grid.n_steps)
 
         def dense(s: float) -> Array:
-            return self.stepper.shorter_from(t, y, s - t)
+            return self.stepper.shorter(y, s - t, t)
 
         y_end = dense(grid.t1)
         search.n_dense += 1

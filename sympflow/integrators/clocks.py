@@ -18,9 +18,10 @@ import numpy as np
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.base import FixedStep, Stepper
+from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.steppers import Stepper
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
 FIRST_CHUNK = 2**16  # steps, at most, before it is known how fast time goes
@@ -287,7 +288,6 @@ class PhysicalRun:
         for name, value in state.items():
             setattr(self, name, value)
         self.stepper = self._stepper()
-        self.stepper.backend = self.backend or self.stepper.backend
 
     def _most_steps(self, allowance: int) -> int:
         """Steps after which time hardly advances: before a collision they would never end, so it is evaluations."""

@@ -23,7 +23,7 @@ from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, lin
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
-from sympflow.integrators.base import rollout
+from sympflow.integrators.steppers import ArraySteps, rollout
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()
 
 
-class Composition(ABC):
+class Composition(ABC, ArraySteps):
     """A scheme composed of the exact flows of the parts of one system.
 
     Parameters
@@ -97,10 +97,6 @@ class Composition(ABC):
         return 0 * x[..., :2]
 
     @abstractmethod
-    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        """One step of length h, a number or one for each state, from y (..., 2d)."""
-
-    @abstractmethod
     def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         """The states from which `step`, with the same h and t, leads to y."""
 
@@ -112,19 +108,9 @@ class Composition(ABC):
         """The step and the vectors W (..., 2d, k) moved by its derivative; None likewise."""
         return None
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
-    ) -> tuple[Array, np.ndarray]:
-        """Many steps by array operations, as `base.rollout`."""
-        return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
-
     @abstractmethod
     def kernel(self, compensated: bool) -> Kernel:
         """The compiled loops; a ValueError says why there are none."""
-
-    @abstractmethod
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Evaluations of forces and their derivatives, as `FixedStep.evaluations`."""
 
 
 MOST_GROWTH = 1.0
@@ -409,7 +395,7 @@ def rollout_in_modes(
     t0: float,
     carry: Carry | None = None,
 ) -> tuple[Array, np.ndarray]:
-    """`base.rollout` of exact flows, in the modes from beginning to end."""
+    """`steppers.rollout` of exact flows, in the modes from beginning to end."""
     d = parts.ndof
     start = parts.to_modes(y0)
     known = parts.prepared(maps, start[0])

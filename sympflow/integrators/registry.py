@@ -331,7 +331,7 @@ def _speaks_for_itself(bases: tuple[type, ...], what: str) -> bool:
     return not any(_DUTIES & vars(base).keys() for base in others)
 
 
-_DUTIES = {"step", "inverse", "tangent", "run", "steps", "stepper", "own_stepper", "rollout", "substep", "composed"}
+_DUTIES = {"step", "inverse", "tangent", "run", "steps", "stepper", "own_stepper", "rollout", "composed"}
 """The methods of an integrator that make its steps."""
 
 

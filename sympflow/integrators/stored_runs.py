@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sympflow.arrays import Array, finite_states
-from sympflow.integrators.contract import INTERRUPTED, Outcome, Problem, finished, interrupted
-from sympflow.integrators.grid import Grid, Outputs, distinct
-from sympflow.integrators.windows import ARRAY_STEPS, MOST_SAVED, ONE, Pace, Pieces, Steps
+from sympflow.integrators.contract import INTERRUPTED, Outcome, finished, interrupted
+from sympflow.integrators.grid import Outputs, distinct
+from sympflow.integrators.windows import ARRAY_STEPS, MOST_SAVED, ONE, Pace, Pieces
 from sympflow.kernels.carry import Carry
 from sympflow.storage.runs import Place, RunStore
+
+if TYPE_CHECKING:
+    from sympflow.integrators.base import GridRun
 
 COUNTED = ("force_evaluations", "hessian_evaluations", "curvature_evaluations", "newton_iterations")
 """Statistics of which those of a run that goes on are added to the earlier ones, where it counts them itself."""
@@ -21,43 +24,10 @@ DONE = ("saved", "within", "counted", "last")
 UNDER_WAY = "The run had reached t = {t:.17g}: make the same call with resume=True to go on."
 
 
-class CountingSteps(Steps, Protocol):
-    """Steps that may count their evaluations themselves: see `base.Stepper`."""
-
-    @property
-    def counts_itself(self) -> bool:
-        """True if `evaluations` tells those that were made so far, whatever the steps."""
-        ...
-
-
-class Driver(Protocol):
-    """The run on a grid whose outputs are stored: see `base.GridRun`."""
-
-    problem: Problem
-    grid: Grid
-
-    @property
-    def stepper(self) -> CountingSteps:
-        """The steps of the run."""
-        ...
-
-    def stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
-        """Statistics after so many steps, saved states and shorter steps."""
-        ...
-
-    def within(self, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:
-        """Replace the states y, those at grid points `count`, by those a remainder later."""
-        ...
-
-    def report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
-        """Set status −1, the time and the message where a trajectory cannot go on."""
-        ...
-
-
 class StoredRun:
     """One run whose outputs a store takes; the outcome has none. A run that was stored before goes on."""
 
-    def __init__(self, run: Driver, store: RunStore) -> None:
+    def __init__(self, run: GridRun, store: RunStore) -> None:
         self.run, self.store = run, store
         self.problem, self.grid, self.stepper = run.problem, run.grid, run.stepper
         self.outputs = Outputs(run.grid, run.problem.t_eval, run.problem.save_every)

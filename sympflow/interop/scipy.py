@@ -14,9 +14,10 @@ from scipy.integrate import DenseOutput, OdeSolver
 
 from sympflow.arguments import as_float
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Problem, Stepper
+from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid, no_event, open_end
 from sympflow.integrators.registry import check_applies, naming_plugin
+from sympflow.integrators.steppers import Stepper
 from sympflow.interop.matching import Comparison, fixed_step
 
 if TYPE_CHECKING:
@@ -260,7 +261,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
 
     def _shorter(self, h: float) -> np.ndarray:
         with naming_plugin(self.integrator), np.errstate(all="ignore"):
-            y = self._stepper.shorter_from(self._t_anchor, self._anchor, h)
+            y = self._stepper.shorter(self._anchor, h, self._t_anchor)
         self._counts.shorter += 1
         return y
 
@@ -312,6 +313,6 @@ class FlowOutput(DenseOutput):
         states[times == self.t] = self._y
         if moving.any():
             with naming_plugin(self._integrator), np.errstate(all="ignore"):
-                states[moving] = self._stepper.shorter_from(self._t_anchor, states[moving], h[moving])
+                states[moving] = self._stepper.shorter(states[moving], h[moving], self._t_anchor)
             self._counts.shorter += int(np.count_nonzero(moving))
         return states.T if t.ndim else states[0]

@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import as_float, check_counts, check_t_eval, floats
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import compiled_loops
 from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
+from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import Orbits, checked_orbits
 
 ALIGNED = 1e-12

@@ -163,7 +163,7 @@ class _Search:
             piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
             stepper = self.integrator.stepper(piece)
             states, _ = stepper.rollout(y[0], step, n, np.arange(n + 1), float(t[0]))
-            end = states[-1] if step == grid.h else stepper.shorter_from(float(t[0]), y[0], step)
+            end = states[-1] if step == grid.h else stepper.shorter(y[0], step, float(t[0]))
         return np.asarray(end)
 
     def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, y_end: np.ndarray) -> None:
