@@ -253,7 +253,7 @@ class EulerWithinSteps(Stepper):
 
 
 def euler_within_steps(self, problem):
-    return EulerWithinSteps(self, problem, OwnSteps(self, problem))
+    return EulerWithinSteps(self, problem, OwnSteps(self, problem, None, True))
 
 
 def identity_for_gradients(self, system, t, y, h):
