@@ -68,6 +68,8 @@ def time_transformed(
     >>> bool(sol.y[2, -1] > 600)  # the physical time
     True
     """
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     system.check_conservative(
         "and no Hamiltonian in another time", "solve it in the physical time, by 'verlet' or 'dop853' for instance"
     )

@@ -113,15 +113,10 @@ class Stepper:
         """
         if self.kernel is None:
             return self.arrays.rollout(y0, h, n_steps, save, t0, carry)
-        start: dict[str, Any] = {"t0": t0} if self.driven else {}
-        if carry is not None:
-            start["carry"] = carry
-        if y0.ndim == 1:
-            states, last, iterations = self.kernel.run(h, y0, n_steps, save, **start)
-        else:
-            rows = y0.reshape(-1, y0.shape[-1])
-            found, last, iterations = self.kernel.run_batch(h, rows, n_steps, save, **start)
-            states = found.swapaxes(0, 1).reshape(len(save), *y0.shape)
+        rows = y0 if y0.ndim == 1 else y0.reshape(-1, y0.shape[-1])
+        states, last, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
+        if y0.ndim > 1:
+            states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
         self.arrays.iterations += iterations
         return states, np.asarray(last).reshape(y0.shape[:-1])
 

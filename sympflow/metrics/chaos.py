@@ -25,6 +25,7 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.systems.given import given_system
 
 ALIGNED = 1e-12
 """Below this SALI and GALI an orbit is chaotic for sure, and ends: what is left is rounding."""
@@ -71,7 +72,7 @@ class Indicator:
 
 def lyapunov(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -93,8 +94,9 @@ def lyapunov(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
-        Splitting methods run compiled on symbolic systems; of others each step is differentiated, which takes longer.
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`. Splitting methods run compiled on
+        symbolic systems; of others each step is differentiated, which takes longer.
     t_span : (float, float), optional
         The default is the system's. With fixed steps the run ends with the last whole one.
     y0 : array_like of shape (..., 2d), optional
@@ -138,7 +140,7 @@ def lyapunov(
 
 def sali(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -191,7 +193,7 @@ def sali(
 
 def gali(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -236,6 +238,7 @@ def gali(
     ----------
     .. [1] C. Skokos, T. Bountis, C. Antonopoulos, Physica D 231 (2007) 30–54.
     """
+    system = given_system(system)
     orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
     check_counts(k=k)
     if not 2 <= k <= 2 * system.ndof:

@@ -16,6 +16,7 @@ from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.systems.given import given_system
 
 WINDOW = 256  # steps between which orbits that have left are put aside
 MOST_VALUES = 1 << 21  # numbers of states that are held at a time
@@ -53,7 +54,7 @@ class Escapes:
 
 def escape_times(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -70,8 +71,8 @@ def escape_times(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
-        Of fixed steps.
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`; of fixed steps.
     t_span, y0
         As for `solve`; y0 may be a batch of shape (..., 2d).
     outside : float, domain or callable, optional
@@ -99,6 +100,7 @@ def escape_times(
     >>> round(float(found.time), 3), int(found.status)
     (4.656, 1)
     """
+    system = given_system(system)
     orbits = checked_orbits(system, method, t_span, y0, options, "escapes are located on")
     region = region_of(outside, system)
     rows = orbits.rows

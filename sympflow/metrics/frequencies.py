@@ -16,6 +16,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.grid import Grid
 from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.solver import solve
+from sympflow.systems.given import given_system
 
 MOST_SAMPLES = 1 << 16
 """Samples of an orbit, unless more are asked for: at every step, or at every few of a longer run."""
@@ -58,7 +59,7 @@ class Frequencies:
 
 def frequencies(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -79,7 +80,8 @@ def frequencies(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`.
     t_span : (float, float), optional
         The default is the system's. Choose ten periods or more.
     y0 : array_like of shape (..., 2d), optional
@@ -123,6 +125,7 @@ def frequencies(
     >>> float(frequencies(system, "kahan_li8", (0, 200), [0.01, 0.0], dt=0.1).frequencies[0, 0].round(6))
     0.999994
     """
+    system = given_system(system)
     orbits = checked_orbits(system, method, t_span, y0, options, "frequencies are found on")
     check_counts(n=n)
     times = _sample_times(orbits, samples)

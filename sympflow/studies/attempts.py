@@ -293,7 +293,9 @@ class Attempt:
         try:
             if self.candidate.problem:
                 raise ImportError(self.candidate.problem)
-            found = run(integrator)
+            with warnings.catch_warnings():  # a row has its energy error
+                warnings.filterwarnings("ignore", "`dt` .* is too long")
+                found = run(integrator)
             self.sols = (found,) if isinstance(found, Solution) else tuple(found)
             sol = self.sols[0]  # `sol.integrator` may be another than was asked for: see `Integrator.resolved`
             trained = sol.integrator.figures(sol.system).get("training_seconds") if sol.integrator.trained else None
