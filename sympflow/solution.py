@@ -161,8 +161,7 @@ class Solution:
                 return _energy(self, self.states, self.t)
             if self.varied:
                 return gathered(self, lambda part: part.energy())
-            t = None if self.system.autonomous else np.broadcast_to(self.t, self.states.shape[:-1])
-            return self.system.hamiltonian(self.states, t)
+            return self.system.hamiltonian(self.states, np.broadcast_to(self.t, self.states.shape[:-1]))
 
     def energy_error(self) -> np.ndarray:
         """Relative energy error over time, (..., n), with its sign; inf where H is beyond floats.
@@ -401,8 +400,7 @@ def _energy(sol: Solution, y: Array, t: Any) -> np.ndarray:
     with np.errstate(all="ignore"):
         if sol.rows is not None and not sol.rows.uniform and sol.system.autonomous:
             return sol.rows.hamiltonian(states)
-        times = None if sol.system.autonomous else np.broadcast_to(t, states.shape[:-1])
-        return np.asarray(sol.system.hamiltonian(states, times))
+        return np.asarray(sol.system.hamiltonian(states, np.broadcast_to(t, states.shape[:-1])))
 
 
 # trajectories with parameters of their own -----------------------------------------------------------------------

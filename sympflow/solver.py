@@ -238,14 +238,7 @@ def solve(
     elif system.step_is_open and readable(y_start):
         integrator = with_step(integrator, system, to_numpy(y_start))
     sol = _shown(integrator, problem, action, rows, progress)
-    if (
-        tol is not None
-        and steps_chosen
-        and store is None
-        and tol_of == "energy"
-        and system.autonomous
-        and system.conservative
-    ):
+    if tol is not None and steps_chosen and store is None and tol_of == "energy" and system.keeps_energy:
         _check_tolerance_met(sol, tol)
     if chosen is not None:
         sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"
@@ -313,15 +306,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     if between is not system:
         _check_impulses(problem, integrator)
         run = partial(run_between_impulses, _run)
-    elif not system.autonomous:
-        warn_of_jumps(
-            system,
-            problem.t0,
-            problem.t1,
-            integrator.step_length(system),
-            integrator.label if integrator.forces_at_ends(system) else None,
-            stacklevel=4,
-        )
+    else:
+        warn_of_jumps(system, problem.t0, problem.t1, integrator, stacklevel=4)
     if problem.t1 in (math.inf, -math.inf):
         run = _run_endless
     elif problem.store is not None:

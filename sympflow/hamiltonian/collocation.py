@@ -30,7 +30,7 @@ def counted_step(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, 
 
 
 def stage_times(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, h: Any) -> Any:
-    """The times t + c_i h of the stages, (..., s), of a driven system; None of another."""
+    """The times t + c_i h of the stages, (..., s), of a driven system; None of another, whose stages are all alike."""
     if system.autonomous:
         return None
     nodes, batch = stage_nodes(tableau), y.shape[:-1]
@@ -45,7 +45,7 @@ def stage_times(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, h
 def advanced(system: HamiltonianSystem, tableau: Tableau, y: Array, K: Array, h: Any) -> Array:
     """The state at the end of a step of length h (..., 1), or a number, with the increments K (..., s, 2d)."""
     end = y + sum(b * K[..., i, :] for i, b in enumerate(tableau[1]))
-    if system.friction is None:
+    if not system.friction:
         return end
     d = system.ndof
     return concatenate([end[..., :d], system.friction.drift(end[..., d:], h)[1]])
@@ -141,7 +141,7 @@ def _residual(system: HamiltonianSystem, y: Array, K: Array, h: Any, times: Any,
 def _field(system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, scale: Array) -> Array:
     """f of the stages Y (..., s, 2d); with friction of [q, P], [∂H/∂p, −e^{Γτ}∂H/∂q] at p = e^{−Γτ}P."""
     friction, d = system.friction, system.ndof
-    if friction is None:
+    if not friction:
         return system.vector_field(Y, times)
     tau = (A @ scale * h)[..., None]
     slope = system.gradient(concatenate([Y[..., :d], friction.drift(Y[..., d:], tau)[1]]), times)
@@ -151,7 +151,6 @@ def _field(system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, sc
 def decays(system: HamiltonianSystem, s: Any) -> Array:
     """e^{−Γs} for times s, a number or (...): (..., d, d)."""
     friction = system.friction
-    assert friction is not None
     identity = np.eye(system.ndof)
     if is_tensor(s):
         import torch
@@ -169,7 +168,7 @@ def newton_matrix(
     if system.local is not None:
         system.local.check_dense(float(math.prod(Y.shape)) * s * n, "the matrix of the equations of an implicit step")
     tau: Any = None
-    if system.friction is not None:
+    if system.friction:
         tau = A @ scale * h
         p = system.friction.drift(Y[..., d:], tau[..., None])[1]
         Y = concatenate([Y[..., :d], p])

@@ -105,7 +105,7 @@ def doubled_hamiltonian(system: HamiltonianSystem, force: SymbolicForce) -> sp.E
     assert symbols is not None
     d = system.ndof
     q, p = (sp.symbols(f"{letter}1:{2 * d + 1}", real=True) for letter in "qp")
-    G = np.zeros((d, d)) if system.friction is None else system.friction.matrix(d)
+    G = system.friction.matrix(d)
     mean = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
     terms = []
     for i, F in enumerate(force.expressions):

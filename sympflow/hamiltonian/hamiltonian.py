@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, per_state
+from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
 from sympflow.hamiltonian.times import checked_time
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.poles import Poles
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -76,8 +76,8 @@ class Hamiltonian:
         A quadratic part ½ qᵀKq of V that was named, of a definition without symbols.
     functions_given : bool
         True if H is given by functions of a user, which are to be checked.
-    friction : Friction or None
-        What −Γp does, of a damped system. Whatever leaves it out must refuse the system: see `check_conservative`.
+    friction : Friction
+        The flow of −Γp; false without it. Whatever leaves it out must refuse the system: see `check_conservative`.
     autonomous : bool
         False if H depends on t: then every function takes the time after the states, a number or one for each state,
         and whatever leaves it out must refuse the system: see `check_autonomous`.
@@ -85,7 +85,7 @@ class Hamiltonian:
         The period of H in t, where one was named.
     """
 
-    friction: Friction | None = None
+    friction: Friction = FRICTIONLESS
     autonomous: bool = True
     period: float | None = None
     energy_scale: float | None = None
@@ -191,8 +191,7 @@ class Hamiltonian:
         else:
             g = self._definition.gradient(y, *self._time(t, y))
             velocity, force = g[..., d:], -g[..., :d]
-        if self.friction is not None:
-            force = force + self.friction.force(y[..., d:])
+        force = self.friction.added(force, y[..., d:])
         if self.external_force is not None:
             force = force + self.external_force(y[..., :d], y[..., d:], *self._time(t, y))
         return concatenate([velocity, force])
@@ -202,7 +201,7 @@ class Hamiltonian:
         d, S = self.ndof, self.hessian(y, t)
         rows = [S[..., d:, :], -S[..., :d, :]]
         A = _library(S).cat(rows, dim=-2) if is_tensor(S) else np.concatenate(rows, axis=-2)
-        if self.friction is not None:
+        if self.friction:
             G = np.zeros((2 * d, 2 * d))
             G[d:, d:] = self.friction.matrix(d)
             A = A - _like(G, A)
@@ -264,12 +263,17 @@ class Hamiltonian:
     @property
     def damping(self) -> np.ndarray | None:
         """Γ of the friction −Γp, to be read only: (), one rate γ for all momenta, (d,) or (d, d); None without."""
-        return None if self.friction is None else self.friction.damping
+        return self.friction.damping
 
     @property
     def conservative(self) -> bool:
         """True without friction or an external force."""
-        return self.friction is None and self.external_force is None
+        return not self.friction and self.external_force is None
+
+    @property
+    def keeps_energy(self) -> bool:
+        """True if H is constant along solutions: without friction, an external force or a drive."""
+        return self.conservative and self.autonomous
 
     def check_conservative(self, what: str, remedy: str) -> None:
         """Refuse a system with friction where it would be left out, or what is asked does not hold with it.
@@ -287,7 +291,7 @@ class Hamiltonian:
                 "Runge–Kutta method such as 'dop853', or its doubled system by any method, and judge the physical "
                 "solution by sympflow.reference_error(sol)."
             )
-        if self.friction is not None:
+        if self.friction:
             raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
     def check_autonomous(self, what: str, remedy: str) -> None:
@@ -508,6 +512,18 @@ class Hamiltonian:
             return per_state(s, p) * self.velocity(p)
         return self._definition.drifted(p, *self._time(t, p), checked_time(s, p, p.shape[:-1]))
 
+    def drifted(self, q: Array, p: Array, t: Any, s: Any, sign: float = 1.0) -> tuple[Array, Array]:
+        """The states after the flow of T(p, t) with friction over a time s from t on; `sign` −1 undoes it.
+
+        s is a number, or an array that broadcasts against p (..., d).
+        """
+        if self.friction:
+            mean, end = self.friction.drift(p, sign * s)
+            return q + self.velocity(mean), end
+        if self.kinetic_timed:
+            return q + sign * self.drift(p, t, s[..., 0] if getattr(s, "ndim", 0) else s), p
+        return q + (sign * s) * self.velocity(p), p
+
     def drift_jacobian(self, p: Array, t: Any, s: Any) -> Array:
         """The derivatives of `drift` in p: (..., d) to (..., d, d)."""
         if not self.kinetic_timed:
@@ -547,7 +563,7 @@ class Hamiltonian:
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int) -> np.ndarray:
         """Return True for each run from states (n, 2d) to others that is seen to have leapt over such a place: (n,)."""
-        return self._definition.leapt(starts, ends, n_steps, self.conservative and self.autonomous)
+        return self._definition.leapt(starts, ends, n_steps, self.keeps_energy)
 
     def leap(self, y: np.ndarray, start: np.ndarray) -> str:
         """A clause on a state (2d,) of a run from a start (2d,) that did."""

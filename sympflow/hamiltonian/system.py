@@ -557,7 +557,7 @@ class HamiltonianSystem(Hamiltonian):
 
     def _set_friction(self, damping: float | ArrayLike | None) -> None:
         G = matrices.damping(damping, self.ndof)
-        self.friction = None if G is None else Friction(G)
+        self.friction = Friction(G)
 
     def _set_period(self, period: float | None) -> None:
         if period is None:

@@ -72,13 +72,8 @@ class Composition(ABC, ArraySteps):
     ) -> None:
         self.method, self.scheme = method, scheme
 
-    def check_friction(self, dt: float) -> None:
-        """Raise a ValueError where the friction of the system asks for shorter steps than dt."""
-        raise ValueError(f"`method` {self.method!r} does not take friction: use the splitting 'kinetic'.")
-
-    def check_driving(self) -> None:
-        """Raise a ValueError where the parts of a driven system have no exact flows."""
-        raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
+    def check_system(self, dt: float) -> None:
+        """Raise a ValueError where the friction or the drive of the system asks for shorter steps, or has no flow."""
 
     @abstractmethod
     def force_times(self) -> list[float]:
@@ -140,16 +135,14 @@ class KineticPotential(Composition):
                 f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
                 "for any separable system, such as 'kahan_li8'."
             )
-        if system.friction is not None and not system.quadratic_kinetic:
+        if system.friction and not system.quadratic_kinetic:
             raise ValueError(
                 f"`method` {method!r} solves friction exactly where the kinetic energy is ½ pᵀM⁻¹p, which "
                 f"{system.name!r} has not: use a Runge–Kutta method such as 'dop853'."
             )
 
-    def check_friction(self, dt: float) -> None:
+    def check_system(self, dt: float) -> None:
         friction = self.system.friction
-        if friction is None:
-            return
         back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
         if friction.largest * back * dt > MOST_GROWTH:
             raise ValueError(
@@ -159,8 +152,6 @@ class KineticPotential(Composition):
                 f"{MOST_GROWTH / (friction.largest * back):.3g}, or a scheme without such drifts, as 'verlet' or "
                 "'chin4c'."
             )
-
-    def check_driving(self) -> None:
         if self.system.kinetic_timed:
             self.system.drift(np.zeros(self.system.ndof), 0.0, 0.0)
 
@@ -169,9 +160,7 @@ class KineticPotential(Composition):
         return [c for s, c in zip(scheme.substeps, scheme.substep_times, strict=True) if s.kind == "kick"]
 
     def _times(self, t: Any, h: Any) -> list[Any]:
-        """The time at which each substep begins; that of a system that does not depend on it is left out."""
-        if self.system.autonomous:
-            return [None] * len(self.scheme.substeps)
+        """The time at which each substep begins."""
         return [stage_time(t, c, h) for c in self.scheme.substep_times]
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -180,7 +169,7 @@ class KineticPotential(Composition):
         times, h = self._times(t, h), per_state(h, y)
         for substep, at in zip(self.scheme.substeps, times, strict=True):
             if substep.kind == "drift":
-                q, p = _drift(system, q, p, substep.one * h, at)
+                q, p = system.drifted(q, p, at, substep.one * h)
             else:
                 p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
         return concatenate([q, p])
@@ -192,10 +181,8 @@ class KineticPotential(Composition):
         for substep, at in zip(reversed(self.scheme.substeps), reversed(times), strict=True):
             if substep.kind == "kick":
                 p = p - _kick(system, q, substep, h, self.scheme.monomials, at)
-            elif system.friction is None:
-                q, p = _drift(system, q, p, substep.one * h, at, -1.0)
             else:
-                q, p = _drift(system, q, p, -(substep.one * h))
+                q, p = system.drifted(q, p, at, substep.one * h, -1.0)
         return concatenate([q, p])
 
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
@@ -232,7 +219,7 @@ class KineticPotential(Composition):
         for substep, at in zip(self.scheme.substeps, times, strict=True):
             c = substep.one
             if substep.kind == "drift":
-                if system.friction is not None:
+                if system.friction:
                     mean, end = system.friction.drift(P.swapaxes(-1, -2), c * h[..., None])
                     U = U + _velocities(system, p, mean.swapaxes(-1, -2))
                     P = end.swapaxes(-1, -2)
@@ -240,7 +227,7 @@ class KineticPotential(Composition):
                     U = U + system.drift_jacobian(p, at, c * h[..., 0]) @ P
                 else:
                     U = U + c * h[..., None] * _velocities(system, p, P)
-                q, p = _drift(system, q, p, c * h, at)
+                q, p = system.drifted(q, p, at, c * h)
             else:
                 change = (c * h)[..., None] * _bends(system, q, U, at)
                 if substep.three:
@@ -252,7 +239,7 @@ class KineticPotential(Composition):
 
     def kernel(self, compensated: bool) -> Kernel:
         loops = _splitting_loops()(self.system)
-        if self.system.friction is None:
+        if not self.system.friction:
             return loops.kernel(self.scheme, compensated)
         return loops.damped_kernel(self.scheme, self.step)
 
@@ -266,18 +253,6 @@ def _splitting_loops() -> Callable[[HamiltonianSystem], SplittingLoops]:
     from sympflow.kernels.splitting_loops import splitting_loops
 
     return splitting_loops
-
-
-def _drift(
-    system: HamiltonianSystem, q: Array, p: Array, s: Any, t: Any = None, sign: float = 1.0
-) -> tuple[Array, Array]:
-    """The states after a drift over s from the time t on, of which friction is a part; `sign` −1 undoes one without."""
-    if system.friction is not None:
-        mean, end = system.friction.drift(p, s)
-        return q + system.velocity(mean), end
-    if system.kinetic_timed:
-        return q + sign * system.drift(p, t, s[..., 0] if getattr(s, "ndim", 0) else s), p
-    return q + (sign * s) * system.velocity(p), p
 
 
 def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials, t: Any = None) -> Array:
@@ -323,9 +298,6 @@ class ExactMaps(Composition):
 
     takes_driving: ClassVar[bool] = True
     parts: ExactParts
-
-    def check_driving(self) -> None:
-        """Do nothing: the parts were found to be solved exactly when the composition was made."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ExactMaps) and self._key() == other._key()

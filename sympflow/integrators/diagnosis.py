@@ -156,7 +156,7 @@ def _look(
     if T is not None:
         V = H - T
         scale = np.fmax.reduce(np.maximum(np.abs(T), np.abs(V - V[0])), axis=0)
-        odd |= ~(np.abs(H - H[0]) <= (OFF if system.conservative and system.autonomous else FAR_OFF) * scale)
+        odd |= ~(np.abs(H - H[0]) <= (OFF if system.keeps_energy else FAR_OFF) * scale)
     odd[0] = ~np.isfinite(H[0])
     return (odd, scale) if odd.any() else None
 
@@ -297,7 +297,7 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
     """Add to the message, and as `stats["blow_up_time"]`, when the solution of a failed run becomes infinite."""
     if not told:
         _note_last_state(outcome, problem)
-    if not (problem.system.conservative and problem.system.autonomous):  # a state of the solution is told by its energy
+    if not problem.system.keeps_energy:  # a state of the solution is told by its energy
         return
     y0 = to_numpy(problem.y0)
     failed = (np.atleast_1d(np.asarray(outcome.status)) < 0).reshape(-1)

@@ -99,7 +99,7 @@ def warn_of_loss(
     """Warn of a run that left the domain of its flow and lost far more energy than the flow does inside."""
     flow = integrator.known_flow(system)
     certificate = None if flow is None else flow.certified
-    if certificate is None or "domain_exit" not in outcome.stats or not (system.conservative and system.autonomous):
+    if certificate is None or "domain_exit" not in outcome.stats or not system.keeps_energy:
         return
     width = 2 * system.ndof
     with np.errstate(all="ignore"):

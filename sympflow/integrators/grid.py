@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    from sympflow.integrators.contract import Integrator
 
 EPS = float(np.finfo(float).eps)
 MOST_STEPS = 10**11
@@ -29,10 +33,9 @@ def no_event(n_steps: int, t: float) -> str:
     )
 
 
-def warn_of_jumps(
-    system: HamiltonianSystem, t0: float, t1: float, dt: float | None, method: str | None, stacklevel: int
-) -> bool:
-    """Warn, and return True, where H jumps within a step, or at the end of one at which the `method` takes a force."""
+def warn_of_jumps(system: HamiltonianSystem, t0: float, t1: float, integrator: Integrator, stacklevel: int) -> bool:
+    """Warn, and return True, where H jumps within a step, or at an end at which a step takes a force."""
+    dt = None if system.autonomous else integrator.step_length(system)
     if dt is None or not math.isfinite(t1) or t0 == t1:
         return False
     times = system.jump_times(min(t0, t1), max(t0, t1), dt / 4)
@@ -45,12 +48,12 @@ def warn_of_jumps(
             "first order. Choose a `dt` that divides all pieces between jumps from t0 on, or solve from jump to jump."
         )
     else:
-        known = [] if method is None else sorted({t0, *times.tolist(), t1})
+        known = [] if not integrator.forces_at_ends(system) else sorted({t0, *times.tolist(), t1})
         met = [t for t in known if t0 != t != t1 or _jumps_into(system, t, t0, t1, dt)]
         if not met:
             return False
         text = (
-            f"`method` {method!r} takes forces at the ends of its steps, and H of {system.name!r} jumps at one, at "
+            f"`method` {integrator.label!r} takes forces at the ends of its steps, and H of {system.name!r} jumps at one, at "
             f"t = {met[0] if t1 > t0 else met[-1]:.6g}: it is of first order there. Use one that takes none, such as "
             "'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
         )

@@ -36,9 +36,7 @@ def run_between_impulses(run: Run, integrator: Integrator, problem: Problem) -> 
             due = len(times) if last else done + (int(beyond.argmax()) if beyond.any() else len(beyond))
             asked = np.clip(times[done:due], min(start, end), max(start, end))
             piece = replace(piece, t_eval=asked if len(asked) and asked[-1] == end else np.append(asked, end))
-        if not (warned or piece.system.autonomous):
-            dt, at_ends = integrator.step_length(piece.system), integrator.forces_at_ends(piece.system)
-            warned = warn_of_jumps(piece.system, start, end, dt, integrator.label if at_ends else None, stacklevel=5)
+        warned = warned or warn_of_jumps(piece.system, start, end, integrator, stacklevel=5)
         try:
             outcome, _ = run(integrator, piece)
         except Interrupted as stop:

@@ -17,7 +17,16 @@ from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.clocks import ARRAYS_ONLY, LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
-from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, differentiated, forward_tangent, in_blocks
+from sympflow.integrators.contract import (
+    Failure,
+    Outcome,
+    Problem,
+    Steps,
+    differentiated,
+    forward_tangent,
+    in_blocks,
+    start_of,
+)
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.integrators.steppers import Stepper, compiled_loops
@@ -298,17 +307,14 @@ class Splitting(FixedStep):
             self.on_clock(system)
             return
         composition = self.composed(system)
-        if not system.autonomous:
-            composition.check_driving()
-        if system.friction is not None:
-            composition.check_friction(self.step_length(system))
-            if self.compensated:
-                raise ValueError(
-                    "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
-                )
+        composition.check_system(self.step_length(system))
+        if system.friction and self.compensated:
+            raise ValueError(
+                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
+            )
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
-        times = [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
+        times = [] if self.clock != "physical" else self.composed(system).force_times()
         return any(not END < c < 1 - END for c in times)
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
@@ -347,7 +353,7 @@ class Splitting(FixedStep):
         for times, states, lengths in self.steps(system, t_span, y0):
             for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
                 at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
-                start = float(at.flat[0]) if system.autonomous else at
+                start = start_of(system, at)
                 yield at, length, partial(self.pushed, system, start, y, length.astype(y.dtype))
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:

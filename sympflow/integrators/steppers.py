@@ -79,7 +79,6 @@ class Stepper:
         self.remark = ""
         if told and problem.system.symbols is not None:
             self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
-        self.driven = self.system is not None and not self.system.autonomous  # a flow alone steps without a system
 
     @property
     def compiled(self) -> bool:
@@ -125,10 +124,10 @@ class Stepper:
         if self.kernel is None:
             return self.arrays.step(y, h, t)
         self.arrays.check_lengths(h)
-        start = (np.broadcast_to(t, y.shape[:-1]).reshape(-1),) if self.driven else ()
+        times = t if np.ndim(t) == 0 else np.broadcast_to(t, y.shape[:-1]).reshape(-1)
         rows = y if y.ndim == 2 else np.ascontiguousarray(y).reshape(-1, y.shape[-1])
         lengths = h if np.shape(h) == (len(rows),) else np.broadcast_to(h, y.shape[:-1]).reshape(-1)
-        states, iterations = self.kernel.step(lengths, rows, *start)
+        states, iterations = self.kernel.step(lengths, rows, times)
         self.arrays.iterations += iterations
         return states.reshape(y.shape)
 
@@ -256,12 +255,9 @@ def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, rem
     together = last - first == len(extra) - 1  # nearly always, and a slice is copied ten times sooner
     rows: Any = slice(first, last + 1) if together and not is_tensor(y) else extra
     states = y[rows]
-    lengths, t = h, np.zeros(())
+    lengths, t = h, grid.t0 + count[extra] * grid.h
     if y.ndim != 2:
-        lengths = np.broadcast_to(h.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
-    if not stepper.system.autonomous:
-        start = grid.t0 + count[extra] * grid.h
-        t = np.broadcast_to(start.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy()
+        lengths, t = (np.broadcast_to(x.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy() for x in (h, t))
     if not is_tensor(y):
         with np.errstate(all="ignore"):
             y[rows] = checked_state(stepper.shorter(states, lengths.astype(y.dtype), t), states)

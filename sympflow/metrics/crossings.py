@@ -199,7 +199,7 @@ class _Search:
         self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(t, y, h * high)))
 
     def _step(self, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-        return self.integrator.step(self.system, 0.0 if self.system.autonomous else t, y, h)  # type: ignore[arg-type]
+        return self.integrator.step(self.system, t, y, h)  # type: ignore[arg-type]
 
     def _located(self, width: int, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The crossings that were found, by trajectory and along the run."""

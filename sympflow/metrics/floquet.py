@@ -180,8 +180,8 @@ def floquet_multipliers(
 def _pairing(system: HamiltonianSystem, M: np.ndarray, T: float) -> float:
     """The defect of the form that M keeps, or shrinks: see `FloquetMultipliers`."""
     friction = system.friction
-    if system.external_force is not None or (friction is not None and not friction.isotropic):
+    if system.external_force is not None or not friction.isotropic:
         return math.nan
-    rate, d = 0.0 if friction is None else friction.largest, system.ndof
+    rate, d = friction.largest, system.ndof
     J = np.block([[np.zeros((d, d)), np.eye(d)], [-np.eye(d), np.zeros((d, d))]])
     return float(np.linalg.norm(M.T @ J @ M - math.exp(-rate * T) * J, 2) / np.linalg.norm(M, 2) ** 2)

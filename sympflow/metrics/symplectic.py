@@ -250,14 +250,14 @@ def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | N
     if sol.system.external_force is not None:
         sol.system.check_conservative("by which its flow is not conformally symplectic", "")
     friction = sol.system.friction
-    if friction is not None and not friction.isotropic:
+    if not friction.isotropic:
         raise ValueError(
             f"`sol` is of {sol.system.name!r}, whose momenta have different rates of friction: its flow is not "
             "conformally symplectic. Use sympflow.reference_error(sol)."
         )
     if sol.varied:
         return gathered(sol, lambda part: conformal_defect(part, relative, scale))
-    return _form_defect(sol, 0.0 if friction is None else friction.largest, relative, scale)
+    return _form_defect(sol, friction.largest, relative, scale)
 
 
 def _form_defect(sol: Solution, rate: float, relative: bool, scale: ArrayLike | None) -> np.floating | np.ndarray:

@@ -170,7 +170,7 @@ def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
     if system.conservative:
         energy = ("energy", "drift") if system.autonomous else () if jumps_in_time(system) else ("balance",)
         return ("error", *energy, "volume", "symplecticity")
-    shrinks_evenly = system.external_force is None and system.friction is not None and system.friction.isotropic
+    shrinks_evenly = system.external_force is None and system.friction and system.friction.isotropic
     return ("error", "conformal") if shrinks_evenly else ("error",)
 
 
