@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import copy
 import math
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, floats, real_number
+from sympflow.arguments import check_flag, real_number
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.scene import Scene, SceneOptions
 from sympflow.hamiltonian.times import check_period, probe_times
 
 if TYPE_CHECKING:
@@ -146,17 +146,12 @@ class HamiltonianSystem(Hamiltonian):
         time: bool = False,
         period: float | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "custom",
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
         check: bool = True,
+        **scene: Unpack[SceneOptions],
     ) -> None:
         from sympflow.hamiltonian.callables import CallableHamiltonian, DrivenCallables
 
+        settled = Scene.given(scene)
         for argument, H in (("potential", potential), ("hamiltonian", hamiltonian)):
             if isinstance(H, str):
                 raise TypeError(
@@ -173,18 +168,18 @@ class HamiltonianSystem(Hamiltonian):
         kind = DrivenCallables if time else CallableHamiltonian
         definition = kind(int(ndof), potential, hamiltonian, gradient, hessian_vector, check)
         if definition.separable:
-            super().__init__(name, definition, matrices.inverse_mass(mass, int(ndof)), True)
+            super().__init__(settled.name, definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
-            super().__init__(name, definition, None, False)
+            super().__init__(settled.name, definition, None, False)
         if stiffness_matrix is not None:
             if not definition.separable:
                 raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
             self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
             self.stiffness_matrix.setflags(write=False)
         self._set_friction(damping)
-        self._set_scene({}, domain, y0, t_span, dt, energy_scale, exact)
+        self._set_scene({}, settled)
         self._set_period(period)
 
     @classmethod
@@ -198,13 +193,7 @@ class HamiltonianSystem(Hamiltonian):
         time: str | sympy.Symbol | None = None,
         period: float | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "custom",
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """A system from one symbolic definition of H in q1 … qd, p1 … pd (or q, p).
 
@@ -242,7 +231,7 @@ class HamiltonianSystem(Hamiltonian):
 
         if q is not None or p is not None:
             expression = renamed(expression, q, p)
-        params = checked_params(params)
+        params, settled = checked_params(params), Scene.given(scene)
         symbols = SymbolicHamiltonian(expression, params, time)
         if cls._continuous:
             symbols.check_continuous()
@@ -256,10 +245,10 @@ class HamiltonianSystem(Hamiltonian):
         self = cls.__new__(cls)
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(matrices.from_entries(M.shape, M.todok()))
-        Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
+        Hamiltonian.__init__(self, settled.name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
         self._set_friction(damping)
-        self._set_scene(params, domain, y0, t_span, dt, energy_scale, exact)
+        self._set_scene(params, settled)
         self._set_period(period)
         return self
 
@@ -275,14 +264,7 @@ class HamiltonianSystem(Hamiltonian):
         fields: str | Sequence[str] = "q",
         params: Mapping[str, Any] | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "lattice",
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
-        time: None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """A lattice of any size, H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), by expressions for one site and one bond.
 
@@ -312,8 +294,6 @@ class HamiltonianSystem(Hamiltonian):
             the first site where the lower end is a wall.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
-        time : None
-            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -329,9 +309,8 @@ class HamiltonianSystem(Hamiltonian):
         """
         from sympflow.hamiltonian.lattice import LatticeHamiltonian
 
-        _check_no_time(time)
         local = LatticeHamiltonian(onsite, bond, shape, boundary, kinetic, fields, params)
-        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
+        return cls._of_pieces(local, damping, Scene.given(scene, name="lattice"))
 
     @classmethod
     def pairs(
@@ -346,14 +325,7 @@ class HamiltonianSystem(Hamiltonian):
         params: Mapping[str, float] | None = None,
         bodies: Mapping[str, ArrayLike] | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "pairs",
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 1.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
-        time: None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """Bodies that interact in pairs, any number of them: H = Σ_i |p_i|²/(2 m_i) + Σ_{i<j} V(r_ij).
 
@@ -383,8 +355,6 @@ class HamiltonianSystem(Hamiltonian):
             Values that differ from body to body: of "c" the values are c1 and c2 in V.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
-        time : None
-            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -401,9 +371,8 @@ class HamiltonianSystem(Hamiltonian):
         """
         from sympflow.hamiltonian.bodies import PairsHamiltonian
 
-        _check_no_time(time)
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
-        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
+        return cls._of_pieces(local, damping, Scene.given(scene, name="pairs", t_span=(0.0, 1.0)))
 
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
@@ -450,8 +419,11 @@ class HamiltonianSystem(Hamiltonian):
         domain = None
         with suppress(ValueError):  # of states at rest none follow
             domain = self.local_states()
-        scene = None, self.t_span, self.dt, None
-        return HamiltonianSystem._of_pieces(local, self.damping, self.name, domain, *scene)
+        return HamiltonianSystem._of_pieces(local, self.damping, self._piece_scene(domain))
+
+    def _piece_scene(self, domain: Domain | None) -> Scene:
+        """The scene of a few of the sites or bodies."""
+        return Scene(self.name, domain, None, self.t_span, self.dt)
 
     def local_states(self) -> LatticeStates | None:
         """The states, for any size, at the energy density of the domain, or else of `y0`; None without both."""
@@ -469,9 +441,7 @@ class HamiltonianSystem(Hamiltonian):
     @cached_property
     def _few_sites(self) -> HamiltonianSystem:
         assert self.local is not None
-        return HamiltonianSystem._of_pieces(
-            self.local.piece(), self.damping, self.name, None, None, self.t_span, self.dt, None
-        )
+        return HamiltonianSystem._of_pieces(self.local.piece(), self.damping, self._piece_scene(None))
 
     @property
     def few_sites(self) -> HamiltonianSystem:
@@ -488,14 +458,7 @@ class HamiltonianSystem(Hamiltonian):
         length: float | Sequence[float] | None = None,
         dispersion: str | sympy.Expr = "k**2/2",
         params: Mapping[str, Any] | None = None,
-        name: str = "schroedinger",
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
-        time: None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """A complex field on a periodic grid of any size, i ∂ψ/∂t = ω(−i∇)ψ + f'(|ψ|²)ψ: Schrödinger equations.
 
@@ -523,8 +486,6 @@ class HamiltonianSystem(Hamiltonian):
             Values of the other names; arrays in `onsite`, such as a potential V or disorder.
         name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
-        time : None
-            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -540,19 +501,16 @@ class HamiltonianSystem(Hamiltonian):
         """
         from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian
 
-        _check_no_time(time)
         local = WaveFunctionHamiltonian(onsite, dispersion, shape, length, params)
-        return cls._of_pieces(local, None, name, domain, y0, t_span, dt, energy_scale, exact)
+        return cls._of_pieces(local, None, Scene.given(scene, name="schroedinger"))
 
     @classmethod
-    def _of_pieces(
-        cls, local: LocalHamiltonian, damping: float | ArrayLike | None, name: str, *scene: Any
-    ) -> HamiltonianSystem:
+    def _of_pieces(cls, local: LocalHamiltonian, damping: float | ArrayLike | None, scene: Scene) -> HamiltonianSystem:
         """A system by a definition of one piece."""
         self = cls.__new__(cls)
-        Hamiltonian.__init__(self, name, local, local.inverse_mass, local.quadratic_kinetic)
+        Hamiltonian.__init__(self, scene.name, local, local.inverse_mass, local.quadratic_kinetic)
         self._set_friction(damping)
-        self._set_scene(local.params, *scene)
+        self._set_scene(local.params, scene)
         return self
 
     def _set_friction(self, damping: float | ArrayLike | None) -> None:
@@ -585,38 +543,18 @@ class HamiltonianSystem(Hamiltonian):
                 self._set_period(former)
         return self._period
 
-    def _set_scene(
-        self,
-        params: Mapping[str, Any],
-        domain: Domain | None,
-        y0: ArrayLike | None,
-        t_span: tuple[float, float],
-        dt: float | None,
-        energy_scale: float | None,
-        exact: Callable[[Any], Array] | None = None,
-    ) -> None:
+    def _set_scene(self, params: Mapping[str, Any], scene: Scene) -> None:
         self._params = Parameters(params)
-        if exact is not None and not callable(exact):
-            raise TypeError(f"`exact` must be a function of the time; got {type(exact).__name__}.")
-        self.exact = exact
-        if dt is not None and not (real_number(dt) and 0 < dt < 1e100):
-            raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
-        try:
-            t0, t1 = (float(t) for t in t_span)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.") from error
-        if not math.isfinite(t1 - t0):
-            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.")
-        self.t_span, self._dt = (t0, t1), None if dt is None else float(dt)
-        if energy_scale is not None and not (real_number(energy_scale) and 0 < energy_scale <= sys.float_info.max):
-            raise ValueError(f"`energy_scale` must be positive and finite; got {energy_scale!r}.")
-        self.energy_scale = energy_scale
-        self.y0 = None if y0 is None else self._checked_y0(y0)
-        if domain is not None and not isinstance(domain, Domain):
-            raise TypeError(f"`domain` must be a domain such as sympflow.Box(low, high); got {type(domain).__name__}.")
-        self.domain = None if domain is None else domain_of(domain, self)
+        self.exact, self.t_span, self._dt, self.energy_scale = scene.exact, scene.t_span, scene.dt, scene.energy_scale
+        self.y0 = scene.state(self.ndof)
+        self.domain = None if scene.domain is None else domain_of(scene.domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
+
+    @property
+    def scene(self) -> Scene:
+        """What the system is usually solved with, but for an `exact` solution, which is one of its parameters."""
+        return Scene(self.name, self.domain, self.y0, self.t_span, self.dt, self.energy_scale)
 
     @property
     def dt(self) -> float:
@@ -635,16 +573,6 @@ class HamiltonianSystem(Hamiltonian):
     def step_is_open(self) -> bool:
         """True if `dt` was not given, and the system has no states from which it could be chosen."""
         return self._dt is None and self.y0 is None and self.domain is None
-
-    def _checked_y0(self, y0: ArrayLike) -> np.ndarray:
-        """The default initial state: a copy of floats."""
-        try:
-            state = floats("y0", y0)
-        except OverflowError:
-            raise ValueError("`y0` must be finite: it has an integer that no float is near.") from None
-        if state.shape != (2 * self.ndof,):
-            raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {state.shape}.")
-        return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
@@ -713,23 +641,12 @@ class HamiltonianSystem(Hamiltonian):
         {'k': 2.5}
         """
         if self.local is not None:
-            scene = self.domain, self.y0, self.t_span, self.dt, self.energy_scale
-            return HamiltonianSystem._of_pieces(self.local.with_params(values), self.damping, self.name, *scene)
+            return HamiltonianSystem._of_pieces(self.local.with_params(values), self.damping, self.scene)
         self.check_parameters(values)
         assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.named_time
-        made = HamiltonianSystem.from_sympy(
-            H,
-            params={**self.params, **values},
-            time=time,
-            damping=self.damping,
-            name=self.name,
-            domain=self.domain,
-            y0=self.y0,
-            t_span=self.t_span,
-            dt=self.dt,
-            energy_scale=self.energy_scale,
-        )
+        params = {**self.params, **values}
+        made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
         # Values of the drive may have changed the period: it is tested where it is asked for.
         made._former_period = self._former_period if self.autonomous else self.period
         return made
@@ -844,14 +761,6 @@ class HamiltonianSystem(Hamiltonian):
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
         return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
-
-
-def _check_no_time(time: object) -> None:
-    if time is not None:
-        raise TypeError(
-            "`time` is for systems that are written out, and those by one piece do not depend on it: leave it out, or "
-            "write H out by HamiltonianSystem.from_sympy(..., time='t')."
-        )
 
 
 def parameters_text(

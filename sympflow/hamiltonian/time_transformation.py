@@ -14,6 +14,7 @@ from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.function_checks import as_like
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.scene import Scene
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
 
 LARGEST_SHIFT = 1e100
@@ -89,10 +90,10 @@ def time_transformed(
     else:
         transformed = HamiltonianSystem.__new__(HamiltonianSystem)
         Hamiltonian.__init__(transformed, f"log_{system.name}", _Logarithmic(system, c), None, False)
-        transformed._set_scene({**system.params, "shift": c}, None, None, (0.0, 100.0), 0.05, 1.0)
+        transformed._set_scene({**system.params, "shift": c}, Scene(dt=0.05, energy_scale=1.0))
     transformed.domain = domain
     if system.y0 is not None:
-        transformed.y0 = transformed._checked_y0(lifted(system, system.y0, c))
+        transformed.y0 = Scene(y0=lifted(system, system.y0, c)).state(transformed.ndof)
         scale = time_scale(system, c)
         transformed.dt = system.dt * scale
         transformed.t_span = (0.0, (system.t_span[1] - system.t_span[0]) * scale)

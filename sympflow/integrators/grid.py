@@ -53,9 +53,9 @@ def warn_of_jumps(system: HamiltonianSystem, t0: float, t1: float, integrator: I
         if not met:
             return False
         text = (
-            f"`method` {integrator.label!r} takes forces at the ends of its steps, and H of {system.name!r} jumps at one, at "
-            f"t = {met[0] if t1 > t0 else met[-1]:.6g}: it is of first order there. Use one that takes none, such as "
-            "'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
+            f"`method` {integrator.label!r} takes forces at the ends of its steps, and H of {system.name!r} jumps "
+            f"at one, at t = {met[0] if t1 > t0 else met[-1]:.6g}: it is of first order there. Use one that takes "
+            "none, such as 'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
         )
     warnings.warn(text, RuntimeWarning, stacklevel=stacklevel + 1)
     return True
