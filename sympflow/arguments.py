@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -182,6 +183,19 @@ def as_float(value: Any) -> float:
         return float(value)
     except OverflowError:
         return math.nan
+
+
+def check_positive(name: str, value: Any, most: float = sys.float_info.max) -> None:
+    """Raise unless the argument `name` is a positive and finite real number."""
+    if not (real_number(value) and 0 < value <= most):
+        raise ValueError(f"`{name}` must be positive and finite; got {value!r}.")
+
+
+def check_one_of(name: str, value: Any, known: Iterable[str]) -> None:
+    """Raise unless the argument `name` is one of the known words."""
+    words = list(known)
+    if not isinstance(value, str) or value not in words:
+        raise ValueError(f"`{name}` must be one of {', '.join(map(repr, words))}; got {value!r}.")
 
 
 def check_flag(name: str, value: Any) -> None:

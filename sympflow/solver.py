@@ -19,6 +19,7 @@ from sympflow.arguments import (
     MAX_ASKED_VALUES,
     MAX_SAVED_VALUES,
     as_float,
+    check_flag,
     check_not_traced,
     check_save_every,
     check_t_eval,
@@ -204,13 +205,11 @@ def solve(
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
     check_backend(backend, integrator)
-    if not isinstance(dense_output, bool | np.bool_):
-        raise TypeError(f"`dense_output` must be True or False; got {dense_output!r}.")
+    check_flag("dense_output", dense_output)
     action = ("warn" if integrator.trained else "ignore") if on_domain_exit is None else on_domain_exit
     if not isinstance(action, str) or action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
-    if not isinstance(diagnose, bool | np.bool_):
-        raise TypeError(f"`diagnose` must be True or False; got {diagnose!r}.")
+    check_flag("diagnose", diagnose)
     if action == "stop" and not readable(y_start):
         raise ValueError(
             "`on_domain_exit` 'stop' needs the values of the states, which torch.func.vmap and torch.compile hide: use "

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, real_number
+from sympflow.arguments import check_flag, check_positive
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, domain_of
@@ -522,8 +522,7 @@ class HamiltonianSystem(Hamiltonian):
             return
         if self.autonomous:
             raise TypeError("`period` only goes with `time`, for H that depends on t: leave it out.")
-        if not real_number(period) or not 0 < period < 1e100:
-            raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+        check_positive("period", period, most=1e100)
         known = self._definition.has_period(float(period))
         if known is False:
             raise ValueError(

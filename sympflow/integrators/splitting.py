@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, check_number
+from sympflow.arguments import check_flag, check_number, check_one_of
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
@@ -197,8 +197,7 @@ class Splitting(FixedStep):
         check_flag("compensated", self.compensated)
         for name, known in (("splitting", SPLITTINGS), ("clock", CLOCKS)):
             value = getattr(self, name)
-            if not isinstance(value, str) or value not in known:
-                raise ValueError(f"`{name}` must be one of {', '.join(map(repr, known))}; got {value!r}.")
+            check_one_of(name, value, known)
         if self.compensated and not SPLITTINGS[self.splitting].compensates:
             raise ValueError("`compensated` sums are for the splitting 'kinetic': leave it out.")
         if self.shift is not None:
@@ -456,8 +455,7 @@ def splitting_method(
     """
     table = checked_scheme(scheme_named(scheme) if isinstance(scheme, str) else scheme)
     for argument, value, known in (("splitting", splitting, SPLITTINGS), ("clock", clock, CLOCKS)):
-        if not isinstance(value, str) or value not in known:
-            raise ValueError(f"`{argument}` must be one of {', '.join(map(repr, known))}; got {value!r}.")
+        check_one_of(argument, value, known)
     if name is None:
         row = _row_of(table, splitting, clock)
         if row is not None:

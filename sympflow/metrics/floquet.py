@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import real_number
+from sympflow.arguments import check_positive, real_number
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -124,8 +124,7 @@ def floquet_multipliers(
     T = system.period if period is None else period
     if T is None:
         raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
-    if not real_number(T) or not 0 < T < math.inf:
-        raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+    check_positive("period", period)
     if not real_number(t0) or not math.isfinite(t0):
         raise ValueError(f"`t0` must be a finite number; got {t0!r}.")
     if is_tensor(y0):
