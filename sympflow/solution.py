@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arguments import check_flag
+from sympflow.arguments import check_flag, warn
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, weights
 
@@ -168,7 +167,7 @@ class Solution:
 
         See `sympflow.energy_error`; the largest magnitude is `sympflow.max_energy_error(sol)`.
         """
-        return energy_change(self, stacklevel=3)
+        return energy_change(self)
 
     def energy_scale(self) -> np.ndarray:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
@@ -333,11 +332,10 @@ def physical_solution(sol: Solution) -> Solution:
         apart = abs(to_numpy(both[0])).max(initial=0.0)
         scaled_apart, size = (abs(scale * to_numpy(y)).max(initial=0.0) for y in both)
     if scaled_apart > LARGEST_DIFFERENCE * size:
-        warnings.warn(
+        warn(
             f"The doubled variables q₋, p₋ have grown to {apart:.3g}: the run has left the physical limit. Reduce "
             "`dt`, or project every step, solve(system, 'projected', of=method).",
             RuntimeWarning,
-            stacklevel=3,
         )
     limit = doubled.physical_limit
     return replace(
@@ -369,7 +367,7 @@ def check_solution(sol: object, name: str = "sol") -> None:
         raise TypeError(f"`{name}` must be a Solution; got {type(sol).__name__}. Pass what solve() returns.")
 
 
-def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> np.ndarray:
+def energy_change(sol: Solution, relative: bool = True) -> np.ndarray:
     """H(y(t)) − H(y0) in float64, (..., n): the metric `sympflow.energy_error`, where it is documented."""
     sol.system.check_conservative(
         "so its energy is lost and no error",
@@ -385,10 +383,9 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
             return error
         scale = sol.energy_scale()
         if (absolute := np.isnan(scale)).any():
-            warnings.warn(
+            warn(
                 "The energy error is absolute where H(y0) is 0 but for rounding: give the system an `energy_scale`.",
                 RuntimeWarning,
-                stacklevel=stacklevel,
             )
         compared = error / np.where(absolute, 1.0, scale)[..., None]
         return np.where(np.isinf(error), error, compared)  # H(y0) may be infinite itself: inf/inf

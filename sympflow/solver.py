@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import time
@@ -24,6 +23,7 @@ from sympflow.arguments import (
     check_save_every,
     check_t_eval,
     check_t_span,
+    warn,
 )
 from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable, to_numpy
 from sympflow.events import EventSearch, parse
@@ -31,12 +31,10 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling, warn_of_long_steps
+from sympflow.integrators.diagnosis import diagnose, note_poles, note_singularities_of_rows
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
-    warn_of_leap,
-    warn_of_loss,
 )
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
 from sympflow.integrators.impulses import run_between_impulses
@@ -51,7 +49,6 @@ if TYPE_CHECKING:
 
 BACKENDS = ("auto", "compiled", "array")
 MAX_EVENT_SAMPLES = 100_000_000
-MOST_DIAGNOSED = 16  # sets of values of parameters
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
 _FLOAT64 = np.dtype(np.float64)
 
@@ -271,7 +268,7 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
     if error > tol:
         note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
         sol.message += f" {note}"
-        warnings.warn(note, RuntimeWarning, stacklevel=3)
+        warn(note, RuntimeWarning)
 
 
 def check_backend(backend: Any, integrator: Integrator) -> None:
@@ -306,7 +303,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         _check_impulses(problem, integrator)
         run = partial(run_between_impulses, _run)
     else:
-        warn_of_jumps(system, problem.t0, problem.t1, integrator, stacklevel=4)
+        warn_of_jumps(system, problem.t0, problem.t1, integrator)
     if problem.t1 in (math.inf, -math.inf):
         run = _run_endless
     elif problem.store is not None:
@@ -322,27 +319,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
-    passed = False
-    if (system.poles is not None or problem.letters is not None) and problem.diagnosed and problem.store is None:
-        if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
-            passed = note_poles(outcome, integrator, problem, rows, stacklevel=4 + (rows is not None))
-        if stopped is None and problem.letters is None and readable(outcome.y):
-            warn_of_cancelling(outcome, problem, stacklevel=4)
-    failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
-    if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
-        note_singularities(outcome, integrator, problem, passed)
-    if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
-        warn_of_leap(outcome, system, y_start, stacklevel=4)
-    if system.functions_given and readable(outcome.y):
-        system.check_functions_along(outcome.y)
-    if integrator.trained:
-        check_system_along(outcome, integrator, between, y_start)
-    if action != "ignore" and readable(outcome.y):
-        check_domain(outcome, integrator, between, action)
-        if problem.store is None and not failed and between is system:
-            warn_of_loss(outcome, integrator, system, y_start, stacklevel=4)
-    if problem.diagnosed and rows is None and not failed and problem.store is None and readable(outcome.y):
-        warn_of_long_steps(outcome, integrator, problem, stacklevel=4)
+    diagnose(outcome, integrator, problem, rows, action, stopped is not None)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     sol = (Solution if problem.store is None else StoredSolution)(
         t=outcome.t,
@@ -384,7 +361,7 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
             sol = _solved(integrator, part, action, rows.taken(index))
             pieces.append((index, sol))
             if problem.diagnosed and part.letters is not None and not sol.success:
-                _note_singularities(sol, integrator, part, rows.taken(index))
+                note_singularities_of_rows(sol, integrator, part, rows.taken(index))
     except Interrupted as stop:
         pieces.append((index, stop.solution))
         whole = max((sol for _, sol in pieces), key=lambda sol: len(sol.t))
@@ -393,22 +370,6 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
         sol = joined(pieces, problem.system, problem.y0, rows)
         raise Interrupted(stop.outcome, replace(sol, message=stop.solution.message)) from None
     return joined(pieces, problem.system, problem.y0, rows)
-
-
-def _note_singularities(sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows) -> None:
-    """Note when solutions with parameters of their own become infinite, of the first `MOST_DIAGNOSED` that fail."""
-    status = np.asarray(sol.status)
-    failed, times = np.flatnonzero(status < 0), np.full(len(status), np.nan)
-    for few, system, _ in itertools.islice(rows.taken(failed).distinct(), MOST_DIAGNOSED):
-        i = failed[few]
-        stats = {name: value[i] if isinstance(value, np.ndarray) else value for name, value in sol.stats.items()}
-        outcome = Outcome(sol.t, np.moveaxis(sol.y[i], -1, 0), status[i], "", stats)
-        note_singularities(outcome, integrator, replace(problem, system=system, y0=problem.y0[i], letters=None))
-        times[i] = outcome.stats.get("blow_up_time", np.nan)
-    if np.isfinite(times).any():
-        sol.stats["blow_up_time"] = times
-        first = int(np.argmax(np.isfinite(times)))
-        sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."
 
 
 def _not_begun(sol: Solution, problem: Problem) -> Solution:
@@ -492,7 +453,7 @@ def _look_for_poles(store: RunStore, piece: Outcome, integrator: Integrator, bef
     """Note that a run passed a pole between outputs of a window, and the state before them; of each trajectory once."""
     known = np.array(store.noted.get("failed_at", np.full(before.y0.shape[:-1], np.nan)), dtype=float)
     piece.status = np.where(np.isnan(known), 0, -1) if known.ndim else 0 if np.isnan(known) else -1
-    if note_poles(piece, integrator, before, None, stacklevel=6):
+    if note_poles(piece, integrator, before, None):
         at = np.where(np.isnan(known), piece.stats["failed_at"], known)
         store.noted |= {"failed_at": at.tolist(), "passed": store.noted.get("passed", piece.message)}
 

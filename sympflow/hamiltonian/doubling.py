@@ -19,12 +19,12 @@ References
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import warn
 from sympflow.arrays import Array, concatenate, is_tensor
 from sympflow.hamiltonian.domain import Box, Domain
 from sympflow.hamiltonian.hamiltonian import ExternalForce
@@ -178,10 +178,9 @@ def doubled(
 
         F = SymbolicForce(system, [0] * system.ndof if force is None else force, params)
         if system.conservative and F.has_potential:
-            warnings.warn(
+            warn(
                 "`force` is that of a potential, which keeps an energy: put it into H, and solve that system.",
                 UserWarning,
-                stacklevel=2,
             )
         time = None if system.symbols.time is None else {"time": system.symbols.time, "period": system.period}
         made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene, **(time or {}))  # type: ignore[assignment]

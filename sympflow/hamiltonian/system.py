@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, check_positive
+from sympflow.arguments import check_flag, check_positive, warn
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, domain_of
@@ -236,11 +235,10 @@ class HamiltonianSystem(Hamiltonian):
         if cls._continuous:
             symbols.check_continuous()
         if symbols.ndof > MOST_WRITTEN_OUT:
-            warnings.warn(
+            warn(
                 f"`expression` has {symbols.ndof} coordinates: written out, H takes seconds to define, and a step ten "
                 "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
                 "HamiltonianSystem.pairs, from one pair. Use one of these.",
-                stacklevel=2,
             )
         self = cls.__new__(cls)
         M = symbols.inverse_mass
@@ -703,7 +701,7 @@ class HamiltonianSystem(Hamiltonian):
         try:
             self._definition.check(far, y, 0, *self._probed_times())
         except (ValueError, TypeError) as error:
-            warnings.warn(f"On this run, far from its start: {error}", RuntimeWarning, stacklevel=3)
+            warn(f"On this run, far from its start: {error}", RuntimeWarning)
             return
         seen = np.concatenate([reached, far[:, : self._arguments]])
         self._tested = self._tested | {kind: reach(seen, self._arguments // self.ndof)}

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,10 +11,12 @@ from weakref import WeakSet
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arguments import warn
+from sympflow.arrays import Array, is_tensor, readable, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
+from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap, warn_of_loss
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 TAIL = 200  # steps before the end of a run, at least, from which the solution is followed
 AHEAD = 4  # steps beyond the end: an implicit method gives up before a singularity
+MOST_DIAGNOSED = 16  # sets of values of parameters
 MOST_TRIED, MOST_ROWS, MOST_STORED = 500, 4096, 10**7  # steps of the reference; trajectories at once; numbers
 RTOL = 1e-10
 LOST = 0.01  # of y·∇H: a state whose energy differs by more is no longer on the solution
@@ -47,6 +50,46 @@ that share of errors there is told."""
 _TOLD: WeakSet[Any] = WeakSet()
 
 
+def diagnose(
+    outcome: Outcome,
+    integrator: Integrator,
+    problem: Problem,
+    rows: ParameterRows | None,
+    action: str,
+    interrupted: bool,
+) -> None:
+    """Look at the outcome of a run: what it shows ends it, is added to its message, or is warned of.
+
+    These are poles that it passed, terms of H that cancel, when the solution becomes infinite, singularities over which
+    it leapt, functions that do not fit, a flow of another system, its domain, and steps that are too long.
+    """
+    system, y0, stored = problem.system, problem.y0, problem.store is not None
+    values, plain = readable(outcome.y), problem.letters is None
+    look = values and problem.diagnosed and not interrupted
+    passed = False
+    if look and not stored and (system.poles is not None or not plain):
+        if np.any(np.asarray(outcome.status) >= 0):
+            passed = note_poles(outcome, integrator, problem, rows)
+        if plain:
+            warn_of_cancelling(outcome, problem)
+    failed = bool(np.any(np.asarray(outcome.status) < 0))
+    if failed and look and plain:
+        note_singularities(outcome, integrator, problem, passed)
+    held = values and not failed and not stored
+    if held and system.leaps and plain:
+        warn_of_leap(outcome, system, y0)
+    if values and system.functions_given:
+        system.check_functions_along(outcome.y)
+    if integrator.trained:
+        check_system_along(outcome, integrator, system.between_impulses, y0)
+    if values and action != "ignore":
+        check_domain(outcome, integrator, system.between_impulses, action)
+        if held and system.between_impulses is system:
+            warn_of_loss(outcome, integrator, system, y0)
+    if held and problem.diagnosed and rows is None:
+        warn_of_long_steps(outcome, integrator, problem)
+
+
 class Passage(NamedTuple):
     """The times between which a trajectory passed a pole, its name, "" of a start, and True if no solution does."""
 
@@ -56,9 +99,7 @@ class Passage(NamedTuple):
     certain: bool
 
 
-def note_poles(
-    outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None, stacklevel: int
-) -> bool:
+def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None) -> bool:
     """End a run where it passed a place at which H is infinite or no number; warn where it may have."""
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
@@ -104,17 +145,16 @@ def note_poles(
     likely = [row for row in found if row not in certain]
     if likely:
         passage, which = found[likely[0]], _which(problem, likely, values)
-        warnings.warn(
+        warn(
             f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
             f"over a place at which it is infinite, {passage.place}: the run means nothing after that. "
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
-            stacklevel=stacklevel + 1,
         )
     return bool(certain)
 
 
-def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> None:
+def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
     """Warn, once for a system, of a run about a value of q or p near which terms of H cancel until digits are lost."""
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
     if poles is None or not poles.cancelling or poles in _TOLD:
@@ -134,12 +174,11 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> N
         if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, visited) > LOST_DIGITS:
             continue
         _TOLD.add(poles)
-        warnings.warn(
+        warn(
             f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in "
             "many digits, and at it no number. Write them by sinc, which is sin(x)/x without that, or near it by their "
             "series, in a Piecewise.",
             RuntimeWarning,
-            stacklevel=stacklevel + 1,
         )
         return
 
@@ -257,7 +296,7 @@ def _end(
         outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)
 
 
-def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem, stacklevel: int) -> None:
+def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
     """Warn where the energy of a run with fixed steps is off by more than `TOO_LONG` of its size.
 
     H is evaluated at the start and a few outputs, of large systems at one for every 200 steps. Its size is the largest
@@ -285,11 +324,10 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
             return
         off = np.max(change / np.maximum(size, system.energy_scale or 0.0), initial=0.0)
     if TOO_LONG < off < np.inf:
-        warnings.warn(
+        warn(
             f"`dt` {integrator.step_length(system):g} is too long for method {integrator.label!r}: the energy of the "
             f"run is off by {100 * off:.2g} %. Take a shorter step, or tol=1e-6, for which it is chosen.",
             RuntimeWarning,
-            stacklevel=stacklevel + 1,
         )
 
 
@@ -449,3 +487,19 @@ def _end_of_solution(
 def _sizes(y: Array, d: int) -> np.ndarray:
     """The largest |q_i| and |p_i|: (n, 2)."""
     return np.stack([np.abs(y[..., :d]).max(-1), np.abs(y[..., d:]).max(-1)], axis=-1)
+
+
+def note_singularities_of_rows(sol: Any, integrator: Integrator, problem: Problem, rows: ParameterRows) -> None:
+    """Note when solutions with parameters of their own become infinite, of the first `MOST_DIAGNOSED` that fail."""
+    status = np.asarray(sol.status)
+    failed, times = np.flatnonzero(status < 0), np.full(len(status), np.nan)
+    for few, system, _ in itertools.islice(rows.taken(failed).distinct(), MOST_DIAGNOSED):
+        i = failed[few]
+        stats = {name: value[i] if isinstance(value, np.ndarray) else value for name, value in sol.stats.items()}
+        outcome = Outcome(sol.t, np.moveaxis(sol.y[i], -1, 0), status[i], "", stats)
+        note_singularities(outcome, integrator, replace(problem, system=system, y0=problem.y0[i], letters=None))
+        times[i] = outcome.stats.get("blow_up_time", np.nan)
+    if np.isfinite(times).any():
+        sol.stats["blow_up_time"] = times
+        first = int(np.argmax(np.isfinite(times)))
+        sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from sympflow.arguments import warn
 from sympflow.arrays import Array, to_numpy
 from sympflow.events import EventSearch
 from sympflow.integrators.contract import Interrupted, Outcome, Problem
@@ -119,10 +119,9 @@ def _ratio(found: np.ndarray) -> np.ndarray:
 
 
 def _warn(extension: Extension, apart: float, which: str) -> None:
-    warnings.warn(
+    warn(
         f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g} of the size of "
         "the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which the "
         "copies are bound.",
         RuntimeWarning,
-        stacklevel=5,
     )

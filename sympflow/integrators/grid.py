@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import warnings
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sympflow.arguments import warn
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def no_event(n_steps: int, t: float) -> str:
     )
 
 
-def warn_of_jumps(system: HamiltonianSystem, t0: float, t1: float, integrator: Integrator, stacklevel: int) -> bool:
+def warn_of_jumps(system: HamiltonianSystem, t0: float, t1: float, integrator: Integrator) -> bool:
     """Warn, and return True, where H jumps within a step, or at an end at which a step takes a force."""
     dt = None if system.autonomous else integrator.step_length(system)
     if dt is None or not math.isfinite(t1) or t0 == t1:
@@ -57,7 +57,7 @@ def warn_of_jumps(system: HamiltonianSystem, t0: float, t1: float, integrator: I
             f"at one, at t = {met[0] if t1 > t0 else met[-1]:.6g}: it is of first order there. Use one that takes "
             "none, such as 'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
         )
-    warnings.warn(text, RuntimeWarning, stacklevel=stacklevel + 1)
+    warn(text, RuntimeWarning)
     return True
 
 

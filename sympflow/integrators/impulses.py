@@ -36,7 +36,7 @@ def run_between_impulses(run: Run, integrator: Integrator, problem: Problem) -> 
             due = len(times) if last else done + (int(beyond.argmax()) if beyond.any() else len(beyond))
             asked = np.clip(times[done:due], min(start, end), max(start, end))
             piece = replace(piece, t_eval=asked if len(asked) and asked[-1] == end else np.append(asked, end))
-        warned = warned or warn_of_jumps(piece.system, start, end, integrator, stacklevel=5)
+        warned = warned or warn_of_jumps(piece.system, start, end, integrator)
         try:
             outcome, _ = run(integrator, piece)
         except Interrupted as stop:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copyreg
 import math
-import warnings
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolver
 
-from sympflow.arguments import as_float
+from sympflow.arguments import as_float, warn
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid, no_event, open_end
@@ -127,10 +126,9 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         if extraneous:
             own = sorted(set(extraneous) & set(self.integrator.options()))
             remedy = f"leave them out; {', '.join(own)} is an option of as_scipy" if own else "leave them out"
-            warnings.warn(
+            warn(
                 f"The options {', '.join(sorted(extraneous))} have no effect on a fixed-step method: {remedy}.",
                 UserWarning,
-                stacklevel=3,
             )
         if not as_float(max_step) > 0:
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")

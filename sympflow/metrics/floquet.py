@@ -12,14 +12,13 @@ References
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_positive, real_number
+from sympflow.arguments import check_positive, real_number, warn
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -153,11 +152,10 @@ def floquet_multipliers(
     scale = weights(system)
     sizes = [float(np.abs(scale * y).max()) for y in (start, system.y0) if y is not None]
     if not np.linalg.norm(scale * (to_numpy(end) - start)) <= CLOSED * (max(sizes) or 1.0):
-        warnings.warn(
+        warn(
             f"The orbit is not periodic: after {T:g} it is {mismatch:.3g} from `y0`. Take a state of a periodic orbit, "
             "its period, or a smaller `dt`.",
             RuntimeWarning,
-            stacklevel=2,
         )
     M = np.eye(len(start))
     for _, _, jacobians in integrator.executed(system, t_span, start):
@@ -167,11 +165,10 @@ def floquet_multipliers(
     found = found[np.argsort(-np.abs(found), kind="stable")].astype(complex)
     pairing = _pairing(system, scale[:, None] * M / scale, float(T))
     if pairing > UNPAIRED:
-        warnings.warn(
+        warn(
             f"The multipliers are not in pairs, to {pairing:.2g}: steps of {integrator.name!r} are too long for "
             "deviations from the orbit. Use a splitting method such as 'kahan_li8', or a smaller `dt`.",
             RuntimeWarning,
-            stacklevel=2,
         )
     return FloquetMultipliers(found, M, float(T), mismatch, pairing)
 
