@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.arguments import check_flag, warn
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, weights
 
 if TYPE_CHECKING:
@@ -458,15 +458,10 @@ def _scattered(pieces: Sequence[tuple[np.ndarray, Any]], shape: tuple[int, ...])
     """Arrays (k, ...) of some trajectories each as one, (*shape, ...)."""
     whole: Any
     order = np.concatenate([index for index, _ in pieces])
-    if is_tensor(pieces[0][1]):
-        import torch
-
-        whole = torch.cat([values for _, values in pieces])[torch.as_tensor(np.argsort(order))]
-        return whole.reshape(*shape, *whole.shape[1:])
     if len(pieces) == 1 and (order == np.arange(len(order))).all():
-        whole = np.asarray(pieces[0][1])
+        whole = pieces[0][1]
     else:
-        whole = np.concatenate([np.asarray(values) for _, values in pieces])[np.argsort(order)]
+        whole = concatenate([values for _, values in pieces], 0)[np.argsort(order)]
     return whole.reshape(*shape, *whole.shape[1:])
 
 

@@ -25,7 +25,7 @@ from sympflow.arguments import (
     check_t_span,
     warn,
 )
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable, to_numpy
+from sympflow.arrays import Array, concatenate, finite_states, full_of_nan, is_tensor, lanes, last, readable, to_numpy
 from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import report_lanes, run_and_search
@@ -320,7 +320,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
     diagnose(outcome, integrator, problem, rows, action, stopped is not None)
-    y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
+    y = last(outcome.y)
     sol = (Solution if problem.store is None else StoredSolution)(
         t=outcome.t,
         y=y,
@@ -382,12 +382,7 @@ def _not_begun(sol: Solution, problem: Problem) -> Solution:
 def _up_to(sol: Solution, t: np.ndarray) -> Solution:
     """A solution of which the outputs at the last ones of the times t are unknown, NaN."""
     unknown = full_of_nan(sol.y0)[..., None]
-    width = len(t) - len(sol.t)
-    if is_tensor(sol.y):
-        import torch
-
-        return replace(sol, t=t, y=torch.cat([sol.y, *[unknown] * width], dim=-1), sol=None)
-    return replace(sol, t=t, y=np.concatenate([sol.y, np.repeat(unknown, width, axis=-1)], axis=-1), sol=None)
+    return replace(sol, t=t, y=concatenate([sol.y, *[unknown] * (len(t) - len(sol.t))]), sol=None)
 
 
 def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
@@ -505,10 +500,6 @@ def _run_endless(integrator: Integrator, problem: Problem) -> tuple[Outcome, Pro
         outcome.message = no_event(outcome.stats.get("n_steps", most), problem.t1)
     reached = problem.events.end or (outcome.stats.get("failed_at", problem.t1),)
     return outcome, replace(problem, t1=float(reached[0]))
-
-
-def _time_last(y: np.ndarray) -> np.ndarray:
-    return y.T if y.ndim == 2 else np.moveaxis(y, 0, -1)
 
 
 def _fits(outcome: Outcome, y0: Array) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, per_state, stack, values
+from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, stack, values
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 
@@ -150,14 +150,8 @@ def _field(system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, sc
 
 def decays(system: HamiltonianSystem, s: Any) -> Array:
     """e^{−Γs} for times s, a number or (...): (..., d, d)."""
-    friction = system.friction
-    identity = np.eye(system.ndof)
-    if is_tensor(s):
-        import torch
-
-        return friction.drift(torch.as_tensor(identity, dtype=s.dtype, device=s.device), s[..., None, None])[1]
-    s = np.asarray(s)
-    return friction.drift(identity.astype(s.dtype), s[..., None, None])[1]
+    s = s if is_tensor(s) else np.asarray(s)
+    return system.friction.drift(like(np.eye(system.ndof), s), s[..., None, None])[1]
 
 
 def newton_matrix(
@@ -182,11 +176,7 @@ def newton_matrix(
     outer = h[..., None, None, None] if getattr(h, "ndim", 0) else h
     blocks = outer * (scale[:, None] * A)[:, None, :, None] * D[..., :, :, None, :]
     M = -blocks.reshape(*Y.shape[:-2], s * n, s * n)
-    if is_tensor(M):
-        import torch
-
-        return M + torch.eye(s * n, dtype=M.dtype, device=M.device), D
-    return M + np.eye(s * n, dtype=M.dtype), D
+    return M + like(np.eye(s * n), M), D
 
 
 def variable_sizes(y: Array, K: Array, residual: Array) -> Array:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.arrays import Array, concatenate, is_tensor, of_library
 from sympflow.hamiltonian.domain import Box, Domain
 from sympflow.hamiltonian.hamiltonian import ExternalForce
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -209,7 +209,7 @@ class GivenForce:
                 f"`force` must return a tensor of the shape of p, {tuple(p.shape)}; got {got}: write it with torch "
                 "functions, for states on the last axis."
             )
-        return value if is_tensor(p) else value.detach().numpy()
+        return of_library(value, p)
 
     def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         import torch
@@ -223,7 +223,7 @@ class GivenForce:
             along[..., i] = 1
             columns.append(jvp(lambda z: self(z[..., :d], z[..., d:]), x, along)[1])
         found = torch.stack(columns, dim=-1)
-        return found if is_tensor(p) else found.numpy()
+        return of_library(found, p)
 
 
 class _DoubledFunctions:

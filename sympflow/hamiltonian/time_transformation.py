@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arguments import real_number
-from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.arrays import Array, concatenate, library
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.function_checks import as_like
@@ -175,7 +175,7 @@ class _Logarithmic(Definition):
         self._system.check_functions(projected(as_like(states[:n_given], like)) if n_given else None)
 
     def kinetic(self, P: Array) -> Array:
-        return _log(self._system.kinetic(P[..., :-1]) + P[..., -1])
+        return library(P).log(self._system.kinetic(P[..., :-1]) + P[..., -1])
 
     def kinetic_gradient(self, P: Array) -> Array:
         p, B = P[..., :-1], P[..., -1:]
@@ -189,7 +189,7 @@ class _Logarithmic(Definition):
         return _bordered(weight * (self._system.kinetic_hessian(p) + 0 * weight)) - g[..., :, None] * g[..., None, :]
 
     def potential(self, Q: Array) -> Array:
-        return -_log(self._c - self._system.potential(Q[..., :-1]))
+        return -library(Q).log(self._c - self._system.potential(Q[..., :-1]))
 
     def potential_gradient(self, Q: Array) -> Array:
         q = Q[..., :-1]
@@ -201,10 +201,6 @@ class _Logarithmic(Definition):
         weight = (1 / (self._c - self._system.potential(q)))[..., None, None]
         g = self.potential_gradient(Q)
         return _bordered(weight * self._system.potential_hessian(q)) + g[..., :, None] * g[..., None, :]
-
-
-def _log(x: Array) -> Array:
-    return x.log() if is_tensor(x) else np.log(x)
 
 
 def _bordered(S: Array) -> Array:

@@ -15,7 +15,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt, check_not_followed
-from sympflow.arrays import Array, finite_states, is_tensor, join, lanes, library_name, stack
+from sympflow.arrays import (
+    Array,
+    concatenate,
+    finite_states,
+    is_tensor,
+    lanes,
+    last,
+    library_name,
+    like,
+    stack,
+    unfollowed,
+)
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import (
@@ -373,7 +384,7 @@ class GridRun:
             outputs, kept = outputs[:n_outputs], [*kept[:n_kept], y[None]]
             search.forget_after(grid.time(k), grid.h)
 
-        t, y_out = times[:delivered], join(outputs)
+        t, y_out = times[:delivered], concatenate(outputs, 0)
         finite_outputs = finite_states(y_out)  # a shorter step may overflow too
         failed = failed or not finite_outputs.all()
         t_end = search.end[0] if search.end else grid.time(k) if failed or stopped else grid.t1
@@ -381,7 +392,7 @@ class GridRun:
         n_keep = len(t) if keep.all() else int(np.argmin(keep))
         t, y_out = t[:n_keep], y_out[:n_keep]
         if search.end and problem.t_eval is None and not (len(t) and t[-1] == t_end):
-            t, y_out = np.append(t, t_end), join([y_out, search.end[1][None]])
+            t, y_out = np.append(t, t_end), concatenate([y_out, search.end[1][None]], 0)
 
         n_extra = search.n_dense + int(np.count_nonzero(remainder[:delivered]))
         stats = self.stats(k + shorter, k, k, n_extra)
@@ -391,7 +402,7 @@ class GridRun:
             outcome.stats["failed_at"] = t_end
             outcome.message = self._failure(t_end, k)
         if problem.dense_output:
-            outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), join(kept))
+            outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), concatenate(kept, 0))
         if stopped:
             raise interrupted(outcome, t_end)
         return outcome
@@ -418,15 +429,9 @@ class GridRun:
         if parts == 1 or not len(states):
             return states[:, None][:, :0]
         t = (self.grid.t0 + (k + np.arange(len(states))) * self.grid.h)[:, None] * np.ones_like(lengths)
-        if is_tensor(states):
-            import torch
-
-            with torch.no_grad():
-                repeated = states[:, None].expand(-1, parts - 1, -1)
-                return self.stepper.shorter(repeated, torch.as_tensor(lengths).to(repeated), t)
+        repeated = stack([unfollowed(states)] * (parts - 1), axis=1)
         with np.errstate(all="ignore"):
-            repeated = np.repeat(states[:, None], parts - 1, axis=1)
-            return self.stepper.shorter(repeated, lengths.astype(states.dtype), t)
+            return self.stepper.shorter(repeated, like(lengths, repeated), t)
 
     def _search_remainder(self, search: EventSearch, y: Array) -> bool:
         """Search the last, shorter step of an interval that dt does not divide."""
@@ -525,7 +530,7 @@ class GridSolution:
         times = np.atleast_1d(np.asarray(t, dtype=float))
         count, remainder = self.grid.locate(times)
         y = shorter_steps(self.stepper, self.grid, self.states[count], count, remainder)
-        y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
+        y = last(y)
         return y[..., 0] if np.ndim(t) == 0 else y
 
 

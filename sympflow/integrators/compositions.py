@@ -379,11 +379,7 @@ def rollout_in_modes(
     states = parts.from_modes(modes[..., :d], modes[..., d:])
     if not (len(save) and save[0] == 0):
         return states, finite
-    if is_tensor(states):
-        import torch
-
-        return torch.cat([y0[None], states[1:]]), finite
-    return np.concatenate([y0[None], states[1:]]), finite
+    return concatenate([y0[None], states[1:]], 0), finite
 
 
 class LinearRest(ExactMaps):
@@ -468,9 +464,8 @@ class MidpointLinearRest(LinearRest):
 
 def _each_class(s: Any, parts: ExactParts) -> Any:
     """A time (...) for all F frequencies: (..., F)."""
-    if is_tensor(s):
-        return s[..., None] * s.new_ones(parts.n_classes)
-    return np.asarray(s)[..., None] * np.ones(parts.n_classes, dtype=getattr(s, "dtype", float))
+    s = s if is_tensor(s) else np.asarray(s, dtype=getattr(s, "dtype", float))
+    return s[..., None] * like(np.ones(parts.n_classes), s)
 
 
 class SolvableParts(ExactMaps):

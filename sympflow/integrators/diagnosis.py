@@ -12,7 +12,7 @@ from weakref import WeakSet
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, is_tensor, readable, to_numpy
+from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
@@ -288,12 +288,7 @@ def _end(
     ).reshape(failed_at.shape)
     outcome.stats["failed_at"], outcome.finite = failed_at, False
     outcome.status = np.where(after.any(0) | ~np.isnan(failed_at), -1, outcome.status)
-    if is_tensor(outcome.y):
-        import torch
-
-        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], np.nan)
-    else:
-        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)
+    outcome.y = masked(outcome.y, after[..., None], np.nan)
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:

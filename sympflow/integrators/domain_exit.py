@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, finite_states, has_values, is_tensor, one_lane, readable, to_numpy
+from sympflow.arrays import Array, finite_states, has_values, masked, one_lane, readable, to_numpy
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome
@@ -184,9 +183,4 @@ def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
     outside = np.logical_or.accumulate(~inside, axis=0)
     after = np.concatenate([np.zeros_like(outside[:1]), outside[:-1]])  # the exit itself is kept
     outcome.status = np.where(outside[-1], -1, outcome.status)
-    if is_tensor(outcome.y):
-        import torch
-
-        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], math.nan)
-    else:
-        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)
+    outcome.y = masked(outcome.y, after[..., None], np.nan)

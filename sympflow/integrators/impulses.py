@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, join
+from sympflow.arrays import Array, concatenate
 from sympflow.integrators.contract import Integrator, Interrupted, Outcome, Problem, finished, interrupted
 from sympflow.integrators.grid import EPS, warn_of_jumps
 
@@ -87,7 +87,7 @@ def _merged(found: list[Outcome], problem: Problem, ends: np.ndarray) -> Outcome
     failed = next((each for each in found if np.any(np.asarray(each.status) < 0)), None)
     stats["impulses"] = len(found) - 1
     message = finished(problem) if not np.any(np.asarray(status)) else (failed or last).message
-    outcome = Outcome(t, join([each.y for each in found]), status, message, stats)
+    outcome = Outcome(t, concatenate([each.y for each in found], 0), status, message, stats)
     if problem.dense_output:
         outcome.sol = BetweenImpulses(tuple(each.sol for each in found if each.sol is not None), ends)
     return outcome

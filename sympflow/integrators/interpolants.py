@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.arguments import check_not_followed
-from sympflow.arrays import Array, is_tensor, stack
+from sympflow.arrays import Array, is_tensor, last, stack
 
 if TYPE_CHECKING:
     from sympflow.integrators.contract import Outcome
@@ -96,7 +96,7 @@ class Piecewise:
         else:
             x = ((times - begin[k]) / length[k]).astype(self.y0.dtype)
         y = _horner([c[k] for c in coefficients], x.reshape(-1, *[1] * self.y0.ndim))
-        y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
+        y = last(y)
         return y[..., 0] if np.ndim(t) == 0 else y
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, full_of_nan, is_tensor, readable
+from sympflow.arrays import Array, concatenate, full_of_nan, is_tensor, readable
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.steppers import Stepper
 from sympflow.kernels.carry import Carry
@@ -112,8 +112,5 @@ class Saved:
         if self.whole is not None:
             self.whole[known:] = np.nan
             return self.whole[:n]
-        import torch
-
-        empty = self.y0[None][:0]
         unknown = [full_of_nan(self.y0)[None]] * (n - known)
-        return torch.cat([empty, *self.parts, *unknown])[:n]
+        return concatenate([self.y0[None][:0], *self.parts, *unknown], 0)[:n]
