@@ -106,6 +106,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
 
     def hessian(self, y: Array) -> Array:
         """∇²H, dense: (..., 2d) to (..., 2d, 2d)."""
+        d = self.ndof
         if np.prod(y.shape, dtype=float) * 2 * d > MOST_DENSE:
             raise ValueError(
                 f"`system` has {d:,} sites, of which a dense ∇²H has {4.0 * d * d:.3g} entries for each state: take a "
