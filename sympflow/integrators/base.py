@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_dt, check_not_followed
+from sympflow.arguments import check_dt
 from sympflow.arrays import (
     Array,
     concatenate,
     finite_states,
     is_tensor,
     lanes,
-    last,
     library_name,
     like,
     stack,
@@ -41,6 +40,7 @@ from sympflow.integrators.contract import (
     interrupted,
 )
 from sympflow.integrators.grid import Grid, distinct
+from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import ArraySteps, Stepper, rollout, shorter_steps
 from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
 from sympflow.kernels.carry import Carry
@@ -500,11 +500,11 @@ def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
     )
 
 
-class GridSolution:
+class GridSolution(DenseOutput):
     """Dense output of a fixed-step method: a shorter step from the last grid point before t."""
 
     def __init__(self, stepper: Stepper, grid: Grid, states: Array) -> None:
-        self.stepper, self.grid, self.states = stepper, grid, states
+        self.stepper, self.grid, self.kept = stepper, grid, states
         self.t_min, self.t_max = sorted((grid.t0, grid.t1))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -514,7 +514,7 @@ class GridSolution:
             "integrator": stepper.integrator,
             "system": stepper.system,
             "grid": self.grid,
-            "states": self.states,
+            "states": self.kept,
             "backend": stepper.backend,
             "letters": stepper.problem.letters,
         }
@@ -525,13 +525,9 @@ class GridSolution:
         problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend, letters=state.get("letters"))
         GridSolution.__init__(self, integrator.stepper(problem), grid, states)
 
-    def __call__(self, t: float | np.ndarray) -> Array:
-        check_not_followed("t", t)
-        times = np.atleast_1d(np.asarray(t, dtype=float))
+    def states(self, times: np.ndarray) -> Array:
         count, remainder = self.grid.locate(times)
-        y = shorter_steps(self.stepper, self.grid, self.states[count], count, remainder)
-        y = last(y)
-        return y[..., 0] if np.ndim(t) == 0 else y
+        return shorter_steps(self.stepper, self.grid, self.kept[count], count, remainder)
 
 
 def _all_finite(y: Array) -> bool:

@@ -253,7 +253,7 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
         stats,
     )
     if problem.dense_output:
-        outcome.sol = Batch(source, batch, (problem.t0, problem.t1))
+        outcome.sol = Batch([(run.sol, j) for run, j in source], batch, (problem.t0, problem.t1))
     return outcome
 
 
