@@ -11,7 +11,7 @@ from conftest import KINDS
 from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
-from sympflow.integrators.base import FINISHED, Integrator, Outcome
+from sympflow.integrators.contract import FINISHED, Integrator, Outcome
 from sympflow.integrators.interpolants import Piecewise, hermite
 from sympflow.integrators.tableaux import ADAPTIVE as TORCHDIFFEQ_ADAPTIVE
 from sympflow.kernels.explicit_loops import compiled_field

@@ -1,8 +1,4 @@
-"""Integrators of fixed steps on the grid t0 + k·dt, and the one driver of their runs.
-
-`FixedStep` is the choice of a method; `Stepper` is one run of it, with its kernel or arrays and its counts; `GridRun`
-walks the grid, finds what is not finite, places the outputs and looks for events.
-"""
+"""Integrators of fixed steps on the grid t0 + k·dt, and recorders of runs whose steps the method chooses."""
 
 from __future__ import annotations
 
@@ -10,47 +6,31 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from sympflow.arguments import check_dt
 from sympflow.arrays import (
     Array,
-    concatenate,
-    finite_states,
     is_tensor,
-    lanes,
     library_name,
-    like,
     stack,
-    unfollowed,
 )
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import (
     ENDED,
-    FINISHED,
     Failure,
     Integrator,
     Outcome,
     Problem,
     Steps,
-    finished,
-    interrupted,
 )
-from sympflow.integrators.grid import Grid, distinct
-from sympflow.integrators.interpolants import DenseOutput
-from sympflow.integrators.steppers import ArraySteps, Stepper, rollout, shorter_steps
-from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
+from sympflow.integrators.grid import Grid
+from sympflow.integrators.grid_runs import GridRun
+from sympflow.integrators.steppers import ArraySteps, Stepper, rollout
 from sympflow.kernels.carry import Carry
-
-if TYPE_CHECKING:
-    from sympflow.storage.runs import RunStore
-
-FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
-"""The values of `stats["backend"]` of compiled loops."""
-MOST_SAMPLES = 65536  # of the events, in a chunk
 
 
 @dataclass(frozen=True)
@@ -219,320 +199,6 @@ class OwnSteps(ArraySteps):
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return self.integrator.evaluations(n_steps, n_saved, n_extra, backend)
-
-
-# the driver ----------------------------------------------------------------------------------------
-
-
-class GridRun:
-    """One run on the grid: the steps, the outputs among and within them, the events, and what is not finite."""
-
-    def __init__(self, integrator: FixedStep, problem: Problem) -> None:
-        self.integrator, self.problem = integrator, problem
-        self.grid = Grid(problem.t0, problem.t1, integrator.step_length(problem.system))
-        self.stepper = integrator.stepper(problem)
-
-    def outcome(self) -> Outcome:
-        """Run: at once, or, with events, in chunks of steps; into a store in windows."""
-        if self.problem.store is not None:
-            return self._stored(self.problem.store)
-        search = self.problem.events
-        outcome = self._whole() if search is None else self._streamed(search)
-        outcome.message += self.stepper.remark
-        return outcome
-
-    def _whole(self) -> Outcome:
-        problem, grid, stepper = self.problem, self.grid, self.stepper
-        t, remainder, save, place = self._placed()
-        asked = last = int(save[-1]) if save.size else 0
-        first = first_window(stepper, problem, last, len(save))
-        if first:
-            saved, finite, last = self._in_windows(first, last, save)
-            if last < asked:
-                save = save[: len(saved)]
-                outputs = len(save) if place is None else int(place.searchsorted(len(save)))
-                t, remainder, place = t[:outputs], remainder[:outputs], None if place is None else place[:outputs]
-        else:
-            saved, finite = stepper.rollout(problem.y0, grid.h, last, save, problem.t0)
-
-        y = saved if place is None else saved[place]
-        extra = remainder.nonzero()[0]
-        if extra.size:
-            y = shorter_steps(stepper, grid, y, save if place is None else save[place], remainder)
-        n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
-        end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
-        n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
-        at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
-        outcome = Outcome(t, y, 0, finished(problem), self.stats(n_steps + at_end, n_steps, n_saved, int(extra.size)))
-        if problem.dense_output:
-            reached = grid if last == asked else Grid(grid.t0, grid.time(last), abs(grid.h))
-            outcome.sol = GridSolution(stepper, reached, saved)
-        outcome.finite = stepper.compiled and stepper.saves_finite and not extra.size
-        self.report_failures(outcome, finite, last)
-        if last < asked:
-            raise interrupted(outcome, grid.time(last))
-        return outcome
-
-    def _in_windows(self, first: int, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, int]:
-        """`Stepper.rollout` in windows: also the step that was reached, less than n_steps where Ctrl-C ended it."""
-        problem, h = self.problem, self.grid.h
-        pieces, pace, saved = Pieces(self.stepper, problem, h, Carry()), Pace(first), Saved(len(save), problem.y0)
-        most = max(2, MOST_SAVED // math.prod(problem.y0.shape))
-        k = row = 0
-        try:
-            while k < n_steps and not pieces.ended:
-                to = k + pace.steps(n_steps - k)
-                end = int(save.searchsorted(to, "right"))
-                if end - row > most:
-                    to, end = int(save[row + most - 1]), row + most
-                saved.put(row, pieces.to(to, save[row:end]))
-                pace.took(to - k)
-                row, k = end, to
-                if problem.progress is not None and k < n_steps:
-                    problem.progress(abs(k * h))
-        except KeyboardInterrupt:
-            n_steps = k
-        finite = np.zeros(problem.y0.shape[:-1], dtype=int) if pieces.finite is None else pieces.finite
-        return saved.up_to(row, int(save.searchsorted(n_steps, "right"))), finite, n_steps
-
-    # a store: windows whose outputs are written --------------------------------------------------------------------
-
-    def _stored(self, store: RunStore) -> Outcome:
-        """The same outputs, taken by a store: see `StoredRun`."""
-        if not self.stepper.takes_carry:
-            raise ValueError(
-                f"`store` needs a run that can be cut, and the loops of method {self.integrator.name!r} cannot: use "
-                "another fixed-step method, or leave `store` out."
-            )
-        from sympflow.integrators.stored_runs import StoredRun
-
-        with store.opened():
-            return StoredRun(self, store).outcome()
-
-    def within(self, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:
-        """`shorter_steps`, none of which depends on how many there are in a window, as those of arrays do."""
-        if self.stepper.compiled:
-            return shorter_steps(self.stepper, self.grid, y, count, remainder)
-        for i in remainder.nonzero()[0].tolist():
-            one = slice(i, i + 1)
-            shorter_steps(self.stepper, self.grid, y[one], count[one], remainder[one])
-        return y
-
-    def stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
-        stepper = self.stepper
-        return {
-            "dt": abs(self.grid.h),
-            "n_steps": n_told,
-            **stepper.evaluations(n_steps, n_saved, n_extra),
-            "backend": stepper.backend,
-            **stepper.more_stats(),
-        }
-
-    def _placed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-        """Output times and their remainders, the counts whose states are to be saved, and where among these each is."""
-        problem, grid = self.problem, self.grid
-        t = problem.t_eval
-        t, count, remainder = grid.outputs(t, problem.save_every)
-        save, position = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
-        return t, remainder, save, position
-
-    # events: the run in chunks of steps, each searched before the next is computed ----------------------------------
-
-    def _streamed(self, search: EventSearch) -> Outcome:
-        """The same steps for a single trajectory with events, never more than a chunk of them in memory."""
-        problem, grid, stepper = self.problem, self.grid, self.stepper
-        system, y = problem.system, problem.y0
-        times, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
-        outputs: list[Array] = [y[None][:0]]
-        kept: list[Array] = []
-        chunk, k, shorter, delivered, failed = FIRST_CHUNK, 0, 0, 0, False
-        largest = max(1, min(LAST_CHUNK, MOST_SAMPLES // search.parts(grid.h, system.dt)))
-        progress = problem.progress
-
-        stopped, done = False, (0, 0, 1, 0)
-        try:
-            while True:
-                n = min(chunk, largest, grid.n_steps - k)
-                states, finite = stepper.rollout(y, grid.h, n, np.arange(n + 1), grid.time(k))
-                good = min(n, int(finite))
-                failed = good < n
-                last = k + n == grid.n_steps or failed
-
-                taken, ended = self._search(search, k, states[: good + 1])
-                if not ended and last and not failed and grid.remainder:
-                    shorter = 1
-                    ended = self._search_remainder(search, states[good])
-
-                # outputs before the end of this chunk; a state at its end belongs to the next, unless there is none
-                due = delivered + int(np.searchsorted(count[delivered:], k + good, "right" if last else "left"))
-                chosen = slice(delivered, due)
-                y_due = states[count[chosen] - k]
-                outputs.append(shorter_steps(stepper, grid, y_due, count[chosen], remainder[chosen]))
-                delivered = due
-                if problem.dense_output:
-                    kept.append(states[: good + 1] if last or ended else states[:good])
-                if ended or last:
-                    k += taken if ended else good
-                    break
-                y, k, chunk = states[n], k + n, 2 * chunk
-                done = k, delivered, len(outputs), len(kept)
-                if progress is not None:
-                    progress(abs(k * grid.h))
-        except KeyboardInterrupt:
-            stopped = True
-            k, delivered, n_outputs, n_kept = done
-            outputs, kept = outputs[:n_outputs], [*kept[:n_kept], y[None]]
-            search.forget_after(grid.time(k), grid.h)
-
-        t, y_out = times[:delivered], concatenate(outputs, 0)
-        finite_outputs = finite_states(y_out)  # a shorter step may overflow too
-        failed = failed or not finite_outputs.all()
-        t_end = search.end[0] if search.end else grid.time(k) if failed or stopped else grid.t1
-        keep = finite_outputs & ((t - t_end) * np.sign(grid.h) <= 0)
-        n_keep = len(t) if keep.all() else int(np.argmin(keep))
-        t, y_out = t[:n_keep], y_out[:n_keep]
-        if search.end and problem.t_eval is None and not (len(t) and t[-1] == t_end):
-            t, y_out = np.append(t, t_end), concatenate([y_out, search.end[1][None]], 0)
-
-        n_extra = search.n_dense + int(np.count_nonzero(remainder[:delivered]))
-        stats = self.stats(k + shorter, k, k, n_extra)
-        outcome = Outcome(t, y_out, int(search.end is not None), ENDED if search.end else FINISHED, stats)
-        if failed and not search.end:
-            outcome.status = -1
-            outcome.stats["failed_at"] = t_end
-            outcome.message = self._failure(t_end, k)
-        if problem.dense_output:
-            outcome.sol = GridSolution(stepper, Grid(grid.t0, t_end, abs(grid.h)), concatenate(kept, 0))
-        if stopped:
-            raise interrupted(outcome, t_end)
-        return outcome
-
-    def _search(self, search: EventSearch, k: int, states: Array) -> tuple[int, bool]:
-        """Search the steps between `states`, which begin at grid point k: the number searched; does the run end?"""
-        grid, stepper = self.grid, self.stepper
-        inner = self._samples(search, k, states[:-1], grid.h)
-        for j in range(len(states) - 1):
-            t, y = grid.time(k + j), states[j]
-
-            def dense(s: float, t: float = t, y: Array = y) -> Array:
-                return stepper.shorter(y, s - t, t)
-
-            if search.step(t, y, grid.time(k + j + 1), states[j + 1], dense, inner[j]):
-                return j + 1, True
-        return len(states) - 1, False
-
-    def _samples(self, search: EventSearch, k: int, states: Array, h: float) -> Array:
-        """States (n, parts − 1, 2d) that divide steps of length h, all computed at once."""
-        parts = search.parts(h, self.problem.system.dt)
-        search.n_dense += len(states) * (parts - 1)
-        lengths = h * np.arange(1, parts) / parts * np.ones((len(states), 1))
-        if parts == 1 or not len(states):
-            return states[:, None][:, :0]
-        t = (self.grid.t0 + (k + np.arange(len(states))) * self.grid.h)[:, None] * np.ones_like(lengths)
-        repeated = stack([unfollowed(states)] * (parts - 1), axis=1)
-        with np.errstate(all="ignore"):
-            return self.stepper.shorter(repeated, like(lengths, repeated), t)
-
-    def _search_remainder(self, search: EventSearch, y: Array) -> bool:
-        """Search the last, shorter step of an interval that dt does not divide."""
-        grid = self.grid
-        t = grid.time(grid.n_steps)
-
-        def dense(s: float) -> Array:
-            return self.stepper.shorter(y, s - t, t)
-
-        y_end = dense(grid.t1)
-        search.n_dense += 1
-        if not finite_states(y_end):
-            return False
-        inner = self._samples(search, grid.n_steps, y[None], grid.remainder)
-        return bool(search.step(t, y, grid.t1, y_end, dense, inner[0]))
-
-    # failures -----------------------------------------------------------------------------------------------------
-
-    def _failure(self, t: float, step: int) -> str:
-        what, remedy = self.integrator.breakdown.value
-        return f"{what} after t = {t:.17g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
-
-    def report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
-        """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there."""
-        grid = self.grid
-        done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
-        outcome.finite = done and (outcome.finite or _all_finite(outcome.y))
-        if outcome.finite:
-            if finite.ndim:
-                outcome.status = np.zeros(finite.shape, dtype=int)
-            return
-        ok = finite_states(outcome.y)  # (n, ...): shorter steps may overflow too
-        if is_tensor(outcome.y) and lanes(outcome.y):
-            if not ok.all():
-                report_lanes(outcome, ok, self.integrator.breakdown)
-        elif finite.ndim:
-            outcome.status = np.where((finite < n_run) | ~ok.all(0), -1, 0)
-            failed = np.argwhere(outcome.status)
-            if failed.size:
-                what, remedy = self.integrator.breakdown.value
-                i = tuple(failed[0].tolist())
-                times = grid.t0 + np.minimum(finite, grid.n_steps) * grid.h
-                outcome.stats["failed_at"] = np.where(outcome.status < 0, times, np.nan)
-                outcome.message = (
-                    f"{len(failed)} of {finite.size} trajectories failed, the first of them (index "
-                    f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. {what}. {remedy}."
-                )
-        elif finite < n_run or not ok.all():
-            last = int(finite) if finite < n_run else int(grid.locate(outcome.t[~ok][:1])[0][0])
-            outcome.status = -1
-            outcome.stats["failed_at"] = grid.time(last)
-            outcome.message = self._failure(grid.time(last), last)
-            keep = int(np.argmin(ok)) if not ok.all() else len(ok)
-            outcome.t, outcome.y = outcome.t[:keep], outcome.y[:keep]
-
-
-def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
-    """Flag a run under `torch.func.vmap` of which some lane failed: `ok` (n, ...) is False where one is not finite."""
-    what, remedy = breakdown.value
-    bad = ~ok.all(0)
-    outcome.status = np.where(bad, -1, 0) if bad.ndim else -1
-    outcome.stats["failed_at"] = float(outcome.t[int(np.argmin(ok.reshape(len(ok), -1).all(1)))])
-    outcome.message = (
-        f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.17g}. {remedy}, or pass the "
-        "states as a batch, whose trajectories are told apart."
-    )
-
-
-class GridSolution(DenseOutput):
-    """Dense output of a fixed-step method: a shorter step from the last grid point before t."""
-
-    def __init__(self, stepper: Stepper, grid: Grid, states: Array) -> None:
-        self.stepper, self.grid, self.kept = stepper, grid, states
-        self.t_min, self.t_max = sorted((grid.t0, grid.t1))
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The choice of the method in place of its run, whose compiled loops belong to a process."""
-        stepper = self.stepper
-        return {
-            "integrator": stepper.integrator,
-            "system": stepper.system,
-            "grid": self.grid,
-            "states": self.kept,
-            "backend": stepper.backend,
-            "letters": stepper.problem.letters,
-        }
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        integrator, grid, states = state["integrator"], state["grid"], state["states"]
-        backend = "auto" if state["backend"] == "compiled" else "array"
-        problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend, letters=state.get("letters"))
-        GridSolution.__init__(self, integrator.stepper(problem), grid, states)
-
-    def states(self, times: np.ndarray) -> Array:
-        count, remainder = self.grid.locate(times)
-        return shorter_steps(self.stepper, self.grid, self.kept[count], count, remainder)
-
-
-def _all_finite(y: Array) -> bool:
-    """True if an array is finite all over; of tensors that is found out elsewhere."""
-    return not is_tensor(y) and bool(np.isfinite(y).all())
 
 
 # runs whose steps the method chooses -----------------------------------------------------------------

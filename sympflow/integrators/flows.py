@@ -20,7 +20,7 @@ from sympflow.flow.shipped import choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
-from sympflow.integrators.base import FixedStep, GridRun
+from sympflow.integrators.base import FixedStep
 from sympflow.integrators.clocks import (
     ARRAYS_ONLY,
     LogarithmicClock,
@@ -31,6 +31,7 @@ from sympflow.integrators.clocks import (
 )
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
+from sympflow.integrators.grid_runs import GridRun
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
 from sympflow.kernels.carry import Carry
 

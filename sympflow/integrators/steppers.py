@@ -14,7 +14,6 @@ from sympflow.integrators.grid import Grid
 from sympflow.kernels.carry import Carry
 
 if TYPE_CHECKING:
-    from sympflow.integrators.base import FixedStep
     from sympflow.kernels.protocol import Kernel
 
 _ADVICE = re.compile(r"(, or use|: use|\. Use) backend='array'\.$")
@@ -67,7 +66,7 @@ class Stepper:
 
     def __init__(
         self,
-        integrator: FixedStep,
+        integrator: Any,
         problem: Problem,
         arrays: ArraySteps,
         kernel: Kernel | None = None,

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FINISHED, FixedStep, Integrator, Problem
+from sympflow.integrators.base import FixedStep, Integrator, Problem
+from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.solver import solve

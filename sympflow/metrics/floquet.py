@@ -22,9 +22,10 @@ from sympflow.arguments import check_positive, real_number, warn
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import build, check_applies
 from sympflow.metrics.crossings import dividing_step
-from sympflow.solver import check_y0, solve
+from sympflow.solver import solve
 from sympflow.systems.given import given_system
 
 GROWS = 1e-5
