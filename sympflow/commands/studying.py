@@ -144,7 +144,7 @@ def bench(
       sympflow bench pendulum --methods verlet,kahan_li8,dop853 --batch 0 --t-end 50
     """
     with reporting(ctx):
-        from sympflow.studies.figure_style import save
+        from sympflow.show.style import save
         from sympflow.studies.precision import work_precision
 
         chosen, found, start = methods(method_names), scenes(systems, own), state(y0)
@@ -295,7 +295,7 @@ def section(
       sympflow section duffing --method kahan_li8 --orbits 100 --t-end 2000 --since 200 --out out/
     """
     with reporting(ctx):
-        from sympflow.studies.figure_style import save
+        from sympflow.show.style import save
         from sympflow.studies.poincare import names, poincare_section
 
         scene, chosen = one_scene(system, own), configured(method_name)

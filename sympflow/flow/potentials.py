@@ -362,6 +362,9 @@ class MLPPotential(Potential):
         s, and the mean of x that the initial biases allow for.
     tau, gain : float
         τ and c.
+    features : int
+        m, of further inputs that a step keeps as they are, the last rows of x (d + m, N), as the time of a drive; the
+        gradients by them are left out, as 0.
     generator : torch.Generator, optional
         Source of the initial weights, uniform in ±1/√(fan in).
 
@@ -395,14 +398,16 @@ class MLPPotential(Potential):
         center: Sequence[float] | None = None,
         tau: float = 1.0,
         gain: float = 1.0,
+        features: int = 0,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         hidden, dtype, device = hidden_widths(hidden), checked_dtype(dtype), checked_device(device)
-        check_memory(f"`hidden` {hidden!r}", count_weights(ndof, hidden), "take narrower layers")
-        self.ndof, self.hidden, self.activation = int(ndof), hidden, activation
+        inputs = int(ndof) + features
+        check_memory(f"`hidden` {hidden!r}", count_weights(inputs, hidden), "take narrower layers")
+        self.ndof, self.features, self.hidden, self.activation = int(ndof), features, hidden, activation
         self._sigma = activation_named(activation)
 
         def uniform(*shape: int, fan_in: int) -> nn.Parameter:
@@ -410,9 +415,9 @@ class MLPPotential(Potential):
             w = (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1) / fan_in**0.5
             return nn.Parameter(w.to(dtype=dtype, device=device))
 
-        self.weight_x = uniform(hidden[0], ndof, fan_in=ndof + 1)
-        self.weight_t = uniform(hidden[0], fan_in=ndof + 1)
-        fans = (ndof + 1, *hidden[:-1])
+        self.weight_x = uniform(hidden[0], inputs, fan_in=inputs + 1)
+        self.weight_t = uniform(hidden[0], fan_in=inputs + 1)
+        fans = (inputs + 1, *hidden[:-1])
         self.biases = nn.ParameterList(uniform(h, fan_in=fan) for h, fan in zip(hidden, fans, strict=True))
         self.weights = nn.ParameterList(uniform(h, fan, fan_in=fan) for fan, h in pairwise(hidden))
         self.weight_out = uniform(hidden[-1], fan_in=hidden[-1])
@@ -420,19 +425,20 @@ class MLPPotential(Potential):
         def constant(value: Any) -> Tensor:
             return torch.as_tensor(value, dtype=dtype, device=device)
 
-        self.register_buffer("scale", constant([1.0] * ndof if scale is None else list(scale)))
+        self.register_buffer("scale", constant([*([1.0] * ndof if scale is None else scale), *[1.0] * features]))
         self.register_buffer("tau", constant(tau))
         self.register_buffer("gain", constant(gain))
         if center is not None:
             with torch.no_grad():
-                self.biases[0] -= self.weight_x @ (constant(list(center)) / self.scale)
+                self.biases[0] -= self.weight_x @ (constant([*center, *[0.0] * features]) / self.scale)
 
     def to_dict(self) -> dict[str, Any]:
-        return {"type": "mlp", "hidden": list(self.hidden), "activation": self.activation}
+        plan = {"type": "mlp", "hidden": list(self.hidden), "activation": self.activation}
+        return plan | ({"features": self.features} if self.features else {})
 
     @classmethod
     def from_dict(cls, ndof: int, plan: Mapping[str, Any], dtype: torch.dtype) -> Self:
-        return cls(ndof, plan["hidden"], plan.get("activation"), dtype=dtype)  # type: ignore[arg-type]
+        return cls(ndof, plan["hidden"], plan.get("activation"), features=plan.get("features", 0), dtype=dtype)  # type: ignore[arg-type]
 
     @classmethod
     def from_weights(
@@ -520,6 +526,11 @@ class MLPPotential(Potential):
     def network(self, is_kick: bool) -> NetworkLayer:
         from sympflow.kernels.networks import NetworkLayer
 
+        if self.features:
+            raise ValueError(
+                "`flow` has networks that take the time of the state, and these have no compiled form: use "
+                "backend='array'."
+            )
         K, k, b, W, w = self.folded()
 
         def array(weight: Tensor) -> np.ndarray:
@@ -539,7 +550,7 @@ class MLPPotential(Potential):
         units = [1 / self.scale.expand_as(self.weight_x), 1 / self.tau.expand_as(self.weight_t)]
         units += [self.gain.expand_as(self.weight_out), *(torch.ones_like(w) for w in inner)]
         flat = torch.cat([u.detach().reshape(-1) for u in units]).numpy()
-        return TrainedNetwork(self.ndof, self.hidden, self.activation, flat)
+        return TrainedNetwork(self.ndof + self.features, self.hidden, self.activation, flat)
 
     # V and its derivatives at one time ---------------------------------------------------------------
 
@@ -575,17 +586,22 @@ class MLPPotential(Potential):
 
     # the combinations that the layers use: t and 0 in one sweep -------------------------------------------
 
+    def _by_x(self, gradient: Tensor) -> Tensor:
+        """The gradient with 0 in the rows of the features."""
+        d = self.ndof
+        return torch.cat([gradient[:d], torch.zeros_like(gradient[d:])]) if self.features else gradient
+
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         K, k, b, W, w = self.folded()
         r = self._sweeps(self._both_times(t, K @ x + b[0][:, None], k), b, W, w)
         r_t, r_0 = r.chunk(2, 1)
-        return K.T @ (r_t - r_0)
+        return self._by_x(K.T @ (r_t - r_0))
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
         K, k, b, W, w = self.folded()
         r = self._sweeps(self._both_times(t, K @ x + b[0][:, None], k), b, W, w)
         r_t, r_0 = r.chunk(2, 1)
-        return K.T @ (r_t - r_0), k @ r_t
+        return self._by_x(K.T @ (r_t - r_0)), k @ r_t
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
         K, k, b, W, w = self.folded()
@@ -593,7 +609,7 @@ class MLPPotential(Potential):
         da = K @ dx
         r, dr = self._sweeps_tangent(a, torch.cat([da + k[:, None], da], 1), b, W, w)
         (r_t, r_0), (dr_t, dr_0) = r.chunk(2, 1), dr.chunk(2, 1)
-        return K.T @ (r_t - r_0), K.T @ (dr_t - dr_0)
+        return self._by_x(K.T @ (r_t - r_0)), self._by_x(K.T @ (dr_t - dr_0))
 
     # sweeps ---------------------------------------------------------------------------------------------
 

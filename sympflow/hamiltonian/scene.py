@@ -15,6 +15,8 @@ from sympflow.arguments import floats, real_number
 from sympflow.arrays import Array
 from sympflow.hamiltonian.domain import Domain
 
+UNNAMED = "custom"
+
 
 class SceneOptions(TypedDict, total=False):
     """The arguments of a scene, as every constructor of a system takes them."""
@@ -32,7 +34,7 @@ class SceneOptions(TypedDict, total=False):
 class Scene:
     """What a system is usually solved with: see `HamiltonianSystem`."""
 
-    name: str = "custom"
+    name: str = UNNAMED
     domain: Domain | None = None
     y0: Any = None
     t_span: tuple[float, float] = (0.0, 100.0)

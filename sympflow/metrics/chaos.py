@@ -25,6 +25,7 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.show.cards import Card, Shown, numbers
 from sympflow.systems.given import given_system
 
 ALIGNED = 1e-12
@@ -35,8 +36,8 @@ BACKENDS = ("auto", "compiled", "array")
 LOG_2 = float(np.log(2.0))
 
 
-@dataclass(frozen=True)
-class Indicator:
+@dataclass(frozen=True, repr=False)
+class Indicator(Shown):
     """A chaos indicator of each orbit, at its end and at the times that were asked for.
 
     Attributes
@@ -63,6 +64,10 @@ class Indicator:
     message: str
     t: np.ndarray = field(repr=False)
     history: np.ndarray = field(repr=False)
+
+    def card(self) -> Card:
+        facts = {"value": numbers(self.value), "t_end": numbers(self.t_end), "status": numbers(self.status)}
+        return Card("Indicator of chaos", facts, self.message)
 
     @property
     def success(self) -> bool:

@@ -16,6 +16,7 @@ from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.show.cards import Card, Shown, numbers
 from sympflow.systems.given import given_system
 
 WINDOW = 256  # steps between which orbits that have left are put aside
@@ -25,8 +26,8 @@ HALVINGS = 48
 Outside = Callable[[np.ndarray], np.ndarray]
 
 
-@dataclass(frozen=True)
-class Escapes:
+@dataclass(frozen=True, repr=False)
+class Escapes(Shown):
     """When and where orbits left a region.
 
     Attributes
@@ -45,6 +46,10 @@ class Escapes:
     state: np.ndarray = field(repr=False)
     status: Any
     message: str
+
+    def card(self) -> Card:
+        facts = {"time": numbers(self.time), "state": numbers(self.state), "status": numbers(self.status)}
+        return Card("Escapes", facts, self.message)
 
     @property
     def success(self) -> bool:

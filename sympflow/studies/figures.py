@@ -16,10 +16,7 @@ from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
-from sympflow.solution import Solution
-from sympflow.solver import solve
-from sympflow.studies.attempts import Attempt, Row
-from sympflow.studies.figure_style import (
+from sympflow.show.style import (
     TEXT,
     dress,
     filled,
@@ -30,6 +27,9 @@ from sympflow.studies.figure_style import (
     new_figure,
     save,
 )
+from sympflow.solution import Solution
+from sympflow.solver import solve
+from sympflow.studies.attempts import Attempt, Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,8 +18,8 @@ from sympflow.integrators.base import Integrator
 from sympflow.integrators.registry import name_of
 from sympflow.metrics.crossings import Crossings, Plane, crossings, stroboscopic, whole_periods
 from sympflow.metrics.orbits import Orbits, checked_orbits
-from sympflow.studies.figure_style import saved
-from sympflow.studies.reports import Column, Report, described, text_table, title
+from sympflow.show.style import saved
+from sympflow.studies.reports import Column, Report, described, text_table
 from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def _section(orbits: Orbits, seen: Crossings, where: Plane | float) -> PoincareS
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PoincareSection(Report):
     """The crossings of a plane, or the states after each period; those of each trajectory together, in order of time.
 
@@ -290,7 +290,7 @@ class PoincareSection(Report):
             if not (_is_number(turn) and 0 < turn < math.inf):
                 raise ValueError(f"`turn` must be positive and finite, such as 2*pi; got {turn!r}.")
             points[:, 0] -= turn * np.rint(points[:, 0] / turn)
-        heading = f"{title(self.system)}, {name_of(self.integrator)}: {self._seen}"
+        heading = f"{self.system.title}, {name_of(self.integrator)}: {self._seen}"
         return section_figure(points, self.trajectory, len(self.y0), (label[i], label[j]), heading)
 
     @property
