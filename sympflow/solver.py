@@ -28,14 +28,14 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.diagnosis import diagnose, note_poles, note_singularities_of_rows
+from sympflow.integrators.diagnosis import diagnose, diagnose_piece, note_poles, note_singularities_of_rows
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
 )
-from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
+from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
 from sympflow.integrators.grid_runs import report_lanes
-from sympflow.integrators.impulses import run_between_impulses
+from sympflow.integrators.impulses import landings, run_in_pieces
 from sympflow.integrators.problems import (
     check_backend,
     check_event_search,
@@ -293,11 +293,14 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     check_applies(integrator, between, y_start)
     integrator.check_library(y_start)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
+    able = problem.store is None and problem.letters is None
+    told, jumps = landings(integrator, between, problem.t0, problem.t1, able)
+    if told:
+        warn(told, RuntimeWarning)
     if between is not system:
         _check_impulses(problem, integrator)
-        run = partial(run_between_impulses, _run)
-    else:
-        warn_of_jumps(system, problem.t0, problem.t1, integrator)
+    if between is not system or jumps:
+        run = partial(run_in_pieces, partial(_run_diagnosed, rows), jumps=jumps)
     if problem.t1 in (math.inf, -math.inf):
         run = _run_endless
     elif problem.store is not None:
@@ -385,6 +388,13 @@ def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
     if search is None or integrator.finds_events:
         return integrator.run(problem), problem
     return run_and_search(integrator, problem, search), problem
+
+
+def _run_diagnosed(rows: ParameterRows | None, integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
+    """The outcome of a piece of a run, and its problem."""
+    outcome, problem = _run(integrator, problem)
+    diagnose_piece(outcome, integrator, problem, rows)
+    return outcome, problem
 
 
 def _check_impulses(problem: Problem, integrator: Integrator) -> None:

@@ -50,6 +50,20 @@ that share of errors there is told."""
 _TOLD: WeakSet[Any] = WeakSet()
 
 
+def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> None:
+    """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
+    if not problem.diagnosed or not readable(outcome.y):
+        return
+    passed, plain = False, problem.letters is None
+    if problem.store is None and (problem.system.poles is not None or not plain):
+        if np.any(np.asarray(outcome.status) >= 0):
+            passed = note_poles(outcome, integrator, problem, rows)
+        if plain:
+            warn_of_cancelling(outcome, problem)
+    if plain and np.any(np.asarray(outcome.status) < 0):
+        note_singularities(outcome, integrator, problem, passed)
+
+
 def diagnose(
     outcome: Outcome,
     integrator: Integrator,
@@ -63,28 +77,20 @@ def diagnose(
     These are poles that it passed, terms of H that cancel, when the solution becomes infinite, singularities over which
     it leapt, functions that do not fit, a flow of another system, its domain, and steps that are too long.
     """
-    system, y0, stored = problem.system, problem.y0, problem.store is not None
-    values, plain = readable(outcome.y), problem.letters is None
-    look = values and problem.diagnosed and not interrupted
-    passed = False
-    if look and not stored and (system.poles is not None or not plain):
-        if np.any(np.asarray(outcome.status) >= 0):
-            passed = note_poles(outcome, integrator, problem, rows)
-        if plain:
-            warn_of_cancelling(outcome, problem)
-    failed = bool(np.any(np.asarray(outcome.status) < 0))
-    if failed and look and plain:
-        note_singularities(outcome, integrator, problem, passed)
-    held = values and not failed and not stored
-    if held and system.leaps and plain:
+    system, y0 = problem.system, problem.y0
+    if not interrupted:
+        diagnose_piece(outcome, integrator, problem, rows)
+    values, between = readable(outcome.y), system.between_impulses
+    held = values and problem.store is None and not np.any(np.asarray(outcome.status) < 0)
+    if held and system.leaps and problem.letters is None:
         warn_of_leap(outcome, system, y0)
     if values and system.functions_given:
         system.check_functions_along(outcome.y)
     if integrator.trained:
-        check_system_along(outcome, integrator, system.between_impulses, y0)
+        check_system_along(outcome, integrator, between, y0)
     if values and action != "ignore":
-        check_domain(outcome, integrator, system.between_impulses, action)
-        if held and system.between_impulses is system:
+        check_domain(outcome, integrator, between, action)
+        if held and between is system:
             warn_of_loss(outcome, integrator, system, y0)
     if held and problem.diagnosed and rows is None:
         warn_of_long_steps(outcome, integrator, problem)
@@ -298,7 +304,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
     """
     system, n = problem.system, len(outcome.t)
-    if not isinstance(integrator, FixedStep) or integrator.trained or not (system.conservative and system.autonomous):
+    if not isinstance(integrator, FixedStep) or integrator.trained or not system.keeps_energy:
         return
     seen = LOOKED_AT if system.ndof <= LARGE else min(LOOKED_AT, outcome.stats.get("n_steps", 0) // 200)
     if not n or not seen or problem.letters is not None or problem.system.between_impulses is not problem.system:

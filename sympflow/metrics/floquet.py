@@ -124,7 +124,7 @@ def floquet_multipliers(
     T = system.period if period is None else period
     if T is None:
         raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
-    check_positive("period", period)
+    check_positive("period", T)
     if not real_number(t0) or not math.isfinite(t0):
         raise ValueError(f"`t0` must be a finite number; got {t0!r}.")
     if is_tensor(y0):

@@ -162,10 +162,11 @@ def stability(
                     one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say, small
                 )
                 say("")
-                own = [study.row(h) for h in study.lengths(lengths)]
-                rows += own
-                if limits and study.has_steps and any(_ran(row) for row in own):
-                    found.append(step_limit(study, own))
+                with attempts.any_step():
+                    own = [study.row(h) for h in study.lengths(lengths)]
+                    rows += own
+                    if limits and study.has_steps and any(_ran(row) for row in own):
+                        found.append(step_limit(study, own))
     return StabilityReport(family, tuple(metrics), float(bound), tuple(rows), tuple(found))
 
 

@@ -66,7 +66,7 @@ def ladders() -> list[Recipe]:
     plain, curved = partial(made, energy_weight=0.0), partial(made, curvature=True)
     # Many numbers: most of what they can do at Δt they would give up for the times before it.
     in_powers = partial(made, polynomial=6, first="kick", frozen_weight=10.0, processor=8)
-    of_state = partial(in_powers, energy_weight=0.0, seed=1)
+    of_state = partial(in_powers, energy_weight=0.0)
     # d = 18: starts are dear, few and short, and the gain of more is small
     short = partial(plain, points=40, label_times=5, reference_states=20)
     along = ByRuns(along_the_orbit, 1e5 * YEAR, 100 * YEAR)
@@ -87,7 +87,7 @@ def ladders() -> list[Recipe]:
         rung(quartic, made(0.83, stages=4, processor=9, force_gradient=(1, 3), first="kick"), 40),
         # Beside the first for the energy, those for the state; T = 100 and 1000 are whole numbers of their Δt.
         rung(quartic, in_powers(1.0, stages=8, seed=1), 40, 400),
-        *(rung(quartic, of_state(dt, stages=6), 24, 300) for dt in (100 / 62, 100 / 96)),
+        *(rung(quartic, of_state(dt, stages=6, seed=1), 24, 300) for dt in (100 / 62, 100 / 96)),
         rung(quartic, of_state(0.625, stages=8), 1, 300, after="polynomial-8-1"),
         rung(quartic, of_state(0.5, stages=8), 1, 300, after="polynomial-8-0.625"),
         *(rung(kepler, plain(dt, stages=2)) for dt in (0.25, 0.15)),
