@@ -52,15 +52,18 @@ _TOLD: WeakSet[Any] = WeakSet()
 
 def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> None:
     """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
-    if not problem.diagnosed or not readable(outcome.y):
+    system, status = problem.system, outcome.status
+    failed = status < 0 if isinstance(status, int) else bool(np.any(np.asarray(status) < 0))
+    looked = system.poles is not None or problem.letters is not None
+    if not problem.diagnosed or not (failed or looked) or not readable(outcome.y):
         return
     passed, plain = False, problem.letters is None
-    if problem.store is None and (problem.system.poles is not None or not plain):
+    if problem.store is None and looked:
         if np.any(np.asarray(outcome.status) >= 0):
             passed = note_poles(outcome, integrator, problem, rows)
         if plain:
             warn_of_cancelling(outcome, problem)
-    if plain and np.any(np.asarray(outcome.status) < 0):
+    if plain and (failed or passed):
         note_singularities(outcome, integrator, problem, passed)
 
 
@@ -80,8 +83,9 @@ def diagnose(
     system, y0 = problem.system, problem.y0
     if not interrupted:
         diagnose_piece(outcome, integrator, problem, rows)
-    values, between = readable(outcome.y), system.between_impulses
-    held = values and problem.store is None and not np.any(np.asarray(outcome.status) < 0)
+    values, between, status = readable(outcome.y), system.between_impulses, outcome.status
+    failed = status < 0 if isinstance(status, int) else bool(np.any(np.asarray(status) < 0))
+    held = values and problem.store is None and not failed
     if held and system.leaps and problem.letters is None:
         warn_of_leap(outcome, system, y0)
     if values and system.functions_given:
@@ -311,9 +315,14 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         return
     width = 2 * system.ndof
     every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
-    y = np.concatenate(
-        [to_numpy(part).reshape(-1, math.prod(problem.y0.shape[:-1]), width) for part in (problem.y0, outcome.y[every])]
-    )[:, :LOOKED_AT].astype(float)
+    if problem.y0.ndim == 1 and n <= seen and outcome.t[0] == problem.t0:
+        y = to_numpy(outcome.y)
+    else:
+        parts = (
+            to_numpy(part).reshape(-1, math.prod(problem.y0.shape[:-1]), width)
+            for part in (problem.y0, outcome.y[every])
+        )
+        y = np.concatenate([*parts])[:, :LOOKED_AT].astype(float)
     with np.errstate(all="ignore"):
         try:
             H = np.asarray(system.hamiltonian(y))
