@@ -113,6 +113,7 @@ class Stepper:
             return self.arrays.rollout(y0, h, n_steps, save, t0, carry)
         rows = y0 if y0.ndim == 1 else y0.reshape(-1, y0.shape[-1])
         states, last, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
+        self.remark = self.kernel.remark
         if y0.ndim > 1:
             states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
         self.arrays.iterations += iterations
