@@ -453,7 +453,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         periods = local.frame.periods
         end = (0.0, 1000 * float(periods.max())) if t_span is None else t_span
         step = float(periods.min()) / FEWEST_STEPS if dt is None else dt
-        return cls._of_pieces(local, None, name, domain, start, end, step, energy_scale)
+        return cls._of_pieces(local, None, Scene(name, domain, start, end, step, energy_scale))
 
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
