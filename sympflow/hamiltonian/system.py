@@ -763,10 +763,10 @@ class HamiltonianSystem(Hamiltonian, Shown):
         self._definition.check(probes, like, n_given, *self._probed_times())
         self._tested = self._tested | {kind: reach(probes[:, : self._arguments], self._arguments // self.ndof)}
 
-    def check_functions_along(self, y: Array) -> None:
+    def check_functions_along(self, y: Array) -> bool:
         """Test the functions of a user where a run went far beyond the states at which they were tested: `solve` does.
 
-        At the farthest of the states y a RuntimeWarning says what `check_functions` would refuse: the run is made.
+        At the farthest of the states y a RuntimeWarning says what `check_functions` would refuse, and True is returned.
 
         Parameters
         ----------
@@ -775,19 +775,20 @@ class HamiltonianSystem(Hamiltonian, Shown):
         kind = type(y), y.dtype
         reached = self._tested.get(kind)
         if reached is None:
-            return
+            return False
         from sympflow.hamiltonian.function_checks import farther_states, reach
 
         far = farther_states(one_lane(y).reshape(-1, 2 * self.ndof), reached).astype(float)
         if not len(far):
-            return
+            return False
         try:
             self._definition.check(far, y, 0, *self._probed_times())
         except (ValueError, TypeError) as error:
             warn(f"On this run, far from its start: {error}", RuntimeWarning)
-            return
+            return True
         seen = np.concatenate([reached, far[:, : self._arguments]])
         self._tested = self._tested | {kind: reach(seen, self._arguments // self.ndof)}
+        return False
 
     def _probed_times(self) -> tuple[np.ndarray, ...]:
         """The times at which functions of a driven system are tested."""

@@ -86,17 +86,16 @@ def diagnose(
     values, between, status = readable(outcome.y), system.between_impulses, outcome.status
     failed = status < 0 if isinstance(status, int) else bool(np.any(np.asarray(status) < 0))
     held = values and problem.store is None and not failed
-    if held and system.leaps and problem.letters is None:
-        warn_of_leap(outcome, system, y0)
+    told = held and system.leaps and problem.letters is None and warn_of_leap(outcome, system, y0)
     if values and system.functions_given:
-        system.check_functions_along(outcome.y)
+        told = system.check_functions_along(outcome.y) or told
     if integrator.trained:
         check_system_along(outcome, integrator, between, y0)
     if values and action != "ignore":
         check_domain(outcome, integrator, between, action)
         if held and between is system:
             warn_of_loss(outcome, integrator, system, y0)
-    if held and problem.diagnosed and rows is None:
+    if held and not told and problem.diagnosed and rows is None:
         warn_of_long_steps(outcome, integrator, problem)
 
 

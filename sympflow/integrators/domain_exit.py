@@ -67,16 +67,16 @@ def check_system_along(outcome: Outcome, integrator: Integrator, system: Hamilto
     )
 
 
-def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> None:
-    """Warn of a run that leapt over a singularity of V, and goes on with any energy."""
+def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool:
+    """Warn, and return True, of a run that leapt over a singularity of V, and goes on with any energy."""
     n, width = len(outcome.t), 2 * system.ndof
     if not n:
-        return
+        return False
     starts, outputs = to_numpy(y0).reshape(-1, width), to_numpy(outcome.y).reshape(n, -1, width)
     n_steps = int(np.max(outcome.stats.get("n_steps", 0)))
     leapt = system.leapt(starts, outputs[-1], n_steps)
     if not leapt.any():
-        return
+        return False
     row = int(np.argmax(leapt))
     start, along = starts[row], outputs[:, row]
     first = int(np.argmax(system.leapt(np.broadcast_to(start, along.shape), along, n_steps)))
@@ -89,6 +89,7 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> None
         f"that. It was lost {after}, where {system.leap(along[first], start)}.",
         RuntimeWarning,
     )
+    return True
 
 
 def warn_of_loss(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
