@@ -57,7 +57,12 @@ def largest(x: Array) -> Array:
 
 def last(y: Array) -> Array:
     """Return y with its first axis as the last: time first as time last."""
-    return y.T if y.ndim == 2 else library(y).moveaxis(y, 0, -1)
+    return y.T if y.ndim == 2 else moveaxis(y, 0, -1)
+
+
+def moveaxis(y: Array, source: int, target: int) -> Array:
+    """Return y with an axis in another place; torch maps `movedim`, and no `moveaxis`, over lanes."""
+    return y.movedim(source, target) if is_tensor(y) else np.moveaxis(y, source, target)
 
 
 def masked(y: Array, mask: Any, value: float) -> Array:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import fft, fftpack
 
-from sympflow.arrays import Array, is_tensor, library, like
+from sympflow.arrays import Array, is_tensor, like, moveaxis
 
 ZERO = 1e-12
 """Share of the largest squared frequency below which a mode drifts freely, as in `LinearPart`."""
@@ -233,7 +233,6 @@ class SpectralPart:
         if self.fields == 1:
             return x * A[..., 0, 0]
         axis = -1 - len(self.transform.shape)
-        moveaxis = library(x).moveaxis
         return moveaxis((A @ moveaxis(x, axis, -1)[..., None])[..., 0], -1, axis)
 
 

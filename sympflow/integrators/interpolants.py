@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import check_not_followed
-from sympflow.arrays import Array, is_tensor, last, library, stack
+from sympflow.arrays import Array, is_tensor, last, moveaxis, stack
 
 Time = Any
 """A number, or a tensor that carries a gradient."""
@@ -139,7 +139,7 @@ class Batch(DenseOutput):
                 y[..., np.flatnonzero((times < sol.t_min) | (times > sol.t_max))] = np.nan
                 found[id(sol)] = y.reshape(-1, *y.shape[-2:])
         y = stack([found[id(sol)][j] for sol, j in self.places], axis=0)
-        return library(y).moveaxis(y.reshape(*self.batch, *y.shape[1:]), -1, 0)
+        return moveaxis(y.reshape(*self.batch, *y.shape[1:]), -1, 0)
 
 
 def _horner(coefficients: Sequence[Array], x: Any) -> Array:
