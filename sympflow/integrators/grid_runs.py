@@ -144,7 +144,7 @@ class GridRun:
             "dt": abs(self.grid.h),
             "n_steps": n_told,
             **stepper.evaluations(n_steps, n_saved, n_extra),
-            "backend": stepper.backend,
+            "backend": stepper.backend + stepper.why,
             **stepper.more_stats(),
         }
 

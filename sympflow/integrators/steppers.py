@@ -62,6 +62,8 @@ class Stepper:
         True if the states that `rollout` saves up to the last finite one are known to be finite.
     remark : str
         Why a run of a formula is not compiled, for its message.
+    why : str
+        Why functions of Python run as such, to be read after the backend.
     """
 
     def __init__(
@@ -75,7 +77,11 @@ class Stepper:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.arrays, self.kernel = arrays, kernel
         self.saves_finite = kernel is not None and kernel.saves_finite
-        self.remark = ""
+        self.remark = self.why = ""
+        y0, untraced = problem.y0, None if kernel is not None or problem.system is None else problem.system.untraced
+        if untraced and problem.backend == "auto" and not is_tensor(y0) and y0.dtype == np.float64:
+            name = "potential" if problem.system.separable else "hamiltonian"
+            self.why = f": `{name}` could not be traced, for {untraced}"
         if told and problem.system.symbols is not None:
             self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
 
