@@ -19,7 +19,7 @@ import numpy as np
 from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, to_numpy
 from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, linear_and_rest, map_evaluations
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts, linear_and_rest, map_evaluations
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
@@ -354,7 +354,7 @@ class ExactMaps(Composition):
         return [m.at for m in known_maps(self, 1.0) if self.parts.timed(m.part)]
 
     @abstractmethod
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         """The maps of a step of length h, a number or an array (...)."""
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -394,14 +394,14 @@ class ExactMaps(Composition):
 
 
 @lru_cache(maxsize=64)
-def known_maps(composition: ExactMaps, h: float) -> Sequence[Map]:
+def known_maps(composition: ExactMaps, h: float) -> Sequence[SubFlow]:
     """The maps of a step, the same object for the same step, whose table the kernel then knows."""
     return composition.maps(h)
 
 
 def rollout_in_modes(
     parts: ExactParts,
-    maps: Sequence[Map],
+    maps: Sequence[SubFlow],
     y0: Array,
     n_steps: int,
     save: np.ndarray,
@@ -454,14 +454,14 @@ class LinearRest(ExactMaps):
         if any(scheme.gradients) and not self.parts.has_force_gradient:
             raise ValueError(f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p: use 'linear_srkn6b'.")
 
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         filters = self.filters(h)
         maps = []
         for (kind, c, c3, *_), at in zip(self.scheme.substeps, self.scheme.substep_times, strict=True):
             if kind == "drift":
-                maps.append(Map(LINEAR, self.times(c * h)))
+                maps.append(SubFlow(LINEAR, self.times(c * h)))
             elif self.parts.rest:
-                maps.append(Map(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
+                maps.append(SubFlow(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
         return maps
 
     def filters(self, h: Any) -> Any:
@@ -542,9 +542,9 @@ class SolvableParts(ExactMaps):
             known[parts] = exact_parts(system, parts)
         return known[parts]
 
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         *others, innermost = self.parts.sequence
-        maps: list[Map] = []
+        maps: list[SubFlow] = []
         for weight, start, end in zip(self.weights, self._moments, self._moments[1:], strict=False):
             outer = [self._map(k, weight * h / 2, start) for k in others]
             if self.parts.timed(innermost):
@@ -557,8 +557,8 @@ class SolvableParts(ExactMaps):
                 maps.append(m)
         return maps
 
-    def _map(self, k: int, h: Any, at: float) -> Map:
-        return Map(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
+    def _map(self, k: int, h: Any, at: float) -> SubFlow:
+        return SubFlow(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
 
 
 class TwoCopies(SolvableParts):

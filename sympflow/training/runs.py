@@ -295,7 +295,7 @@ class SearchRun(Run):
 
     minima: list[Minimum] = field(default_factory=list, kw_only=True)
     coming: Generator[Minimum] | None = field(default=None, init=False, repr=False)
-    """The minima of a round of starts, as the crew finds them."""
+    """The minima of a round of starts, as the pool finds them."""
 
     UNIT: ClassVar[str] = "starts"
     SEARCH_SHARE: ClassVar[float] = 0.5  # of a time budget

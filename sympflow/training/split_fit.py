@@ -20,7 +20,7 @@ import torch
 from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.parts import Map
+from sympflow.hamiltonian.parts import SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.training.fits import GaussNewton, Resolved
@@ -167,7 +167,7 @@ class SplitProblem:
             out[part] = t**c.power / (c.n**c.power if c.power else 1)
         return out
 
-    def maps(self, u: np.ndarray) -> list[Map]:
+    def maps(self, u: np.ndarray) -> list[SubFlow]:
         """The maps with the numbers u of the first half."""
         entries = {}
         for c, part in zip(self.columns, self.slices, strict=True):

@@ -57,7 +57,7 @@ from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
 from sympflow.training.starts import check_step, default_primed, scaling_of, warn_of_domain
 from sympflow.training.table_fit import MadeRuns, TableRun
-from sympflow.workers import Crew
+from sympflow.workers import WorkerPool
 
 DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
 BUDGET = 60.0  # seconds of a fit of which nothing else is said
@@ -166,7 +166,7 @@ def train(
     _refuse_unknown(options)
     system = _known_system(system, fit.data if isinstance(fit, LossFit | PrimedFit) else options.get("data"))
     start, limit = None, options.pop("time_budget", budget)
-    session = Session(checkpoint, resume, plain(limit), progress, callback, Crew(workers))
+    session = Session(checkpoint, resume, plain(limit), progress, callback, WorkerPool(workers))
     if fit is None or not isinstance(fit, Fit):
         fit, solver, start = _described(system, fit, solver, flow, said(options))
     elif options:
@@ -204,7 +204,7 @@ def fit_flow(
             runs = None if fit.runs is None else partial(runs_of, piece, fit.runs, fit.seed)
             fitted = _fitted(piece.system, small, kind, replace(fit, runs=None), solver, piece.domain, session, runs)
             return piece.whole(fitted)
-    if not (primed or isinstance(fit, SplitFit) or session.crew.alone):
+    if not (primed or isinstance(fit, SplitFit) or session.pool.alone):
         raise TypeError(
             "`workers` share the starts of a search by 'gauss-newton' for primed and split flows, and this fit is one "
             "run of steps: leave it out."
@@ -229,7 +229,7 @@ def _fitted(
     by_default = open_starts and session.time_budget is None
     if by_default:
         session.time_budget = BUDGET
-    with session.interruption, session.crew, np.errstate(divide="ignore", invalid="ignore"):
+    with session.interruption, session.pool, np.errstate(divide="ignore", invalid="ignore"):
         tried = None
         if new and fit.dt is not None:
             check_step(system, domain, fit.dt)

@@ -132,7 +132,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
                 try:
                     made = next(answers)
                 except KeyboardInterrupt:  # while others work
-                    if session.crew.alone or not interruption.armed:
+                    if session.pool.alone or not interruption.armed:
                         raise
                     interruption.asked = True
                 if deadline.over():  # then it says nothing
