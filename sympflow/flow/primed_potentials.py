@@ -224,7 +224,7 @@ class PrimedDrift(Drift):
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         system = self._binding.system
         system.check_conservative(
-            "with which a flow is that of no Hamiltonian", "ask for flow.velocity, or for system.hamiltonian"
+            "and a damped flow is not Hamiltonian", "ask for flow.velocity, or for system.hamiltonian"
         )
         if system.autonomous:
             return super().pull_back(t, q, p)

@@ -87,7 +87,9 @@ class EnergyRuns(RunsFit):
 def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
     """Raise ValueError unless a flow of the system can be fitted to the `runs` that are asked for."""
     if not (system.local is not None and system.local.has_piece and system.conservative):
-        raise ValueError(f"`runs` are of lattices that keep their energy, and {system.name!r} is none: leave it out.")
+        raise ValueError(
+            f"`runs` need a lattice that conserves its energy, and {system.name!r} is not one: leave it out."
+        )
     if fit.data is not None:
         raise ValueError(
             "`runs` begin in states of a larger piece of the system, and `data` are of itself: leave out one of them."

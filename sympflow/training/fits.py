@@ -112,8 +112,9 @@ class GaussNewton(_Options):
     steps : int, optional
         The most steps: by default 1000 of each fit of a primed flow, 150 of a split one, 200 of a network.
     restarts : int, optional
-        Starts of the search for a primed or a split flow: the flow as it is, then random tables. By default 24 and 8;
-        72 for a primed flow in up to three degrees of freedom of which nothing else is said.
+        Starts of the search for a primed or a split flow: the flow as it is, then random tables. By default 24 and 8.
+        Without `budget` a new primed flow has 72 in up to three degrees of freedom of a symbolic system, and fewer than
+        24 beyond six degrees of freedom.
     refresh, validate_every, checkpoint_every : int
         Of other flows, in steps: how long points are kept, None for the whole run; how often held-out figures are
         taken, and a checkpoint is written.

@@ -246,9 +246,9 @@ class Unstarted(Run):
 
     def ended_early(self, reason: str) -> str:
         if reason == INTERRUPTED:
-            return f"Training did not start because {reason}. What it was to start from is returned, the best so far."
+            return f"Training did not start because {reason}. The flow that it was to start from is returned."
         return (
-            f"Training did not start because {reason}: {self.reached}. What it was to start from is returned. Give a "
+            f"Training did not start because {reason}: {self.reached}. The flow that it was to start from is returned. Give a "
             "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`; or a "
             "`domain` without states at which H has a kink or is nearly singular, near which exact solutions take long."
         )

@@ -63,7 +63,8 @@ DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
 BUDGET = 60.0  # seconds of a fit of which nothing else is said
 SHORT_BUDGET = 15.0  # the least of such a fit that has trials
 STARTS = 72  # of such a fit, where it is compiled: these take a second
-BOUGHT = 1000  # starts that a time budget buys at most
+SOME, SMALL, FEWEST = 24, 6, 3  # of other systems, up to so many degrees of freedom, and of the largest
+BOUGHT = 1000  # starts that a budget buys at most
 
 
 def train(
@@ -107,9 +108,9 @@ def train(
     budget : float, optional
         Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled. All counts: trials (at
         most two thirds of it), labels (at most 0.3 of what is left, each set), starts, fits, held-out figures. Where
-        labels take longer the flow is returned as it was, and a warning says how far they came. A new primed flow of
-        which nothing is said has 60, and a warning where that is not enough; with a budget it has as many starts as two
-        fifths of the time allow, up to 1000, in up to three degrees of freedom of a symbolic system.
+        labels take longer the flow is returned as it was, and a warning says how far they came. Without a budget a new
+        primed flow has 60 seconds, and a warning where that is not enough. With one it has as many starts as two fifths
+        of the time allow, up to 1000, in up to three degrees of freedom of a symbolic system.
     checkpoint : path, optional
         Write the state of the run there at intervals, atomically; of a primed flow after each start of the search, and
         first as soon as there is a run: of one that is killed in the trials nothing is kept.
@@ -246,9 +247,11 @@ def _fitted(
         system.vector_field(
             domain.sample(1, 0), start_times(system, 0.0, 1, 0, Stream.LABELS)
         )  # what is compiled for it counts, but not as labels
-        bought = open_starts and session.checkpoint is None and trials.can_try(system)
+        compiled = trials.can_try(system)
+        bought = open_starts and session.checkpoint is None and (compiled or by_default)
         if bought and isinstance(solver, GaussNewton):
-            solver = replace(solver, restarts=STARTS if by_default else BOUGHT)
+            few = max(FEWEST, round(SOME * min(1.0, (SMALL / system.ndof) ** 2)))
+            solver = replace(solver, restarts=few if not compiled else STARTS if by_default else BOUGHT)
         run = _run_of(system, domain, kind, flow, tried, fit, solver, session.deadline, runs)
         if session.resume is not None:
             run.load(session.resume)
@@ -272,7 +275,7 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
                 raise TypeError(f"`{name}` is an option of {by}: pass flow={by}(system, ..., {name}={value!r}).")
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"is `{close[0]}` meant? There are" if close else "choose from"
-        raise TypeError(f"`{name}` is no option of train(): {hint} {', '.join(known)}.")
+        raise TypeError(f"`{name}` is not an option of train(): {hint} {', '.join(known)}.")
 
 
 def _known_system(system: Any, data: Any) -> HamiltonianSystem:

@@ -334,7 +334,7 @@ def test_clocked_flows_are_kept_in_files(clocked, tmp_path):
 def test_schemes_and_systems_without_a_clock_are_refused():
     with pytest.raises(ValueError, match=r"^`scheme` 'chin4a' is not a symmetric one without force gradients"):
         ClockedFlow(3, "chin4a")
-    with pytest.raises(ValueError, match=r"^`system` is no logarithmic Hamiltonian"):
+    with pytest.raises(ValueError, match=r"^`system` is not a logarithmic Hamiltonian"):
         ClockedFlow(2, system=systems.kepler())
     with pytest.raises(ValueError, match=r"^`terms` must be a positive integer"):
         ClockedFlow(3, terms=0)

@@ -118,7 +118,7 @@ def test_the_remedies_work():
 
 def test_unknown_options_are_refused_with_those_that_there_are():
     for name in ("nonsense", "stagse"):
-        with pytest.raises(TypeError, match=rf"^`{name}` is no option of train\(\): .*stages, .*learning_rate"):
+        with pytest.raises(TypeError, match=rf"^`{name}` is not an option of train\(\): .*stages, .*learning_rate"):
             train(HH, **{name: 3})
     for kind in KINDS:
         for solver in SOLVERS:
