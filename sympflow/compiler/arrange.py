@@ -21,7 +21,6 @@ __all__ = ["Arranged", "Arrangement"]
 
 MOST_TERMS = 64  # of a product that is multiplied out
 MOST_TRIED = 10  # terms of a polynomial for which all ways to nest it are compared
-MOST_RICH = 5  # terms for which products are tried that only letters share
 MOST_SEARCHED = 1000  # polynomials, and parts of these, for which they are
 
 Monomial = tuple[tuple[int, int], ...]
@@ -88,8 +87,6 @@ class Arrangement:
         Names of what does not change in a run.
     expand : bool
         False leaves products of sums (`times`) as they are.
-    squares : bool
-        True takes out squares first, which several polynomials may share, where that costs as much.
 
     Attributes
     ----------
@@ -97,14 +94,8 @@ class Arrangement:
         The numbers, to be calculated with.
     """
 
-    def __init__(
-        self,
-        states: Sequence[tuple[str, int]],
-        constants: Sequence[str] = (),
-        expand: bool = True,
-        squares: bool = False,
-    ) -> None:
-        self._expand, self._squares = expand, squares
+    def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = (), expand: bool = True) -> None:
+        self._expand = expand
         self._table, self._body = Recording(), Recording()
         self._constants = [self._table.input(name) for name in constants]
         self._known: dict[int, int] = {}
@@ -347,12 +338,10 @@ class Arrangement:
                     for y, _ in m[i + 1 :]:
                         counts[(x, 1), (y, 1)] = counts.get(((x, 1), (y, 1)), 0) + 1
         if few:
-            rich = len(terms) <= MOST_RICH
-            shared = [m for m, n in counts.items() if n > 1 or (rich and all(counts[(x, 1),] > 1 for x, _ in m))]
+            shared = [m for m, n in counts.items() if n > 1]
             alone = [m for m in terms if m and not any(_divides(factor, m) for factor in shared)]
             last = max(((self._known[x], x) for m in alone for x, _ in m), default=None)
-            squares = [((x, 2),) for m in terms for x, e in m if e > 1] if self._squares else []
-            return [*squares, *shared, *([] if last is None else [((last[1], 1),)])]
+            return [*shared, *([] if last is None else [((last[1], 1),)])]
         return sorted((m for m in counts if m[0][1] == 1), key=lambda m: -counts[m])[:1]
 
     def _nested(self, terms: Terms, factor: Monomial) -> Iterator[Plan]:
@@ -445,7 +434,3 @@ def _without(m: Monomial, factor: Monomial) -> Monomial:
 
 def _is_one(c: Any) -> bool:
     return isinstance(c, float) and c == 1.0
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, float) and x == 0.0
