@@ -249,7 +249,7 @@ class Unstarted(Run):
             return f"Training did not start because {reason}. The flow that it was to start from is returned."
         return (
             f"Training did not start because {reason}: {self.reached}. The flow that it was to start from is returned. "
-            "Give a longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`; or a "
+            "Give a longer `time_budget`, a shorter `dt`, fewer `points`, `label_times` and `reference_states`, or a "
             "`domain` without states at which H has a kink or is nearly singular, near which exact solutions take long."
         )
 
