@@ -109,9 +109,9 @@ def train(
         Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled. All counts: trials (at
         most two thirds of it), labels (at most 0.3 of what is left, each set), starts, fits, held-out figures. Where
         labels take longer the flow is returned as it was, and a warning says how far they came. Without a budget a new
-        primed flow has 60 seconds: enough in up to three degrees of freedom of a symbolic system, or there is a warning;
-        for others the search may take fewer starts, which the recipe records. With a budget such a system has as many
-        starts as two fifths of the time allow, up to 1000.
+        primed flow has 60 seconds: enough in up to three degrees of freedom of a symbolic system, or there is a
+        warning; for others the search may take fewer starts, which the recipe records. With a budget such a system has
+        as many starts as two fifths of the time allow, up to 1000.
     checkpoint : path, optional
         Write the state of the run there at intervals, atomically; of a primed flow after each start of the search, and
         first as soon as there is a run: of one that is killed in the trials nothing is kept.
