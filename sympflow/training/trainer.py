@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.arguments import plain
+from sympflow.arguments import plain, real_number
 from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
@@ -45,7 +45,6 @@ from sympflow.training.fits import (
     SplitFit,
     check_of,
     from_keywords,
-    is_number,
     keywords,
     said,
 )
@@ -163,7 +162,7 @@ def train(
     --------
     >>> flow = train(system, PrimedFit(stages=3, processor=6), solver=GaussNewton(restarts=24), budget=15)
     """
-    if is_number(fit := plain(fit)):
+    if real_number(fit := plain(fit)):
         fit, options = None, {"dt": fit, **options}
     _refuse_unknown(options)
     system = _known_system(system, fit.data if isinstance(fit, LossFit | PrimedFit) else options.get("data"))
@@ -336,7 +335,7 @@ def _described(
     if fit is not None:
         raise TypeError(f"`fit` must be a fit of sympflow.training, such as PrimedFit(); got {fit!r}: or Δt, a number.")
     dt, by = options.get("dt"), options.pop("optimizer", None) if solver is None else getattr(solver, "name", solver)
-    if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
+    if dt is not None and not (real_number(dt) and 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     searches = by in (None, GaussNewton.name)
     kind, of_flow = options.pop("kind", None), (*OF_PRIMED, *OF_NETWORKS, "dtype", "device")
