@@ -44,8 +44,8 @@ WEIGHTS = ("residual_weight", "matching_weight", "label_weight")
 
 def check_counts(**values: Any) -> None:
     """Positive integers, or None where a choice is left open."""
-    for name, value in values.items():
-        value = plain(value)
+    for name, given in values.items():
+        value = plain(given)
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
             raise ValueError(f"`{name}` must be a positive integer; got {value!r}: give 1 or more, or leave it out.")
 
@@ -606,12 +606,8 @@ def keywords() -> list[str]:
 
 def said(options: Mapping[str, Any]) -> dict[str, Any]:
     """The keywords that say something: not those that are None, or what is so without them."""
-    nothing = object()
-    plainly = {name: plain(value) for name, value in options.items()}
-    kept = {name: value for name, value in plainly.items() if value is not None or name == "clip"}
-    return {
-        n: v for n, v in kept.items() if not (real_number(v) or isinstance(v, str)) or v != DEFAULTS.get(n, nothing)
-    }
+    kept = {name: plain(value) for name, value in options.items() if value is not None or name == "clip"}
+    return {name: value for name, value in kept.items() if name not in DEFAULTS or value != DEFAULTS[name]}
 
 
 def from_keywords(options: Mapping[str, Any], kind: str, by: str | None, flow: FlowMap | None) -> tuple[Fit, Solver]:
