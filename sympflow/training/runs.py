@@ -59,38 +59,38 @@ class Run(ABC):
         return self.fit.record(self.solver)
 
     @property
-    @abstractmethod
     def done(self) -> int:
         """Steps, or what else `UNIT` names, that were taken."""
+        return 0
 
     @property
-    @abstractmethod
     def planned(self) -> int:
         """The most there may be."""
+        return 0
 
     @abstractmethod
     def begin(self, session: Session) -> None:
         """Get ready for the first; an exception ends the run."""
 
-    @abstractmethod
     def over(self, session: Session) -> bool:
         """Return whether to take no more."""
+        return True
 
-    @abstractmethod
     def advance(self, session: Session) -> Advance:
         """Take one."""
+        raise NotImplementedError
 
     @abstractmethod
     def end(self, session: Session) -> str | None:
         """Make the flow that is returned; why the run ended early, if it did."""
 
-    @abstractmethod
     def achieved(self) -> dict[str, float]:
         """The figures of that flow."""
+        return dict(self.flow.figures)
 
-    @abstractmethod
     def missed(self) -> tuple[float, float] | None:
         """The share of what a step of Δt moves a state that the flow misses, see `shares_missed`; None if unknown."""
+        return None
 
     def missed_by_verlet(self) -> tuple[float, float] | None:
         """The same of one Verlet step of Δt; None if there is none to compare with."""
@@ -109,9 +109,9 @@ class Run(ABC):
     def remarks(self, reason: str | None) -> dict[str, Any]:
         """The record of the run, beside its options, in the recipe of the flow."""
 
-    @abstractmethod
     def kept(self) -> dict[str, Any]:
         """The state that a checkpoint keeps: `best` and `optimizer`."""
+        raise NotImplementedError
 
     @abstractmethod
     def restore(self, state: dict[str, Any]) -> None:
@@ -224,22 +224,8 @@ class Unstarted(Run):
 
     UNIT: ClassVar[str] = "steps"
 
-    @property
-    def done(self) -> int:
-        return 0
-
-    @property
-    def planned(self) -> int:
-        return 0
-
     def begin(self, session: Session) -> None:
         self.history = list(self.flow.history)
-
-    def over(self, session: Session) -> bool:
-        return True
-
-    def advance(self, session: Session) -> Advance:
-        raise AssertionError
 
     def end(self, session: Session) -> str | None:
         return INTERRUPTED if session.interruption.asked else NO_LABELS
@@ -253,17 +239,8 @@ class Unstarted(Run):
             "`domain` without states at which H has a kink or is nearly singular, near which exact solutions take long."
         )
 
-    def achieved(self) -> dict[str, float]:
-        return dict(self.flow.figures)
-
-    def missed(self) -> tuple[float, float] | None:
-        return None
-
     def remarks(self, reason: str | None) -> dict[str, Any]:
         return {"ended_early": f"{reason}: {self.reached}"}
-
-    def kept(self) -> dict[str, Any]:
-        raise AssertionError  # it has nothing to keep
 
     def restore(self, state: dict[str, Any]) -> None:
         self.flow.load_state_dict(state["best"])
