@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from sympflow import (
+    ClockedFit,
     HamiltonianSystem,
     SympFlow,
     compare,
@@ -16,6 +17,7 @@ from sympflow import (
     solve,
     systems,
     time_transformed,
+    train,
 )
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
@@ -26,7 +28,6 @@ from sympflow.integrators.flows import LogSympFlow
 from sympflow.interop.scipy import as_scipy
 from sympflow.systems.celestial import kepler_ellipse
 from sympflow.testing.checks import check_integrator
-from sympflow.training.clock_fit import train_clock
 
 METHODS = ("log_leapfrog", "log_blanes_moan4", "log_kahan_li8")
 EPS = np.finfo(float).eps
@@ -251,7 +252,7 @@ def test_a_sympflow_on_the_transformed_system_runs_in_physical_time():
 
 @pytest.fixture(scope="module")
 def clocked():
-    return train_clock(systems.kepler(), 1.0)
+    return train(systems.kepler(), ClockedFit(1.0))
 
 
 def rows(n=5):
