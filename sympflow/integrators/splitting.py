@@ -309,8 +309,14 @@ class Splitting(OwnStepper):
                 )
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
-        times = [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
-        return any(not END < c < 1 - END for c in times)
+        return any(not END < c < 1 - END for c in self._force_times(system))
+
+    def forces_beyond(self, system: HamiltonianSystem) -> bool:
+        return any(not -END < c < 1 + END for c in self._force_times(system))
+
+    def _force_times(self, system: HamiltonianSystem) -> list[float]:
+        """The times of the forces in a step of length 1, of a driven system."""
+        return [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         clock = self.on_clock(system)
