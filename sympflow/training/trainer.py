@@ -195,7 +195,7 @@ def fit_flow(
     primed = isinstance(fit, PrimedFit)
     check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind in DRIVEN)
     if isinstance(fit, ClockedFit):
-        return train_clock(system, fit)
+        return train_clock(system, fit, domain)
     if isinstance(fit, PrimedFit):
         if fit.runs is not None:
             check_runs(system, fit)

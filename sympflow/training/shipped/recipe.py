@@ -64,7 +64,7 @@ class Recipe:
         before = time.process_time()
         domain = self.domain_of(system)
         if isinstance(self.fit, ClockedFit):
-            return train_clock(system, self.fit)
+            return train_clock(system, self.fit, domain)
         start = None if isinstance(self.fit, NetworkFit) else self.fit.flow(system, domain, earlier)
         first = self.fit if start is None else self.fit.of_a_given_flow
         flow = fit_flow(system, start, first, self.solver, domain, Session(progress=progress))
