@@ -430,6 +430,8 @@ class SplitFit(Fit):
         Of the new flow, see `SympFlow.split`.
     frozen_weight : float
         Weight of the residuals at t = Δt; those at other times have 1.
+    loss : str, optional
+        "labels", the only one.
     points, label_times, seed, reference_states
         See `Fit`.
     """
@@ -441,6 +443,7 @@ class SplitFit(Fit):
     terms: int = 8
     force_gradient: Which | None = None
     frozen_weight: float = 30.0
+    loss: str | None = None
 
     kind: ClassVar[str] = "split"
     OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "turn", "stages", "terms", "force_gradient")
@@ -448,6 +451,8 @@ class SplitFit(Fit):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(frozen_weight=self.frozen_weight, turn=self.turn)
+        if self.loss not in (None, "labels"):
+            raise ValueError(f"`loss` {self.loss!r} is not one that Gauss–Newton fits split flows by: use 'labels'.")
 
     def flow(self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None) -> Any:
         dt = self.turn / float(system.linear_part.frequencies.max()) if self.dt is None else self.dt
