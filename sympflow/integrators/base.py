@@ -326,7 +326,7 @@ class KernelStepper(Stepper):
     ) -> tuple[Array, np.ndarray]:
         if y0.ndim == 1:
             states, last, iterations = self.kernel.run(h, y0, n_steps, save, carry, t0)
-            self.iterations += iterations
+            self.iterations, self.remark = self.iterations + iterations, self.kernel.remark
             return states, np.asarray(last)
         rows = y0.reshape(-1, y0.shape[-1])
         states, finite, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
