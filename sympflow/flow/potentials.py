@@ -252,9 +252,9 @@ def _checked_activation(name: str, activation: Any, compiled: Any = None) -> Act
     if not isinstance(value, Tensor) or value.shape != a.shape or value.dtype != a.dtype or not value.requires_grad:
         raise TypeError(f"`activation` {name!r} must be an elementwise function of tensors that torch differentiates.")
     (slope,) = torch.autograd.grad(value.sum(), x, create_graph=True)
-    bend = torch.autograd.grad(slope.sum(), x)[0] if slope.requires_grad else torch.zeros_like(a)
+    second = torch.autograd.grad(slope.sum(), x)[0] if slope.requires_grad else torch.zeros_like(a)
     slope = slope.detach()
-    expected = {"value": value.detach(), "slope": slope, "dvalue": slope * da, "dslope": bend * da}
+    expected = {"value": value.detach(), "slope": slope, "dvalue": slope * da, "dslope": second * da}
     for what, found in zip(expected, activation.tangent(a, da), strict=True):
         if not torch.allclose(found, expected[what], rtol=1e-9, atol=1e-9):
             raise ValueError(f"`activation` {name!r} has a tangent() whose {what} is not that of value(): mend it.")

@@ -263,17 +263,17 @@ class SplitProblem:
         weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.fit.frozen_weight, 1.0)
         weight /= math.sqrt(len(self.t))
 
-        equal, bend = np.array([self.equal(t) for t in self.t]), (weight * pulls)[:, None] / scale
+        equal, pulled = np.array([self.equal(t) for t in self.t]), (weight * pulls)[:, None] / scale
 
         def residuals(theta: np.ndarray) -> np.ndarray:
             u = offsets + designs @ theta
             data = [weight[j] * self.residuals(u[j], j) for j in range(len(self.t))]
-            return np.concatenate([*data, *(bend * (u - equal))])
+            return np.concatenate([*data, *(pulled * (u - equal))])
 
         def linearized(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             u = offsets + designs @ theta
             data = [weight[j] * self.jacobian(u[j], j) @ designs[j] for j in range(len(self.t))]
-            return residuals(theta), np.concatenate([*data, *(bend[..., None] * designs)])
+            return residuals(theta), np.concatenate([*data, *(pulled[..., None] * designs)])
 
         m = levenberg_marquardt(residuals, linearized, theta, iterations=self.solver.steps, stop=stop)
         self.assign(m.x)
