@@ -26,7 +26,6 @@ from sympflow.systems.given import given_system
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.clock_fit import train_clock
-from sympflow.training.energy_runs import check_runs, runs_of
 from sympflow.training.fits import (
     FITTED,
     KINDS,
@@ -48,7 +47,7 @@ from sympflow.training.fits import (
     keywords,
     said,
 )
-from sympflow.training.lattice_fit import LatticePiece, on_piece
+from sympflow.training.lattice_fit import LatticePiece, check_runs, on_piece, runs_of
 from sympflow.training.network_fit import LossRun
 from sympflow.training.points import Stream, handed_in, start_times, unlabelled, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted
