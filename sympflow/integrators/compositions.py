@@ -17,10 +17,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, to_numpy
-from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts, linear_and_rest, map_evaluations
-from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
@@ -29,6 +26,8 @@ from sympflow.integrators.contract import Failure
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, scheme_evaluations
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.parts import ExactParts, SubFlow
+    from sympflow.hamiltonian.planets import Frame
     from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
@@ -219,7 +218,7 @@ class KineticPotential(Composition):
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         y = to_numpy(y)
         n = y.shape[-1]
-        if y.dtype == np.float64 and self.system.symbols is not None and y.size:
+        if y.dtype == np.float64 and self.system.form is not None and y.size:
             from sympflow.kernels.stages import step_table
             from sympflow.kernels.tangents import step_tangents
 
@@ -394,6 +393,8 @@ class ExactMaps(Composition):
         return parts_loops(self.parts).kernel(lambda h: known_maps(self, float(h)) if h.ndim == 0 else self.maps(h))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        from sympflow.hamiltonian.parts import map_evaluations  # SymPy, which other splittings do without
+
         return map_evaluations(known_maps(self, 1.0), n_steps, n_saved, n_extra, backend)
 
 
@@ -441,6 +442,8 @@ class LinearRest(ExactMaps):
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
     ) -> None:
         super().__init__(method, scheme, system)
+        from sympflow.hamiltonian.parts import linear_and_rest
+
         known = _PARTS.setdefault(system, {})
         if "linear" not in known:
             known["linear"] = linear_and_rest(system)
@@ -459,6 +462,8 @@ class LinearRest(ExactMaps):
             raise ValueError(f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p: use 'linear_srkn6b'.")
 
     def maps(self, h: Any) -> list[SubFlow]:
+        from sympflow.hamiltonian.parts import LINEAR, SubFlow
+
         filters = self.filters(h)
         maps = []
         for (kind, c, c3, *_), at in zip(self.scheme.substeps, self.scheme.substep_times, strict=True):
@@ -541,6 +546,8 @@ class SolvableParts(ExactMaps):
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
         """The parts of a system, found once."""
+        from sympflow.hamiltonian.parts import exact_parts
+
         known = _PARTS.setdefault(system, {})
         if parts not in known:
             known[parts] = exact_parts(system, parts)
@@ -562,6 +569,8 @@ class SolvableParts(ExactMaps):
         return maps
 
     def _map(self, k: int, h: Any, at: float) -> SubFlow:
+        from sympflow.hamiltonian.parts import LINEAR, SubFlow
+
         return SubFlow(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
 
 
@@ -586,17 +595,25 @@ class TwoCopies(SolvableParts):
         known = _PARTS.setdefault(system, {})
         key = "copies", self.omega
         if key not in known:
+            from sympflow.hamiltonian.copies import coupling_strength, two_copies
+
             known[key] = two_copies(system, coupling_strength(system) if self.omega is None else float(self.omega))
         return known[key]
 
     def lift(self, y: Array) -> Array:
+        from sympflow.hamiltonian.copies import both
+
         return both(y, self.ndof)
 
     def project(self, x: Array) -> Array:
+        from sympflow.hamiltonian.copies import mean
+
         return mean(x, self.ndof)
 
     def distance(self, x: Array) -> Array:
         """The largest difference of the copies, and the size of their states: (..., 4d) to (..., 2)."""
+        from sympflow.hamiltonian.copies import distance
+
         return distance(x, self.scale)
 
 
@@ -625,6 +642,8 @@ class KeplerInteraction(Composition):
             )
         if system.friction is not None:
             self.check_friction(0.0)
+        from sympflow.hamiltonian.planets import frame_of
+
         self.frame = frame_of(method, system.name, system.local, system.y0)
         self.frame.check(method)
         self.substeps = _paired([(s.kind, s.one) for s in scheme.substeps])
