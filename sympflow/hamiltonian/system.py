@@ -480,13 +480,12 @@ class HamiltonianSystem(Hamiltonian, Shown):
         >>> system.ndof
         9
         """
-        from sympflow.hamiltonian.planets import FEWEST_STEPS, PlanetsHamiltonian, checked_planets
+        from sympflow.hamiltonian.planets import PlanetsHamiltonian, checked_planets
 
         masses, G, start = checked_planets(masses, elements, y0, G, units)
         local = PlanetsHamiltonian(masses, G, start, coordinates, encounter)
-        periods = local.frame.periods
-        end = (0.0, 1000 * float(periods.max())) if t_span is None else t_span
-        step = float(periods.min()) / FEWEST_STEPS if dt is None else dt
+        end = (0.0, 1000 * float(local.frame.periods.max())) if t_span is None else t_span
+        step = local.frame.longest_step if dt is None else dt
         return cls._of_pieces(local, None, name, domain, start, end, step, energy_scale)
 
     def piece(

@@ -96,6 +96,14 @@ class FixedStep(Integrator):
         """Return the step that is used for a system."""
         return float(self.dt if self.dt is not None else system.dt)
 
+    def longest_step(self, system: HamiltonianSystem) -> float:
+        """Return the longest step that is chosen for a tolerance."""
+        return math.inf
+
+    def doubt(self, system: HamiltonianSystem) -> str:
+        """Return a warning of the method with its step on a system, or nothing."""
+        return ""
+
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of one run, for states such as the problem's y0."""
         self.check_library(problem.y0)

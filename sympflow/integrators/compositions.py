@@ -7,6 +7,7 @@ here and a row of `SPLITTINGS`.
 from __future__ import annotations
 
 import itertools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
-_PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()
+_PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()
 
 
 class Composition(ABC):
@@ -82,6 +83,14 @@ class Composition(ABC):
     def check_driving(self) -> None:
         """Raise a ValueError where the parts of a driven system have no exact flows."""
         raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
+
+    def longest_step(self) -> float:
+        """The longest step with which the method is to be used."""
+        return math.inf
+
+    def doubt(self, dt: float) -> str:
+        """A warning of the system with steps dt, or nothing."""
+        return ""
 
     @abstractmethod
     def force_times(self) -> list[float]:
@@ -642,10 +651,14 @@ class KeplerInteraction(Composition):
             )
         if system.friction is not None:
             self.check_friction(0.0)
-        from sympflow.hamiltonian.planets import frame_of
+        known = _PARTS.setdefault(system, {})
+        if "kepler" not in known:
+            from sympflow.hamiltonian.planets import frame_of
 
-        self.frame = frame_of(method, system.name, system.local, system.y0)
-        self.frame.check(method)
+            frame = frame_of(method, system.name, system.local, system.y0)
+            frame.check(method)
+            known["kepler"] = frame
+        self.frame: Frame = known["kepler"]
         self.substeps = _paired([(s.kind, s.one) for s in scheme.substeps])
         self.before: list[tuple[float, float]] = []
         self.after: list[tuple[float, float]] = []
@@ -679,6 +692,27 @@ class KeplerInteraction(Composition):
             if drift:
                 x, v = frame.drift(x, v, drift * h)
         return frame.out(x, v, Q + sign * h[..., None] * U, U)
+
+    def longest_step(self) -> float:
+        kicks = sum(kick != 0 for kick, _ in self.substeps)
+        return self.frame.longest_step * max(kicks, 1)
+
+    def doubt(self, dt: float) -> str:
+        frame, crossing = self.frame, self.frame.crossing()
+        if dt > self.longest_step() * (1 + 1e-9):
+            body = 1 + int(np.argmin(frame.periods))
+            return (
+                f"`dt` {dt:g} is long for method {self.method!r}: its kicks are more than a twentieth of the period of "
+                f"body {body}, {frame.periods.min():.4g}, apart, where steps may be in resonance with the orbit. Take "
+                f"at most {self.longest_step():.3g}."
+            )
+        if crossing:
+            return (
+                f"`system` has orbits that cross, those of bodies {crossing[0]} and {crossing[1]}, where the splitting "
+                "'kepler' is right only until they come close to each other. Take the splitting 'kinetic', such as "
+                "'srkn11b', unless a resonance keeps them apart."
+            )
+        return ""
 
     def kernel(self, compensated: bool) -> Kernel:
         from sympflow.kernels.kepler import KeplerKernel, KeplerLoops
