@@ -165,7 +165,12 @@ def train(
         fit, options = None, {"dt": fit, **options}
     _refuse_unknown(options)
     system = _known_system(system, fit.data if isinstance(fit, LossFit | PrimedFit) else options.get("data"))
-    start, limit = None, options.pop("time_budget", budget)
+    start, budget = None, plain(budget)
+    if budget is not None and "time_budget" in options:
+        raise TypeError("`budget` and `time_budget` are the same limit: leave out one of them.")
+    if budget is not None and not (real_number(budget) and 0 < budget < math.inf):
+        raise ValueError(f"`budget` must be a positive number of seconds; got {budget!r}: leave it out.")
+    limit = options.pop("time_budget", budget)
     session = Session(checkpoint, resume, plain(limit), progress, callback, WorkerPool(workers))
     if fit is None or not isinstance(fit, Fit):
         fit, solver, start = _described(system, fit, solver, flow, said(options))
