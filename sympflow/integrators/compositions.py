@@ -27,7 +27,7 @@ from sympflow.integrators.steppers import ArraySteps, rollout
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, scheme_evaluations
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.parts import ExactParts, Map
+    from sympflow.hamiltonian.parts import ExactParts, SubFlow
     from sympflow.hamiltonian.planets import Frame
     from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
@@ -324,7 +324,7 @@ class ExactMaps(Composition):
         return [m.at for m in known_maps(self, 1.0) if self.parts.timed(m.part)]
 
     @abstractmethod
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         """The maps of a step of length h, a number or an array (...)."""
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -366,14 +366,14 @@ class ExactMaps(Composition):
 
 
 @lru_cache(maxsize=64)
-def known_maps(composition: ExactMaps, h: float) -> Sequence[Map]:
+def known_maps(composition: ExactMaps, h: float) -> Sequence[SubFlow]:
     """The maps of a step, the same object for the same step, whose table the kernel then knows."""
     return composition.maps(h)
 
 
 def rollout_in_modes(
     parts: ExactParts,
-    maps: Sequence[Map],
+    maps: Sequence[SubFlow],
     y0: Array,
     n_steps: int,
     save: np.ndarray,
@@ -424,16 +424,16 @@ class LinearRest(ExactMaps):
         if any(scheme.gradients) and not self.parts.has_force_gradient:
             raise ValueError(f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p: use 'linear_srkn6b'.")
 
-    def maps(self, h: Any) -> list[Map]:
-        from sympflow.hamiltonian.parts import LINEAR, Map
+    def maps(self, h: Any) -> list[SubFlow]:
+        from sympflow.hamiltonian.parts import LINEAR, SubFlow
 
         filters = self.filters(h)
         maps = []
         for (kind, c, c3, *_), at in zip(self.scheme.substeps, self.scheme.substep_times, strict=True):
             if kind == "drift":
-                maps.append(Map(LINEAR, self.times(c * h)))
+                maps.append(SubFlow(LINEAR, self.times(c * h)))
             elif self.parts.rest:
-                maps.append(Map(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
+                maps.append(SubFlow(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
         return maps
 
     def filters(self, h: Any) -> Any:
@@ -515,9 +515,9 @@ class SolvableParts(ExactMaps):
             known[parts] = exact_parts(system, parts)
         return known[parts]
 
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         *others, innermost = self.parts.sequence
-        maps: list[Map] = []
+        maps: list[SubFlow] = []
         for weight, start, end in zip(self.weights, self._moments, self._moments[1:], strict=False):
             outer = [self._map(k, weight * h / 2, start) for k in others]
             if self.parts.timed(innermost):
@@ -530,10 +530,10 @@ class SolvableParts(ExactMaps):
                 maps.append(m)
         return maps
 
-    def _map(self, k: int, h: Any, at: float) -> Map:
-        from sympflow.hamiltonian.parts import LINEAR, Map
+    def _map(self, k: int, h: Any, at: float) -> SubFlow:
+        from sympflow.hamiltonian.parts import LINEAR, SubFlow
 
-        return Map(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
+        return SubFlow(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
 
 
 class TwoCopies(SolvableParts):
