@@ -3,12 +3,11 @@
 The public names are loaded when first used (PEP 562): importing sympflow loads neither torch, SciPy nor matplotlib.
 """
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sympflow._version import __version__
-from sympflow.lazy import FORMER_PATHS, whole_import
+from sympflow.lazy import whole_import
 
 _HOME = {
     "HamiltonianSystem": "hamiltonian.system",
@@ -52,6 +51,10 @@ _HOME = {
     "poincare_section": "studies.poincare",
     "energy_error": "metrics.energy",
     "max_energy_error": "metrics.energy",
+    "angular_momentum": "metrics.elements",
+    "elements": "metrics.elements",
+    "momentum": "metrics.elements",
+    "states_of_elements": "metrics.elements",
     "energy_drift": "metrics.energy",
     "energy_growth": "metrics.energy",
     "energy_balance_error": "metrics.energy_balance",
@@ -100,6 +103,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.domain import EnergySublevel as EnergySublevel
     from sympflow.hamiltonian.domain import Tube as Tube
     from sympflow.hamiltonian.doubling import doubled as doubled
+    from sympflow.hamiltonian.lattice_states import LatticeStates as LatticeStates
     from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
     from sympflow.integrators.choosing import choose_step as choose_step
@@ -116,6 +120,10 @@ if TYPE_CHECKING:
     from sympflow.metrics.chaos import gali as gali
     from sympflow.metrics.chaos import lyapunov as lyapunov
     from sympflow.metrics.chaos import sali as sali
+    from sympflow.metrics.elements import angular_momentum as angular_momentum
+    from sympflow.metrics.elements import elements as elements
+    from sympflow.metrics.elements import momentum as momentum
+    from sympflow.metrics.elements import states_of_elements as states_of_elements
     from sympflow.metrics.energy import energy_drift as energy_drift
     from sympflow.metrics.energy import energy_error as energy_error
     from sympflow.metrics.energy import energy_growth as energy_growth
@@ -147,10 +155,6 @@ if TYPE_CHECKING:
     from sympflow.training.fits import PrimedFit as PrimedFit
     from sympflow.training.fits import SplitFit as SplitFit
     from sympflow.training.trainer import train as train
-
-
-if FORMER_PATHS not in sys.meta_path:
-    sys.meta_path.append(FORMER_PATHS)
 
 
 def __getattr__(name: str) -> Any:

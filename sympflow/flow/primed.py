@@ -42,7 +42,7 @@ from sympflow.flow.primed_potentials import (
 )
 from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Substep, Tables, columns_of, substeps_of
+from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Tables, columns_of
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.lattice_states import LatticeStates
@@ -107,9 +107,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         self.kicks, self.drifts, self.gradients, self.curvatures, self.polynomials = inside
         self.processor_kicks, self.processor_drifts, self.processor_gradients = outside[:3]
         self.processor_curvatures, self.processor_polynomials = outside[3:]
-        inner = substeps_of(shape.kernel, inside, 1)
-        outer = {sign: substeps_of(shape.outer, outside, sign) for sign in (1, -1)}
-        self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
+        self.substeps = shape.substeps(inside, outside)
         self._tables: Kept[Tables] = Kept(column._parameters for column in columns_of(self.substeps))
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(map(self._layer, range(len(self.substeps))))

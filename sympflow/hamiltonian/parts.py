@@ -31,7 +31,7 @@ LINEAR = 0
 
 
 @dataclass(frozen=True)
-class Map:
+class SubFlow:
     """The exact flow of a part, in units of absolute time; every entry may have a batch shape in front.
 
     Attributes
@@ -53,8 +53,8 @@ class Map:
     filters: Any = None
     at: float = 0.0
 
-    def inverse(self) -> Map:
-        return Map(self.part, -self.length, -self.gradient, self.filters, self.at)
+    def inverse(self) -> SubFlow:
+        return SubFlow(self.part, -self.length, -self.gradient, self.filters, self.at)
 
 
 class PartFunctions(SymbolicHamiltonian):
@@ -188,7 +188,7 @@ class ExactParts:
 
     # flows ----------------------------------------------------------------------------------------------
 
-    def apply(self, maps: Sequence[Map], X: Array, Y: Array, t: Any = 0.0, h: Any = 0.0) -> tuple[Array, Array]:
+    def apply(self, maps: Sequence[SubFlow], X: Array, Y: Array, t: Any = 0.0, h: Any = 0.0) -> tuple[Array, Array]:
         """The maps of a step one after another, the first first; those of parts that move in a step h from t on."""
         for m in maps:
             if m.part == LINEAR:
@@ -206,7 +206,7 @@ class ExactParts:
         return X, Y
 
     def pushed(
-        self, maps: Sequence[Map], x: tuple[Array, Array], w: tuple[Array, Array], t: Any = 0.0, h: Any = 0.0
+        self, maps: Sequence[SubFlow], x: tuple[Array, Array], w: tuple[Array, Array], t: Any = 0.0, h: Any = 0.0
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]] | None:
         """The modes (..., d) after the maps, and vectors (..., k, d) moved by the derivative of these.
 
@@ -228,7 +228,7 @@ class ExactParts:
             P = P - each_mode(length) * linear.slopes(of.hessian_vector(y[..., None, :], linear.positions(U), *time))
         return (X, Y), (U, P)
 
-    def _turned(self, m: Map, X: Array, Y: Array) -> tuple[Array, Array]:
+    def _turned(self, m: SubFlow, X: Array, Y: Array) -> tuple[Array, Array]:
         """The flow of a part that brings its own: its change alone is transformed, so that transforms add no drift."""
         y = self.from_modes(X, Y)
         change = self.rest[m.part - 1].turned(y, each_mode(m.length)) - y
@@ -241,7 +241,7 @@ class ExactParts:
         """The linear part over the times s (..., F), or by the shears that `prepared` has put in their place."""
         return sheared(X, Y, s if isinstance(s, tuple) else self._shears(s, X))
 
-    def prepared(self, maps: Sequence[Map], X: Array) -> list[Map]:
+    def prepared(self, maps: Sequence[SubFlow], X: Array) -> list[SubFlow]:
         """The maps for repeated use on states of the kind of X: the shears of the linear ones computed once."""
         return [replace(m, length=self._shears(m.length, X)) if m.part == LINEAR else m for m in maps]
 
@@ -533,7 +533,7 @@ def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
     return part.xreplace({s: first[s.name] for s in part.free_symbols if s.name in first})
 
 
-def map_evaluations(maps: Sequence[Map], n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+def map_evaluations(maps: Sequence[SubFlow], n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Evaluations of slopes and force gradients, as `FixedStep.evaluations`; linear flows cost none."""
     counts = [sum(m.part != LINEAR for m in maps), sum(_has_gradient(m) for m in maps)]
     counts = [count * (n_steps + n_extra) for count in counts]
@@ -543,5 +543,5 @@ def map_evaluations(maps: Sequence[Map], n_steps: int, n_saved: int, n_extra: in
     return {"force_evaluations": int(counts[0]), "hessian_evaluations": int(counts[1])}
 
 
-def _has_gradient(m: Map) -> bool:
+def _has_gradient(m: SubFlow) -> bool:
     return m.gradient != 0.0 if isinstance(m.gradient, float) else bool(np.any(m.gradient))

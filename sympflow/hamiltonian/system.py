@@ -418,6 +418,76 @@ class HamiltonianSystem(Hamiltonian, Shown):
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
         return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
 
+    @classmethod
+    def planets(
+        cls,
+        masses: ArrayLike,
+        *,
+        elements: Mapping[str, ArrayLike] | ArrayLike | None = None,
+        y0: ArrayLike | None = None,
+        G: float | None = None,
+        units: str | Sequence[str] | None = None,
+        coordinates: str = "jacobi",
+        encounter: float | None = 1.0,
+        name: str = "planets",
+        domain: Domain | None = None,
+        t_span: tuple[float, float] | None = None,
+        dt: float | None = None,
+        energy_scale: float | None = None,
+    ) -> HamiltonianSystem:
+        """Planets about a star: H = Σ_i |p_i|²/(2 m_i) − G Σ_{i<j} m_i m_j/r_ij, for methods of the splitting "kepler".
+
+        States are inertial, y = [q, p]; ``q.reshape(n, 3)`` are the places of the bodies, the star first. The methods
+        "wisdom_holman" and "kepler_aba864" have coordinates of their own inside of a run only. All other methods take
+        the system as one of `pairs`.
+
+        Parameters
+        ----------
+        masses : array_like of shape (n,)
+            The star's first, which is the heaviest.
+        elements : mapping of str to array_like of shape (n − 1,), or array_like of shape (n − 1, 6)
+            Heliocentric orbital elements of the planets: "a", "e", "inc", "node" (ascending), "peri" (the argument of
+             the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Of hyperbolas
+            e > 1 and a < 0. The centre of mass is at rest at the origin.
+        y0 : array_like of shape (6n,)
+            In place of elements: the initial state.
+        G : float, optional
+            The gravitational constant, by default 1.
+        units : str or sequence of 3 str, optional
+            In place of G: names of a length ("AU", "km", "m"), a time ("day", "year", "s") and a mass ("solar mass",
+            "Jupiter mass", "Earth mass", "kg"), such as "AU, day, solar mass".
+        coordinates : {"jacobi", "democratic"}
+            Inside of a run: each planet as seen from the centre of mass of all inside of its orbit, or, democratic
+            heliocentric, from the star, where kicks hold the motion of the star and are less accurate.
+        encounter : float or None
+            Two planets that come closer to each other than so many Hill radii end a run of the splitting "kepler", with
+            status −1, their numbers and the time. None for no such end.
+        name, domain, energy_scale
+            As for the class.
+        t_span : (float, float), optional
+            By default a thousand of the longest periods.
+        dt : float, optional
+            By default a twentieth of the shortest period.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an argument is wrong, or the star is not the heaviest body.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.planets([1.0, 1e-3, 3e-4], elements={"a": [5.2, 9.6], "e": 0.05})
+        >>> system.ndof
+        9
+        """
+        from sympflow.hamiltonian.planets import PlanetsHamiltonian, checked_planets
+
+        masses, G, start = checked_planets(masses, elements, y0, G, units)
+        local = PlanetsHamiltonian(masses, G, start, coordinates, encounter)
+        end = (0.0, 1000 * float(local.frame.periods.max())) if t_span is None else t_span
+        step = local.frame.longest_step if dt is None else dt
+        return cls._of_pieces(local, None, name, domain, start, end, step, energy_scale)
+
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
     ) -> HamiltonianSystem:
@@ -630,6 +700,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         self.domain = None if domain is None else domain_of(domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
+        self._definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
 
     @property
     def dt(self) -> float:
@@ -770,6 +841,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
         if kind in self._tested:
+            self._definition.check_unchanged(like)
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 
@@ -856,6 +928,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
             kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
+        if self._definition.given_functions:
+            kind += f", arrays: it could not be traced, for {self.untraced}" if self.form is None else ", traced"
         degrees = f"{self.ndof:,} degree{'s' * (self.ndof > 1)} of freedom"
         named = self.title if self.name == UNNAMED and self.symbols is not None else f"{self.name}({params})"
         return f"<HamiltonianSystem {named}: {degrees}, {kind}>"

@@ -7,6 +7,7 @@ here and a row of `SPLITTINGS`.
 from __future__ import annotations
 
 import itertools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,21 +18,22 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, to_numpy
-from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, linear_and_rest, map_evaluations
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import rollout
-from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
+from sympflow.integrators.contract import Failure
+from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, scheme_evaluations
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.parts import ExactParts, SubFlow
+    from sympflow.hamiltonian.planets import Frame
     from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
-_PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()
+_PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()
 
 
 class Composition(ABC):
@@ -64,6 +66,8 @@ class Composition(ABC):
     """True if one of the parts holds the friction of a damped system."""
     takes_driving: ClassVar[bool] = False
     """True if the time moves with one of the parts, of a system that depends on it."""
+    breakdown: ClassVar[Failure | None] = None
+    """The reason for which runs end that cannot go on; None for that of all methods."""
     takes_extended: ClassVar[bool] = False
     """True if the parts stay as they are with E, the momentum of the time, as one more momentum."""
 
@@ -79,6 +83,14 @@ class Composition(ABC):
     def check_driving(self) -> None:
         """Raise a ValueError where the parts of a driven system have no exact flows."""
         raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
+
+    def longest_step(self) -> float:
+        """The longest step with which the method is to be used."""
+        return math.inf
+
+    def doubt(self, dt: float) -> str:
+        """A warning of the system with steps dt, or nothing."""
+        return ""
 
     @abstractmethod
     def force_times(self) -> list[float]:
@@ -215,7 +227,7 @@ class KineticPotential(Composition):
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         y = to_numpy(y)
         n = y.shape[-1]
-        if y.dtype == np.float64 and self.system.symbols is not None and y.size:
+        if y.dtype == np.float64 and self.system.form is not None and y.size:
             from sympflow.kernels.stages import step_table
             from sympflow.kernels.tangents import step_tangents
 
@@ -354,7 +366,7 @@ class ExactMaps(Composition):
         return [m.at for m in known_maps(self, 1.0) if self.parts.timed(m.part)]
 
     @abstractmethod
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         """The maps of a step of length h, a number or an array (...)."""
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -390,18 +402,20 @@ class ExactMaps(Composition):
         return parts_loops(self.parts).kernel(lambda h: known_maps(self, float(h)) if h.ndim == 0 else self.maps(h))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        from sympflow.hamiltonian.parts import map_evaluations  # SymPy, which other splittings do without
+
         return map_evaluations(known_maps(self, 1.0), n_steps, n_saved, n_extra, backend)
 
 
 @lru_cache(maxsize=64)
-def known_maps(composition: ExactMaps, h: float) -> Sequence[Map]:
+def known_maps(composition: ExactMaps, h: float) -> Sequence[SubFlow]:
     """The maps of a step, the same object for the same step, whose table the kernel then knows."""
     return composition.maps(h)
 
 
 def rollout_in_modes(
     parts: ExactParts,
-    maps: Sequence[Map],
+    maps: Sequence[SubFlow],
     y0: Array,
     n_steps: int,
     save: np.ndarray,
@@ -437,6 +451,8 @@ class LinearRest(ExactMaps):
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
     ) -> None:
         super().__init__(method, scheme, system)
+        from sympflow.hamiltonian.parts import linear_and_rest
+
         known = _PARTS.setdefault(system, {})
         if "linear" not in known:
             known["linear"] = linear_and_rest(system)
@@ -454,14 +470,16 @@ class LinearRest(ExactMaps):
         if any(scheme.gradients) and not self.parts.has_force_gradient:
             raise ValueError(f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p: use 'linear_srkn6b'.")
 
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
+        from sympflow.hamiltonian.parts import LINEAR, SubFlow
+
         filters = self.filters(h)
         maps = []
         for (kind, c, c3, *_), at in zip(self.scheme.substeps, self.scheme.substep_times, strict=True):
             if kind == "drift":
-                maps.append(Map(LINEAR, self.times(c * h)))
+                maps.append(SubFlow(LINEAR, self.times(c * h)))
             elif self.parts.rest:
-                maps.append(Map(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
+                maps.append(SubFlow(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
         return maps
 
     def filters(self, h: Any) -> Any:
@@ -537,14 +555,16 @@ class SolvableParts(ExactMaps):
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
         """The parts of a system, found once."""
+        from sympflow.hamiltonian.parts import exact_parts
+
         known = _PARTS.setdefault(system, {})
         if parts not in known:
             known[parts] = exact_parts(system, parts)
         return known[parts]
 
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         *others, innermost = self.parts.sequence
-        maps: list[Map] = []
+        maps: list[SubFlow] = []
         for weight, start, end in zip(self.weights, self._moments, self._moments[1:], strict=False):
             outer = [self._map(k, weight * h / 2, start) for k in others]
             if self.parts.timed(innermost):
@@ -557,8 +577,10 @@ class SolvableParts(ExactMaps):
                 maps.append(m)
         return maps
 
-    def _map(self, k: int, h: Any, at: float) -> Map:
-        return Map(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
+    def _map(self, k: int, h: Any, at: float) -> SubFlow:
+        from sympflow.hamiltonian.parts import LINEAR, SubFlow
+
+        return SubFlow(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
 
 
 class TwoCopies(SolvableParts):
@@ -582,18 +604,145 @@ class TwoCopies(SolvableParts):
         known = _PARTS.setdefault(system, {})
         key = "copies", self.omega
         if key not in known:
+            from sympflow.hamiltonian.copies import coupling_strength, two_copies
+
             known[key] = two_copies(system, coupling_strength(system) if self.omega is None else float(self.omega))
         return known[key]
 
     def lift(self, y: Array) -> Array:
+        from sympflow.hamiltonian.copies import both
+
         return both(y, self.ndof)
 
     def project(self, x: Array) -> Array:
+        from sympflow.hamiltonian.copies import mean
+
         return mean(x, self.ndof)
 
     def distance(self, x: Array) -> Array:
         """The largest difference of the copies, and the size of their states: (..., 4d) to (..., 2)."""
+        from sympflow.hamiltonian.copies import distance
+
         return distance(x, self.scale)
+
+
+class KeplerInteraction(Composition):
+    """H of planets about a star: Kepler's motion of each, exactly | all else, their interaction.
+
+    In Jacobi's coordinates the interaction is a potential, so that every scheme keeps its order. In democratic
+    heliocentric ones it holds the motion of the star too, half before a kick and half after, which is of order 2.
+    """
+
+    breakdown: ClassVar[Failure | None] = Failure.ENCOUNTER
+
+    def __init__(
+        self,
+        method: str,
+        scheme: Scheme,
+        system: HamiltonianSystem,
+        parts: tuple[str, ...] | None = None,
+        corrector: int | None = None,
+    ) -> None:
+        super().__init__(method, scheme, system)
+        if scheme.level:
+            raise ValueError(
+                f"`splitting` 'kepler' has plain kicks, and the scheme of method {method!r} has force gradients: use "
+                "'leapfrog', 'aba864' or another scheme without them."
+            )
+        if system.friction is not None:
+            self.check_friction(0.0)
+        known = _PARTS.setdefault(system, {})
+        if "kepler" not in known:
+            from sympflow.hamiltonian.planets import frame_of
+
+            frame = frame_of(method, system.name, system.local, system.y0)
+            frame.check(method)
+            known["kepler"] = frame
+        self.frame: Frame = known["kepler"]
+        self.substeps = _paired([(s.kind, s.one) for s in scheme.substeps])
+        self.before: list[tuple[float, float]] = []
+        self.after: list[tuple[float, float]] = []
+        if corrector is not None:
+            if [s[:2] for s in scheme.substeps] != [("drift", 0.5), ("kick", 1.0), ("drift", 0.5)]:
+                raise ValueError(
+                    f"`corrector` goes with the steps of 'wisdom_holman', and method {method!r} makes other ones: "
+                    "leave it out."
+                )
+            self.before, self.after = (_paired(corrector_maps(corrector, sign)) for sign in (1, -1))
+
+    def force_times(self) -> list[float]:
+        return []
+
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        return self._moved(y, h, [*self.before, *self.substeps, *self.after])
+
+    def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        maps = [*self.before, *self.substeps, *self.after]
+        kicks, drifts = [-b for b, _ in maps[::-1]], [-a for _, a in maps[::-1]]
+        back = zip([0.0, *kicks], [*drifts, 0.0], strict=True)
+        return self._moved(y, h, [*back], -1.0)
+
+    def _moved(self, y: Array, h: Any, maps: Sequence[tuple[float, float]], sign: float = 1.0) -> Array:
+        frame = self.frame
+        h = like(np.asarray(h, dtype=float), y) if isinstance(h, int | float) else h
+        x, v, Q, U = frame.into(y)
+        for kick, drift in maps:
+            if kick:
+                x, v = frame.kick(x, v, kick * h)
+            if drift:
+                x, v = frame.drift(x, v, drift * h)
+        return frame.out(x, v, Q + sign * h[..., None] * U, U)
+
+    def longest_step(self) -> float:
+        kicks = sum(kick != 0 for kick, _ in self.substeps)
+        return self.frame.longest_step * max(kicks, 1)
+
+    def doubt(self, dt: float) -> str:
+        frame, crossing = self.frame, self.frame.crossing()
+        if dt > self.longest_step() * (1 + 1e-9):
+            body = 1 + int(np.argmin(frame.periods))
+            return (
+                f"`dt` {dt:g} is long for method {self.method!r}: its kicks are more than a twentieth of the period of "
+                f"body {body}, {frame.periods.min():.4g}, apart, where steps may be in resonance with the orbit. Take "
+                f"at most {self.longest_step():.3g}."
+            )
+        if crossing:
+            return (
+                f"`system` has orbits that cross, those of bodies {crossing[0]} and {crossing[1]}, where the splitting "
+                "'kepler' is right only until they come close to each other. Take the splitting 'kinetic', such as "
+                "'srkn11b', unless a resonance keeps them apart."
+            )
+        return ""
+
+    def kernel(self, compensated: bool) -> Kernel:
+        from sympflow.kernels.kepler import KeplerKernel, KeplerLoops
+
+        known = _KEPLER.setdefault(self.frame, {})
+        if "loops" not in known:
+            known["loops"] = KeplerLoops(self.frame)
+        return KeplerKernel(known["loops"], self.substeps, self.before, self.after)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        counts = scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
+        processed = (n_saved if backend == "compiled" else 2 * n_steps) + 2 * n_extra
+        counts["force_evaluations"] += sum(kick != 0 for kick, _ in self.before) * processed
+        return counts
+
+
+_KEPLER: WeakKeyDictionary[Frame, dict[str, Any]] = WeakKeyDictionary()
+
+
+def _paired(maps: Sequence[tuple[str, float]]) -> list[tuple[float, float]]:
+    """Kicks, each with the drift after it."""
+    pairs: list[tuple[float, float]] = []
+    for kind, c in maps:
+        if kind == "kick":
+            pairs.append((c, 0.0))
+        elif pairs and not pairs[-1][1]:
+            pairs[-1] = pairs[-1][0], c
+        else:
+            pairs.append((0.0, c))
+    return pairs
 
 
 SPLITTINGS: dict[str, type[Composition]] = {
@@ -603,5 +752,6 @@ SPLITTINGS: dict[str, type[Composition]] = {
     "midpoint": MidpointLinearRest,
     "parts": SolvableParts,
     "copies": TwoCopies,
+    "kepler": KeplerInteraction,
 }
 """The splittings by the name that the option `splitting` takes."""

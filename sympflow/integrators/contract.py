@@ -96,6 +96,11 @@ class Failure(Enum):
     NON_FINITE = "The solution became non-finite", "Reduce `dt`"
     UNSOLVED = "The implicit step could not be solved: Newton's iteration did not converge", "Reduce `dt`"
     CLOCK = "T + B or c − V ceased to be positive and finite", "Reduce `dt`, or raise `shift` above the energy"
+    ENCOUNTER = (
+        "Two planets came closer to each other than `encounter` Hill radii, where they are no longer on orbits about "
+        "the star",
+        "Follow the encounter with the splitting 'kinetic', such as method 'dop853' or 'srkn11b' with short steps",
+    )
     STALLED = (
         "After {n_steps} steps time hardly advances any more, as before a collision",
         "End `t_span` earlier, or raise `dt`",

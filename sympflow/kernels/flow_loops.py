@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.parts import ExactParts, Map
+from sympflow.hamiltonian.parts import ExactParts, SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
@@ -98,7 +98,7 @@ class PrimedFlowKernel(Kernel):
             raise ValueError(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
-        known = system.symbols is not None or (tables.level == CURVATURE and system.local is not None)
+        known = system.form is not None or (tables.level == CURVATURE and system.local is not None)
         if tables.level >= CURVATURE and not known:
             raise ValueError(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
@@ -222,11 +222,11 @@ def _stepped_by(step: ArrayStep, y: np.ndarray, h: np.ndarray, t: Any = 0.0) -> 
 class MapSource(Protocol):
     """The maps of a split flow, which do not change."""
 
-    def maps(self, t: float) -> Sequence[Map]:
+    def maps(self, t: float) -> Sequence[SubFlow]:
         """The maps of a step, for t < 0 those of the inverse; the same object for the same t."""
         ...
 
-    def coefficients(self, back: bool) -> Sequence[Map]:
+    def coefficients(self, back: bool) -> Sequence[SubFlow]:
         """The maps of all steps, or of their inverses: see `PartsLoops.step_by_coefficients`."""
         ...
 

@@ -18,16 +18,17 @@ from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, dot, times
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, traced
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.recorded import evaluator
-from sympflow.kernels.approximations import OnInterval, Ranges, on_interval
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.kernels.approximations import OnInterval, Ranges
     from sympflow.kernels.stage_times import Driving
 
 __all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange", "shared"]
@@ -58,12 +59,12 @@ class Splitting:
         Intervals of one position in which kicks are polynomials, equal but for rounding; its values are then in V.
     """
 
-    symbols: SymbolicHamiltonian
+    symbols: SymbolicHamiltonian | TracedHamiltonian
     level: int
     monomials: Monomials = ()
     compensated: bool = False
     friction: int | None = None
-    driving: Driving | None = None
+    driving: Driving | TracedDriving | None = None
     ranges: Ranges = ()
 
     @property
@@ -127,6 +128,8 @@ class Splitting:
 
     def _within_range(self, terms: int) -> Arranged | WithinRange:
         """The stage as a polynomial in its range, if there is one."""
+        from sympflow.kernels.approximations import on_interval
+
         near = on_interval(_of_kick(self.symbols, terms), self.symbols.q[0], *self.ranges[0])
         if near is None:
             return self._arranged(terms)
@@ -301,7 +304,7 @@ class _Both:
         return [x for program in self._programs for x in program(*values)]
 
 
-def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
+def _of_kick(symbols: Any, terms: int) -> list[Any]:
     """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
     V, M = symbols.V, symbols.inverse_mass
     assert V is not None
@@ -313,7 +316,7 @@ def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
 
 
 def _kick_changes(
-    symbols: SymbolicHamiltonian, q: Sequence[Any], kicks: Sequence[Any], known: Any, terms: int, monomials: Monomials
+    symbols: Any, q: Sequence[Any], kicks: Sequence[Any], known: Any, terms: int, monomials: Monomials
 ) -> list[Any]:
     """The change of p by a kick of so many terms, of recorded numbers; `known` evaluates expressions."""
     slope, M, d = gradient(known(symbols.V), q), symbols.inverse_mass, len(q)
@@ -498,14 +501,11 @@ class SplittingCode(Rollouts):
                 entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
         return entries
 
-    def own_columns(self, table: np.ndarray, values: np.ndarray, width: int) -> Columns:
-        """The columns of trajectories with their own values (N, n) of the parameters."""
+    def own_entries(self, table: np.ndarray, values: np.ndarray) -> Columns:
+        """The numbers of the columns of trajectories with their own values of the parameters."""
         kinds, n = self._kinds_of(table), len(table) - self._own
         rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
-        entries = self._entries(rows, kinds, (len(values),))
-        groups = -(-len(values) // width)
-        full = np.concatenate([entries, np.repeat(entries[..., -1:], groups * width - len(values), axis=-1)], axis=-1)
-        return np.ascontiguousarray(full.reshape(*full.shape[:2], groups, width).transpose(2, 0, 1, 3)), kinds
+        return np.moveaxis(self._entries(rows, kinds, (len(values),)), -1, 0), kinds
 
     def step_rows(
         self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray

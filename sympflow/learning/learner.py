@@ -49,7 +49,7 @@ from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
 from sympflow.training.starts import suited_step
 from sympflow.training.trainer import train
-from sympflow.workers import Crew
+from sympflow.workers import WorkerPool
 
 HELD_OUT = 0.2  # of the trajectories
 TIME_BUDGET = 60.0  # seconds
@@ -184,7 +184,7 @@ def learn(
     dt = plain(dt)
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
-    session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
+    session = Session(checkpoint, resume, plain(time_budget), progress, callback, WorkerPool(workers))
     smooth = smoothed(data)
     rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
     seen = smooth.sigma if data.n_points >= ROUGH else None
@@ -201,7 +201,7 @@ def learn(
     search = Search(_cut(data, rate), folds, said, setting, seed, identity=identity, whole=data)
     if resume is not None:
         search.resume(resume)
-    with session.interruption, session.crew:
+    with session.interruption, session.pool:
         search.run(chosen, session)
         search.diagnose(session)
         flow = search.flow(dt, name, session)

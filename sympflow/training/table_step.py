@@ -589,14 +589,14 @@ def _generated(
 
     from sympflow.hamiltonian.symbolic import without_deltas
 
-    letters: dict[Any, Any] = {}
+    samples_at: dict[Any, Any] = {}
     expressions = [without_deltas(f) for f in expressions]
     if samples:
         from sympflow.hamiltonian.driving import with_letters
 
-        expressions, letters = with_letters(expressions)
-    sampled = [(samples[a.name_of_samples], a.order, sp.lambdify(variables, a.at, modules="numpy")) for a in letters]
-    function = sp.lambdify((*variables, *letters.values()), expressions, modules="numpy", cse=True)
+        expressions, samples_at = with_letters(expressions)
+    sampled = [(samples[a.name_of_samples], a.order, sp.lambdify(variables, a.at, modules="numpy")) for a in samples_at]
+    function = sp.lambdify((*variables, *samples_at.values()), expressions, modules="numpy", cse=True)
 
     def evaluate(q: np.ndarray) -> np.ndarray:
         values = function(*q, *(each(at(*q), order) for each, order, at in sampled))

@@ -244,7 +244,7 @@ def test_a_reduction_returns_what_it_tells():
 
 def test_what_is_sent_to_processes_is_small_and_can_be_sent():
     task = sweep.Task(SYSTEM, sympflow.get("verlet")(dt=DT), SPAN, None, {}, reductions.States(), "auto")
-    assert len(workers.Parcel(task).pack()) < 20_000
+    assert len(workers.PickledTask(task).pack()) < 20_000
     lock = threading.Lock()
     with pytest.raises(TypeError, match="`reduce` cannot be sent to the processes of `workers`"):
         kept(reduce=lambda t, y: float(lock.locked()), workers=2)
