@@ -23,10 +23,10 @@ from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Me
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.choosing import integrator_for
 from sympflow.integrators.contract import Integrator, Problem
+from sympflow.integrators.problems import check_backend, check_own_parameters
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import check_applies
 from sympflow.kernels.threads import at_most
-from sympflow.solver import check_backend, check_own_parameters
 from sympflow.systems.given import given_system
 from sympflow.workers import LostWorkers, PickledTask, Unpicklable, checked_workers, mapped
 

@@ -149,7 +149,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
                 f"`system` {system.name!r} has a kinetic energy that depends on t, and flows are primed with V(q, t) "
                 "alone: use a splitting method such as 'kahan_li8'."
             )
-        if system.friction is not None and not system.quadratic_kinetic:
+        if system.friction and not system.quadratic_kinetic:
             raise ValueError(
                 f"`system` {system.name!r} has friction, which drifts hold where the kinetic energy is ½ pᵀM⁻¹p: use a "
                 "Runge–Kutta method such as 'dop853'."
@@ -412,7 +412,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
 def _is_timed(system: HamiltonianSystem) -> bool:
     """Return True if the drifts of a kernel must add up to t."""
-    return system.friction is not None or not system.autonomous
+    return not (system.autonomous and not system.friction)
 
 
 def _check_counts(stages: Any, processor: Any) -> None:

@@ -170,12 +170,12 @@ class PrimedDrift(Drift):
     def _plain(self) -> bool:
         """True without friction and driving."""
         system = self._binding.system
-        return system.friction is None and system.autonomous
+        return not system.friction and system.autonomous
 
     def _moved(self, s: Time, q: Tensor, p: Tensor, passed: Time = 0.0) -> tuple[Tensor, Tensor]:
         """The linear map of a drift over s, and by how much the time moves with it."""
         system = self._binding.system
-        if system.friction is None:
+        if not system.friction:
             mean, end = _each(s) * p.T, p
         else:
             mean, end = system.friction.drift(p.T, _each(s))
@@ -207,7 +207,7 @@ class PrimedDrift(Drift):
         change = rate * system.velocity(p.T).T
         if not system.autonomous:
             change = torch.cat([change, torch.zeros_like(change[:1])])
-        if system.friction is not None:
+        if system.friction:
             dp = dp + rate * system.friction.force(p.T).T
         return q, p, dq + change, dp
 

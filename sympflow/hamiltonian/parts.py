@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, like, stack
+from sympflow.arrays import Array, concatenate, is_tensor, library, like, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 from sympflow.hamiltonian.times import probe_times, stage_time
@@ -247,7 +247,7 @@ class ExactParts:
 
     def _shears(self, s: Any, X: Array) -> tuple[Array, Array, Array, Array]:
         assert self.linear is not None
-        return shears(self.linear.kinds, like(self.linear.rates, X), self.by_class(matching(s, X)))
+        return shears(self.linear.kinds, like(self.linear.rates, X), self.by_class(like(s, X)))
 
     def linear_energies(self, X: Array, Y: Array) -> Array:
         """Energy of the linear part in each frequency: (..., F)."""
@@ -267,7 +267,7 @@ class ExactParts:
         g = functions.gradient(self._state(part, X, Y, filters), *t)
         linear = self.linear
         dX = g[..., :d] if linear is None else linear.slopes(g[..., :d])
-        dX = dX if filters is None else self.by_class(matching(filters, X)) * dX
+        dX = dX if filters is None else self.by_class(like(filters, X)) * dX
         if functions.of_positions:
             return dX, None
         return dX, g[..., d:] if linear is None else linear.coordinates(g[..., d:])
@@ -277,7 +277,7 @@ class ExactParts:
         functions, d, linear = self.rest[part - 1], self.ndof, self.linear
         assert linear is not None
         y = self._state(part, X, 0 * X, filters)
-        phi = 1.0 if filters is None else self.by_class(matching(filters, X))
+        phi = 1.0 if filters is None else self.by_class(like(filters, X))
         v = self.inverse_masses(X) * phi * linear.slopes(functions.gradient(y, *t)[..., :d])
         v = linear.positions(phi * v)
         return phi * linear.slopes(functions.hessian_vector(y, v, *t))
@@ -289,7 +289,7 @@ class ExactParts:
 
     def _state(self, part: int, X: Array, Y: Array, filters: Array | None) -> Array:
         """[q, p] at which a part acts; of one of positions with p = 0, which it does not see."""
-        X = X if filters is None else self.by_class(matching(filters, X)) * X
+        X = X if filters is None else self.by_class(like(filters, X)) * X
         if not self.rest[part - 1].of_positions:
             return self.from_modes(X, Y)
         q = self._positions(X)
@@ -310,13 +310,6 @@ def each_mode(value: Any) -> Any:
     return value[..., None] if getattr(value, "ndim", 0) else value
 
 
-def matching(value: Any, x: Array) -> Array:
-    """Times or filters in the library, dtype and device of `x`."""
-    if is_tensor(value):
-        return value.to(dtype=x.dtype, device=x.device)
-    return like(np.asarray(value), x)
-
-
 SPLITTER = 134217729.0  # 2²⁷ + 1
 
 
@@ -331,11 +324,7 @@ def shears(kinds: Sequence[str], rates: Array, s: Array) -> tuple[Array, Array, 
 
     The flow is X ← cX + dY, Y ← cY − dX, where c and d are 0 or ±1, then X ← X + tY, Y ← Y − σX, X ← X + tY.
     """
-    module: Any = np
-    if is_tensor(s):
-        import torch
-
-        module = torch
+    module = library(s)
     theta = rates * s
     k, r = _reduced(theta, 0.0 if is_tensor(s) else _low(rates, s, theta), module)
     one, zero = 1 + 0 * theta, 0 * theta

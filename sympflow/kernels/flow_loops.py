@@ -94,7 +94,7 @@ class PrimedFlowKernel(Kernel):
     def __init__(
         self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False, step: ArrayStep | None = None
     ) -> None:
-        if system.friction is not None and compensated:
+        if system.friction and compensated:
             raise ValueError(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
@@ -106,7 +106,7 @@ class PrimedFlowKernel(Kernel):
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated
-        self._step = None if system.friction is None else step
+        self._step = step if system.friction else None
         self._ranges = self._splitting.ranges(tables.level, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:

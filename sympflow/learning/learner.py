@@ -282,7 +282,7 @@ def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
     if not isinstance(known, HamiltonianSystem):
         raise TypeError(f"`known` must be a HamiltonianSystem, a part of H; got {known!r}.")
     symbols = known.symbols
-    if symbols is None or known.ndof != d or not known.autonomous or known.friction is not None:
+    if symbols is None or known.ndof != d or not known.autonomous or known.friction:
         raise ValueError(
             f"`known` must be a symbolic system of {d} degrees of freedom that depends on no time and has no friction: "
             "define it by HamiltonianSystem.from_sympy."
@@ -855,7 +855,7 @@ class Search:
         flow.figures = {**flow.figures, **self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
         self._check_flow(flow)
         flow.history = self.history
-        damping = None if system.friction is None else system.friction.damping.tolist()
+        damping = None if system.damping is None else system.damping.tolist()
         flow.recipe = {**flow.recipe, "learned": {**self._learned, "damping": damping}}
         flow.take_learned(system)
         return flow
@@ -946,7 +946,7 @@ class Search:
     @staticmethod
     def _energy(flow: FlowMap, states: np.ndarray) -> np.ndarray:
         """𝓗 of the flow at states (n, 2d), averaged over [0, Δt]; with friction H."""
-        if flow.system is not None and flow.system.friction is not None:  # the maps of a damped flow have no 𝓗
+        if flow.system is not None and flow.system.friction:  # the maps of a damped flow have no 𝓗
             return flow.system.hamiltonian(states)
         x = torch.as_tensor(states)
         times = flow.dt * np.arange(OVER_TIMES) / (OVER_TIMES - 1)

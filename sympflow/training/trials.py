@@ -179,7 +179,7 @@ def _long_work(
     """The estimated work of those that are nearly as good as the best, by their energy errors in long runs."""
     near = [start for start in sorted(work, key=work.__getitem__) if work[start] <= NEAR * min(work.values())][:NEAREST]
     flows = [flow for start in near if (flow := found[start].flow) is not None]
-    if len(near) < 2 or len(flows) < len(near) or not (system.autonomous and system.conservative):
+    if len(near) < 2 or len(flows) < len(near) or not system.keeps_energy:
         return {}
     errors = long_errors(flows, system, domain)
     return {

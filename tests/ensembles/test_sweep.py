@@ -66,7 +66,7 @@ def test_a_failed_orbit_is_a_row():
 
 
 def test_no_orbit_is_asked_when_its_solution_becomes_infinite(monkeypatch):
-    monkeypatch.setattr("sympflow.solver.note_singularities", lambda *_: 1 / 0)
+    monkeypatch.setattr("sympflow.integrators.diagnosis.note_singularities", lambda *_: 1 / 0)
     states = np.array([STATES[0], [60.0, 60.0, 0.0, 0.0]])
     result = sympflow.ensemble(SYSTEM, "verlet", SPAN, states, dt=DT, reduce="final")
     assert result.status.tolist() == [0, -1]
