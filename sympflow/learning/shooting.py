@@ -482,7 +482,7 @@ class Problem:
     def normal(self, theta: np.ndarray, states: np.ndarray, stop: Stop = lambda: False) -> Normal:
         """The normal equations at a point, as far as its orbits are finite."""
         N, m, n = len(states), 2 * self.model.ndof, 0 if self.frozen else self.model.n
-        made = Normal(*(np.zeros(shape) for shape in ((N, m, m), (N, m, n), (n, n), (N, m), n)), 0.0)
+        made = Normal(np.zeros((N, m, m)), np.zeros((N, m, n)), np.zeros((n, n)), np.zeros((N, m)), np.zeros(n), 0.0)
         for batch in self.batches:
             size = len(batch.index)
             A, B, a = np.zeros((m, m, size)), np.zeros((m, n, size)), np.zeros((m, size))
@@ -625,14 +625,14 @@ def minimized(
     """Levenberg–Marquardt steps until `patience` of them together gain less than this share of the cost."""
     start = theta, states
     try:
-        first = problem.normal(*start, stop)
+        first = problem.normal(theta, states, stop)
     except OutOfTime:
         first = problem.normal(theta, np.full_like(states, np.nan))  # which ends at once
     known: dict[str, Any] = {"here": (start, first), "tried": (None, None)}
 
     def normal_at(x: Any) -> Normal:
         found = next((normal for point, normal in known.values() if point is x and normal is not None), None)
-        return problem.normal(*x, stop) if found is None else found
+        return problem.normal(x[0], x[1], stop) if found is None else found
 
     def model_at(x: Any) -> _Arrow:
         known["here"] = x, normal_at(x)
@@ -640,8 +640,8 @@ def minimized(
         return _Arrow(x, known["here"][1], scale, problem.frozen)
 
     def cost(x: Any, attempt: int) -> float:
-        known["tried"] = x, None if attempt else problem.normal(*x, stop)  # the first is mostly taken
-        return problem.cost(*x, stop) if attempt else known["tried"][1].cost
+        known["tried"] = x, None if attempt else problem.normal(x[0], x[1], stop)  # the first is mostly taken
+        return problem.cost(x[0], x[1], stop) if attempt else known["tried"][1].cost
 
     scale, costs = np.diagonal(normal_at(start).C).copy(), [normal_at(start).cost]
     if not math.isfinite(costs[0]):
