@@ -498,14 +498,11 @@ class SplittingCode(Rollouts):
                 entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
         return entries
 
-    def own_columns(self, table: np.ndarray, values: np.ndarray, width: int) -> Columns:
-        """The columns of trajectories with their own values (N, n) of the parameters."""
+    def own_entries(self, table: np.ndarray, values: np.ndarray) -> Columns:
+        """The numbers of the columns of trajectories with their own values of the parameters."""
         kinds, n = self._kinds_of(table), len(table) - self._own
         rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
-        entries = self._entries(rows, kinds, (len(values),))
-        groups = -(-len(values) // width)
-        full = np.concatenate([entries, np.repeat(entries[..., -1:], groups * width - len(values), axis=-1)], axis=-1)
-        return np.ascontiguousarray(full.reshape(*full.shape[:2], groups, width).transpose(2, 0, 1, 3)), kinds
+        return np.moveaxis(self._entries(rows, kinds, (len(values),)), -1, 0), kinds
 
     def step_rows(
         self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
