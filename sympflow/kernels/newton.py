@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value
-from sympflow.compiler.functions import added, fma, where
+from sympflow.compiler.functions import added, fma, is_zero, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
 from sympflow.kernels.one_steps import Lettered, OneStep, recorded
@@ -349,7 +349,7 @@ class _InMemory(NewtonCode):
             code.store(code.operand(x, DOUBLE), g, m)
         for j, row in enumerate(hessian):
             for k, x in enumerate(row):
-                if not _is_zero(x):
+                if not is_zero(x):
                     code.store(code.operand(x, DOUBLE), S, j * n + k)
 
     def _fill_sizes(self, code: Code, state: Value, K: Value, M: Value, sizes: Value) -> None:
@@ -456,7 +456,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
     rows = [[*row, value, weight] for row, value, weight in zip(M, x, weights, strict=True)]
     for k in range(n):
         for i in range(k + 1, n):
-            if _is_zero(rows[i][k]):
+            if is_zero(rows[i][k]):
                 continue
             better = abs(rows[i][k]) * rows[i][-1] > abs(rows[k][k]) * rows[k][-1]
             for j in range(k, n + 2):
@@ -464,7 +464,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
                 rows[k][j], rows[i][j] = where(better, b, a), where(better, a, b)
         inverse = 1.0 / rows[k][k]
         for row in rows[k + 1 :]:
-            if _is_zero(row[k]):
+            if is_zero(row[k]):
                 continue
             factor = -(row[k] * inverse)
             for j in range(k + 1, n + 1):
@@ -482,7 +482,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
 def _total(terms: Sequence[Any]) -> Any:
     total: Any = 0.0
     for x in terms:
-        total = x if _is_zero(total) else total + x
+        total = x if is_zero(total) else total + x
     return total
 
 
@@ -492,12 +492,8 @@ def _larger(a: Any, b: Any) -> Any:
 
 def _largest(values: Sequence[Any]) -> Any:
     """The largest absolute value."""
-    moving = [abs(x) for x in values if not _is_zero(x)]
+    moving = [abs(x) for x in values if not is_zero(x)]
     return reduce(_larger, moving) if moving else 0.0
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, float) and x == 0.0
 
 
 def _fill(code: Code, place: Value, count: int) -> None:

@@ -16,6 +16,7 @@ import sympy as sp
 
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import INT, Rows, Value
+from sympflow.compiler.functions import is_zero
 from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -277,5 +278,5 @@ class Terms:
                 values = [x[place] for x in given for place in places]
                 values += [code.splat(code.load(constants, term * m + j), type.width) for j in range(m)]
                 for (rows, place), y in zip(targets(places), program(*values, *letters), strict=True):
-                    if not (isinstance(y, float) and y == 0):
+                    if not is_zero(y):
                         rows[place] = rows[place] + y
