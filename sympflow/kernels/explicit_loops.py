@@ -11,13 +11,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import sympy as sp
 
-from sympflow.compiler.control import DOUBLE, POINTER, Module, Value
+from sympflow.compiler.control import DOUBLE, POINTER, Module, Rows, Value
 from sympflow.compiler.machine import compiled, host
 from sympflow.compiler.program import Program, gradient
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, add_terms, recorded
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, recorded
 from sympflow.kernels.runs import Numbers, Room
-from sympflow.kernels.terms import families, is_large
+from sympflow.kernels.terms import Terms, is_large
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
 
@@ -88,8 +88,9 @@ class Field:
         self.ndof = system.ndof
         self._damping = None if system.friction is None else system.friction.matrix(self.ndof)
         self.rates = [] if self._damping is None else self._damping[self._damped].tolist()
-        self._families = families(self.lettered.expressions[0], (*symbols.q, *symbols.p)) if self.large else []
-        self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]
+        H, given = self.lettered.expressions[0], self.lettered.given
+        self._terms = Terms(H, (*symbols.q, *symbols.p), given) if self.large else None
+        self.data = [] if self._terms is None else [*self._terms.data]
         if self._damping is not None:
             self.data.append(np.ascontiguousarray(self._damping))
 
@@ -147,10 +148,9 @@ class Field:
         given = [code.load(letters, k) for k in range(len(self.lettered.given))]
         with code.over(n) as m:
             code.store(code.constant(0.0), g, m)
-        for i, family in enumerate(self._families):
-            found = recorded([family.f], (*family.x, *family.c, *self.lettered.given))
-            slopes = Program(found.inputs, gradient(found.outputs[0], found.inputs[: len(family.x)]))
-            add_terms(family, data[2 * i : 2 * i + 2], slopes, y, given, lambda places: [(g, m) for m in places])
+        slope = Rows(g, DOUBLE)
+        assert self._terms is not None
+        self._terms.add(data, self._terms.slopes, [Rows(y, DOUBLE)], given, lambda places: [(slope, m) for m in places])
         with code.over(d) as m:
             code.store(code.load(g, m + d), out, m)
             force = -code.load(g, m)

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Type, Value
-from sympflow.compiler.functions import added, fma, where
+from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value
+from sympflow.compiler.functions import added, fma, is_zero, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
-from sympflow.kernels.one_steps import Lettered, OneStep, add_terms, recorded
+from sympflow.kernels.one_steps import Lettered, OneStep, recorded
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
-from sympflow.kernels.terms import families, is_large
+from sympflow.kernels.terms import Terms, is_large
 
 __all__ = ["newton_code"]
 
@@ -217,9 +217,9 @@ class _InMemory(NewtonCode):
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
         super().__init__(lettered, tableau, compensated, damped)
         symbols = lettered.symbols
-        self._large = is_large(symbols)
-        self._families = families(lettered.expressions[0], (*symbols.q, *symbols.p)) if self._large else []
-        self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]
+        H, y = lettered.expressions[0], (*symbols.q, *symbols.p)
+        self._terms = Terms(H, y, lettered.given) if is_large(symbols) else None
+        self.data = [] if self._terms is None else self._terms.data
         n, N = self.n_out, self.unknowns
         self._numbers = self.size + self.stages * len(self.lettered.letters)
         self._sizes = [N, self._numbers, N * self._wide, n, n, n * n, N]
@@ -334,34 +334,23 @@ class _InMemory(NewtonCode):
         n, letters = self.n_out, len(self.lettered.letters)
         given = [code.load(numbers, 1 + k) for k in range(self.parameters)]
         given += [code.load(numbers, i * letters + (self.size + k)) for k in range(letters)]
-        if self._large:
-            self._add_terms(code, given, Y, g, S, data)
+        if self._terms is not None:  # a loop over the terms of each kind
+            _fill(code, g, n)
+            _fill(code, S, n * n)
+            slope, rows = Rows(g, DOUBLE), Rows(S, DOUBLE)
+
+            def targets(places: list[Value]) -> list[tuple[Rows, Value]]:
+                return [(slope, m) for m in places] + [(rows, i * n + j) for i in places for j in places]
+
+            self._terms.add(data, self._terms.hessians, [Rows(Y, DOUBLE)], given, targets)
             return
-        slope, hessian = self._square(self.slopes(*(code.load(Y, m) for m in range(n)), *given))
-        for m, x in enumerate(slope):
+        slopes, hessian = self._square(self.slopes(*(code.load(Y, m) for m in range(n)), *given))
+        for m, x in enumerate(slopes):
             code.store(code.operand(x, DOUBLE), g, m)
         for j, row in enumerate(hessian):
             for k, x in enumerate(row):
-                if not _is_zero(x):
+                if not is_zero(x):
                     code.store(code.operand(x, DOUBLE), S, j * n + k)
-
-    def _add_terms(
-        self, code: Code, given: Sequence[Value], Y: Value, g: Value, S: Value, data: Sequence[Value]
-    ) -> None:
-        """The same by a loop over the terms of each kind."""
-        n = self.n_out
-        _fill(code, g, n)
-        _fill(code, S, n * n)
-
-        def targets(places: list[Value]) -> list[tuple[Value, Value]]:
-            return [(g, m) for m in places] + [(S, row * n + column) for row in places for column in places]
-
-        for i, family in enumerate(self._families):
-            program = recorded([family.f], (*family.x, *family.c, *self.lettered.given))
-            x = program.inputs[: len(family.x)]
-            slope = gradient(program.outputs[0], x)
-            both = Program(program.inputs, [*slope, *(entry for s in slope for entry in gradient(s, x))])
-            add_terms(family, data[2 * i : 2 * i + 2], both, Y, given, targets)
 
     def _fill_sizes(self, code: Code, state: Value, K: Value, M: Value, sizes: Value) -> None:
         """The reciprocal size of each unknown: of its variable, or of the largest of its kind where that is 0."""
@@ -467,7 +456,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
     rows = [[*row, value, weight] for row, value, weight in zip(M, x, weights, strict=True)]
     for k in range(n):
         for i in range(k + 1, n):
-            if _is_zero(rows[i][k]):
+            if is_zero(rows[i][k]):
                 continue
             better = abs(rows[i][k]) * rows[i][-1] > abs(rows[k][k]) * rows[k][-1]
             for j in range(k, n + 2):
@@ -475,7 +464,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
                 rows[k][j], rows[i][j] = where(better, b, a), where(better, a, b)
         inverse = 1.0 / rows[k][k]
         for row in rows[k + 1 :]:
-            if _is_zero(row[k]):
+            if is_zero(row[k]):
                 continue
             factor = -(row[k] * inverse)
             for j in range(k + 1, n + 1):
@@ -493,7 +482,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
 def _total(terms: Sequence[Any]) -> Any:
     total: Any = 0.0
     for x in terms:
-        total = x if _is_zero(total) else total + x
+        total = x if is_zero(total) else total + x
     return total
 
 
@@ -503,12 +492,8 @@ def _larger(a: Any, b: Any) -> Any:
 
 def _largest(values: Sequence[Any]) -> Any:
     """The largest absolute value."""
-    moving = [abs(x) for x in values if not _is_zero(x)]
+    moving = [abs(x) for x in values if not is_zero(x)]
     return reduce(_larger, moving) if moving else 0.0
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, float) and x == 0.0
 
 
 def _fill(code: Code, place: Value, count: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from sympflow.compiler.control import INT, Code, Value
+from sympflow.compiler.control import Code, Value
 from sympflow.compiler.program import Program, traced
 from sympflow.hamiltonian.driving import with_letters
 from sympflow.hamiltonian.recorded import check_recorded, evaluator
@@ -20,10 +20,9 @@ from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.samples import check_samples, sampled_value
 from sympflow.kernels.stage_times import letters_of_time
-from sympflow.kernels.terms import Family
 from sympflow.kernels.threads import given
 
-__all__ = ["Lettered", "OneStep", "OneStepKernel", "add_terms", "recorded"]
+__all__ = ["Lettered", "OneStep", "OneStepKernel", "recorded"]
 
 
 def recorded(expressions: Sequence[sp.Expr], inputs: Sequence[sp.Symbol]) -> Program:
@@ -77,35 +76,6 @@ class Lettered:
         values = [sampled_value(symbols.samples[f.name_of_samples], f.order, of_time(f.at)) for f in sampled]
         program = recorded(expressions, (symbols.time, *symbols.parameters, *sampled.values()))
         return [t.code.operand(x, t.type) for x in program(t, *parameters, *values)]
-
-
-def add_terms(
-    family: Family,
-    data: Sequence[Value],
-    values: Program,
-    y: Value,
-    given: Sequence[Value],
-    targets: Callable[[list[Value]], list[tuple[Value, Value]]],
-) -> None:
-    """Add the values of each term of a kind, of its coordinates, constants and the given numbers, in a loop.
-
-    Parameters
-    ----------
-    data : two addresses
-        Of the family's coordinates and constants.
-    y : Value
-        The address of the state.
-    targets : callable
-        From the places of a term's coordinates to those of its values: addresses and indices.
-    """
-    (coordinates, constants), code, k, n = data, y.code, len(family.x), len(family.c)
-    with code.over(len(family.coordinates)) as term:
-        places = [code.load(coordinates, term * k + j, INT) for j in range(k)]
-        numbers = [code.load(y, place) for place in places]
-        numbers += [code.load(constants, term * n + j) for j in range(n)]
-        for (target, place), x in zip(targets(places), values(*numbers, *given), strict=True):
-            if not (isinstance(x, float) and x == 0):
-                code.store(code.load(target, place) + x, target, place)
 
 
 class OneStep(Rollouts):

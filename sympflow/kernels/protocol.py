@@ -237,18 +237,3 @@ class Kernel:
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int] | None:
         """Count the evaluations of the system's functions in a run; None where the method itself counts them."""
         return None
-
-    def reach_times(
-        self,
-        h: float,
-        y0: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        numbers: tuple[float, ...] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The states of rows of `y0` (N, 2d) at elapsed times, of steps that are equal in another time.
-
-        See `elapsed_times.reach_times`. None where there is no such pass.
-        """
-        return None

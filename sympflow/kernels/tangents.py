@@ -16,7 +16,7 @@ import numpy as np
 
 from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, Value
-from sympflow.compiler.functions import dot, fma
+from sympflow.compiler.functions import dot, is_zero, summed
 from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
@@ -115,7 +115,7 @@ class Linearised(Shape):
         made, d, positions = self.made, self.d, [self.made.node(x) for x in q]
         for i in range(d):
             for j in range(d):
-                if not _is_zero(slants[d * i + j]):
+                if not is_zero(slants[d * i + j]):
                     positions[i] = made.moved(positions[i], slants[d * i + j], made.written(p[j]))
         return positions
 
@@ -142,26 +142,14 @@ def _vector_moved(
     """A vector (q, p) after a stage, of the derivatives that its program gives after the state."""
     n = d * (d + 1) // 2
     bend, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
-    p = [_summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
-    q = [_summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
-    return q, [_summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
+    p = [summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
+    q = [summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
+    return q, [summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
 
 
 def _place(i: int, j: int) -> int:
     """The place of an entry of a symmetric matrix, of which the rows are known to the diagonal."""
     return max(i, j) * (max(i, j) + 1) // 2 + min(i, j)
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, float) and x == 0.0
-
-
-def _summed(total: Any, factors: Sequence[Any], x: Sequence[Value]) -> Any:
-    """total + Σ factor·x."""
-    for factor, value in zip(factors, x, strict=True):
-        if not _is_zero(factor):
-            total = fma(factor, value, total)
-    return total
 
 
 class TangentCode(SplittingCode):
