@@ -295,62 +295,46 @@ class TangentKernel:
             np.ones(N, dtype=bool),
         )
         table = self._loops.rows(run_table(self._scheme, h), h)
+        width = self._width
+
+        def follow(looks: np.ndarray, rows: np.ndarray, carry: Carry) -> np.ndarray:
+            """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
+            work = table.shape[1] * self._code.n_out / 2
+            task = Task(0.0, start[rows], int(looks[-1]), looks, carry, threads=threads)
+            run = run_states(partial(self._code.run, table), task, self._code.n_values, work)
+            w = run.states[..., width:-k].reshape(*run.states.shape[:2], k, width)
+            w = w if scale is None else w * scale
+            with np.errstate(all="ignore"):
+                growth = LOG_2 * run.states[..., -k:] + 0.5 * np.log(np.einsum("nmki,nmki->nmk", w, w))
+                W = w.swapaxes(-1, -2).reshape(-1, width, k)
+                spreads = np.full(w.shape[:2], np.nan) if spread is None else spread(W).reshape(w.shape[:2])
+            known = looks <= run.n_finite[:, None]
+            below = known & (spreads < limit)
+            last = np.where(below.any(1), below.argmax(1), len(looks) - 1)
+            known &= np.arange(len(looks)) <= last[:, None]
+            first, end = np.searchsorted(save, [looks[0], looks[-1] + 1])
+            where, each = np.searchsorted(looks, save[first:end]), np.arange(len(rows))
+            if len(where):
+                columns = np.arange(first, end)
+                found.growth[rows[:, None], :, columns] = np.where(known[:, where, None], growth[:, where], np.nan)
+                found.spread[rows[:, None], columns] = np.where(known[:, where], spreads[:, where], np.nan)
+            failed = ~below.any(1) & (run.n_finite < looks[-1])
+            found.growth[rows, :, -1] = np.where(failed[:, None], np.nan, growth[each, last])
+            found.spread[rows, -1] = np.where(failed, np.nan, spreads[each, last])
+            found.n_steps[rows] = np.where(failed, run.n_finite, looks[last])
+            found.whole[rows] = ~failed
+            return failed | below.any(1)
+
         size = max(64, AT_ONCE // (n * some))
         for first in range(0, N, size):
             rows, carry = np.arange(first, min(first + size, N)), Carry()
             for i in range(0, len(looks), some):
-                piece = looks[i : i + some]
-                ended = self._followed(
-                    table, start[rows], piece, save, found, rows, carry, spread, limit, scale, threads
-                )
+                ended = follow(looks[i : i + some], rows, carry)
                 if ended.any():
                     rows, carry.running, carry.spare = rows[~ended], carry.running[~ended], None
                 if not len(rows):
                     break
         return found
-
-    def _followed(
-        self,
-        table: np.ndarray,
-        start: np.ndarray,
-        looks: np.ndarray,
-        save: np.ndarray,
-        found: TangentRun,
-        rows: np.ndarray,
-        carry: Carry,
-        spread: Callable[[np.ndarray], np.ndarray] | None,
-        limit: float,
-        scale: np.ndarray | None,
-        threads: int | None,
-    ) -> np.ndarray:
-        """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
-        code, k = self._code, self.vectors
-
-        work = table.shape[1] * code.n_out / 2
-        task = Task(0.0, start, int(looks[-1]), looks, carry, threads=threads)
-        run = run_states(partial(code.run, table), task, code.n_values, work)
-        w = run.states[..., self._width : -k].reshape(*run.states.shape[:2], k, self._width)
-        w = w if scale is None else w * scale
-        with np.errstate(all="ignore"):
-            growth = LOG_2 * run.states[..., -k:] + 0.5 * np.log(np.einsum("nmki,nmki->nmk", w, w))
-            W = w.swapaxes(-1, -2).reshape(-1, self._width, k)
-            spreads = np.full(w.shape[:2], np.nan) if spread is None else spread(W).reshape(w.shape[:2])
-        known = looks <= run.n_finite[:, None]
-        below = known & (spreads < limit)
-        last = np.where(below.any(1), below.argmax(1), len(looks) - 1)
-        known &= np.arange(len(looks)) <= last[:, None]
-        first, end = np.searchsorted(save, [looks[0], looks[-1] + 1])
-        where, each = np.searchsorted(looks, save[first:end]), np.arange(len(rows))
-        if len(where):
-            columns = np.arange(first, end)
-            found.growth[rows[:, None], :, columns] = np.where(known[:, where, None], growth[:, where], np.nan)
-            found.spread[rows[:, None], columns] = np.where(known[:, where], spreads[:, where], np.nan)
-        failed = ~below.any(1) & (run.n_finite < looks[-1])
-        found.growth[rows, :, -1] = np.where(failed[:, None], np.nan, growth[each, last])
-        found.spread[rows, -1] = np.where(failed, np.nan, spreads[each, last])
-        found.n_steps[rows] = np.where(failed, run.n_finite, looks[last])
-        found.whole[rows] = ~failed
-        return failed | below.any(1)
 
 
 def _looks(save: np.ndarray, n_steps: int, limit: float) -> np.ndarray:
