@@ -33,7 +33,7 @@ from sympflow.integrators.contract import (
 from sympflow.integrators.grid import Grid, distinct
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel

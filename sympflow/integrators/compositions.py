@@ -29,8 +29,7 @@ from sympflow.integrators.contract import Failure
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, scheme_evaluations
 
 if TYPE_CHECKING:
-    from sympflow.kernels.carry import Carry
-    from sympflow.kernels.protocol import Kernel
+    from sympflow.kernels.protocol import Carry, Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()

@@ -18,8 +18,8 @@ from sympflow.integrators.base import KernelStepper, OwnStepper, Problem, Steppe
 from sympflow.integrators.contract import Failure
 
 if TYPE_CHECKING:
-    from sympflow.kernels.carry import Carry
     from sympflow.kernels.one_steps import OneStepKernel
+    from sympflow.kernels.protocol import Carry
 
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
 _SYMPLECTIC = (
@@ -103,7 +103,7 @@ class Gauss(OwnStepper):
         return True
 
     def own_stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
-        from sympflow.kernels.implicit_loops import implicit_kernel
+        from sympflow.kernels.newton import implicit_kernel
 
         told: list[str] = []
         kernel = compiled_loops(

@@ -23,8 +23,7 @@ from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.schemes import CORRECTORS, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
-    from sympflow.kernels.carry import Carry
-    from sympflow.kernels.protocol import Kernel
+    from sympflow.kernels.protocol import Carry, Kernel
     from sympflow.kernels.tangents import TangentKernel
 
 

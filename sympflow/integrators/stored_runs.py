@@ -11,7 +11,7 @@ from sympflow.arrays import Array, finite_states
 from sympflow.integrators.contract import INTERRUPTED, Outcome, Problem, finished, interrupted
 from sympflow.integrators.grid import Grid, Outputs, distinct
 from sympflow.integrators.windows import ARRAY_STEPS, MOST_SAVED, ONE, Pace, Pieces, Steps
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 from sympflow.storage.runs import Place, RunStore
 
 COUNTED = ("force_evaluations", "hessian_evaluations", "curvature_evaluations", "newton_iterations")

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from functools import cached_property, reduce
 from itertools import pairwise
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -19,12 +20,13 @@ from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value
 from sympflow.compiler.functions import added, fma, is_zero, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
-from sympflow.kernels.one_steps import Lettered, OneStep, recorded
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, recorded
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.terms import Terms, is_large
 
-__all__ = ["newton_code"]
+__all__ = ["implicit_kernel", "newton_code"]
 
 TOLERANCE = 1e-11  # of a relative increment: convergence is quadratic, so what is left is below rounding
 ROUNDING = 1e-9  # increments below this that no longer shrink are rounding
@@ -32,6 +34,51 @@ SMALLEST = 1e-150  # of a size whose reciprocal is multiplied by other numbers
 MOST_IN_REGISTERS = 4  # unknowns
 ABREAST = 4  # numbers of a row of a matrix that are changed together
 LONG = 4e6  # operations between two looks for a stop
+
+
+def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
+    """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
+
+    Raises
+    ------
+    ValueError
+        If the system cannot be compiled, with the reason.
+    """
+    kernels = _KERNELS.setdefault(system, {})
+    if (tableau, compensated) not in kernels:
+        kernels[tableau, compensated] = _kernel(system, tableau, compensated)
+    return kernels[tableau, compensated]
+
+
+_KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneStepKernel]] = WeakKeyDictionary()
+
+
+def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
+    written = system.written
+    if written is None:
+        raise ValueError(
+            "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
+            "or use backend='array'."
+        )
+    friction = system.friction
+    if friction is not None and compensated:
+        raise ValueError("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
+    if friction is not None and friction.damping.ndim == 2:
+        raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
+    symbols = written if is_large(written) else written.parametric
+    lettered = Lettered(symbols, [symbols.H])
+    code = newton_code(lettered, tableau, compensated, friction is not None)
+    single = newton_code(lettered, tableau, False, False) if compensated else code
+    if friction is None:
+        return OneStepKernel(code, single)
+    rates = np.broadcast_to(friction.rates, system.ndof)
+    exponents = np.outer([*stage_nodes(tableau), 1.0], rates).ravel()
+
+    def growths(h: np.ndarray) -> np.ndarray:
+        """e^{γτ} at the stages and the end of steps, and their reciprocals."""
+        return np.exp(np.concatenate([h[:, None] * exponents, -h[:, None] * exponents], axis=1))
+
+    return OneStepKernel(code, single, growths)
 
 
 def newton_code(lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> NewtonCode:
