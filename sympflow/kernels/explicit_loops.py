@@ -9,15 +9,14 @@ from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import sympy as sp
 
 from sympflow.compiler.control import DOUBLE, POINTER, Module, Rows, Value
 from sympflow.compiler.machine import compiled, host
 from sympflow.compiler.program import Program, gradient
+from sympflow.hamiltonian.formulas import Letter, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, recorded
+from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
 from sympflow.kernels.runs import Numbers, Room
-from sympflow.kernels.terms import Terms, is_large
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
 
@@ -77,19 +76,18 @@ class Field:
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
-        symbols, force = system.symbols, system.external_force
+        symbols, force = system.form, system.external_force
         assert symbols is not None
         forces = getattr(force, "expressions", None)
-        if force is not None and forces is None:
+        if force is not None and (forces is None or system.symbols is None):
             raise ValueError("`system` has a force that is no formula, which is not compiled: use backend='array'.")
         self.large = is_large(symbols) and force is None
         symbols = symbols if is_large(symbols) else symbols.parametric
-        self.lettered = Lettered(symbols, [symbols.H, *(forces or [])])
+        self.lettered = lettered(symbols, [symbols.H, *(forces or [])])
         self.ndof = system.ndof
         self._damping = None if system.friction is None else system.friction.matrix(self.ndof)
         self.rates = [] if self._damping is None else self._damping[self._damped].tolist()
-        H, given = self.lettered.expressions[0], self.lettered.given
-        self._terms = Terms(H, (*symbols.q, *symbols.p), given) if self.large else None
+        self._terms = terms_of(self.lettered) if self.large else None
         self.data = [] if self._terms is None else [*self._terms.data]
         if self._damping is not None:
             self.data.append(np.ascontiguousarray(self._damping))
@@ -108,7 +106,7 @@ class Field:
     def program(self) -> Program:
         """f, from q, p, the parameters, the letters and the numbers of Γ."""
         symbols, d, n = self.lettered.symbols, self.ndof, 2 * self.ndof
-        rates = sp.symbols(f"rate_:{len(self.rates)}")
+        rates = [Letter(f"rate_{i}") for i in range(len(self.rates))]
         inputs = (*symbols.q, *symbols.p, *self.lettered.given, *rates)
         found = recorded([*self.lettered.expressions, *rates], inputs)
         slope = gradient(found.outputs[0], found.inputs[:n])

@@ -20,11 +20,12 @@ from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value
 from sympflow.compiler.functions import added, fma, is_zero, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
+from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, recorded
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, terms_of
+from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
-from sympflow.kernels.terms import Terms, is_large
 
 __all__ = ["implicit_kernel", "newton_code"]
 
@@ -54,7 +55,7 @@ _KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneSte
 
 
 def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
-    written = system.written
+    written = system.written or system.form
     if written is None:
         raise ValueError(
             "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
@@ -66,9 +67,9 @@ def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> O
     if friction is not None and friction.damping.ndim == 2:
         raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
     symbols = written if is_large(written) else written.parametric
-    lettered = Lettered(symbols, [symbols.H])
-    code = newton_code(lettered, tableau, compensated, friction is not None)
-    single = newton_code(lettered, tableau, False, False) if compensated else code
+    of_time = with_letters(symbols, [symbols.H])
+    code = newton_code(of_time, tableau, compensated, friction is not None)
+    single = newton_code(of_time, tableau, False, False) if compensated else code
     if friction is None:
         return OneStepKernel(code, single)
     rates = np.broadcast_to(friction.rates, system.ndof)
@@ -264,8 +265,7 @@ class _InMemory(NewtonCode):
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
         super().__init__(lettered, tableau, compensated, damped)
         symbols = lettered.symbols
-        H, y = lettered.expressions[0], (*symbols.q, *symbols.p)
-        self._terms = Terms(H, y, lettered.given) if is_large(symbols) else None
+        self._terms = terms_of(lettered) if is_large(symbols) else None
         self.data = [] if self._terms is None else self._terms.data
         n, N = self.n_out, self.unknowns
         self._numbers = self.size + self.stages * len(self.lettered.letters)

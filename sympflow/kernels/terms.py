@@ -18,7 +18,7 @@ from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import INT, Rows, Value
 from sympflow.compiler.functions import is_zero
 from sympflow.compiler.program import Program, gradient, tangent, traced
-from sympflow.hamiltonian.recorded import evaluator
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
