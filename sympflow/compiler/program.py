@@ -12,7 +12,7 @@ import numpy as np
 from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.numbers import Number
 
-__all__ = ["Program", "Traced", "derivatives", "fused", "gradient", "tangent", "traced"]
+__all__ = ["Program", "Traced", "adjoint", "derivatives", "fused", "gradient", "tangent", "traced"]
 
 
 class Traced(Number):
@@ -290,6 +290,16 @@ def tangent(outputs: Sequence[Any], x: Sequence[Traced], v: Sequence[Any]) -> li
                     total = total + partial * dots[a.order]
             dots[number.order] = total
     return [dots.get(y.order, 0.0) if isinstance(y, Traced) else 0.0 for y in outputs]
+
+
+def adjoint(program: Program) -> Program:
+    """Return the program from the inputs, and from cotangents of the outputs behind them, to those of the inputs."""
+    recording = program.inputs[0].recording
+    cotangents = [recording.input(f"of_{i}") for i in range(len(program.outputs))]
+    total: Any = 0.0
+    for a, y in zip(cotangents, program.outputs, strict=True):
+        total = total + a * y
+    return fused(Program([*program.inputs, *cotangents], gradient(total, program.inputs)))
 
 
 def derivatives(outputs: Sequence[Any], x: Sequence[Traced]) -> list[list[Any]]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
-from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "aligned", "filled", "zeros"]
@@ -104,6 +104,12 @@ class Rollouts:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
         raise NotImplementedError
 
+    def adjoint(
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+    ) -> tuple[list[Value], list[Value]]:
+        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
+        raise NotImplementedError
+
     def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
         """One column of many states: see `sympflow.kernels.runs.Over`."""
         each(lambda values: self.stage(values, numbers, kind, step))
@@ -145,15 +151,18 @@ class Rollouts:
         return found
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "run", "run own" or "map"."""
-        memory = self.place
+        """Compile the function of a name: "run", "kept", "reverse", "slopes", each " own" too, or "map"."""
+        memory, (what, _, own_tables) = self.place, name.partition(" ")
+        if what in ("reverse", "slopes"):
+            given = self.n_values, self.n_out, self.size, self.adjoint, width, bool(own_tables), what == "slopes"
+            return reverse_function(*given)
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
-        own, over = name == "run own", self.over if self.chunked else None
-        return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over
-        )
+        own, kept = bool(own_tables), what == "kept"
+        over = self.over if self.chunked and not kept else None
+        given = self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing
+        return run_function(*given, over, kept)
 
     def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
         """Call the compiled function of a name with arrays and integers."""
@@ -220,12 +229,13 @@ class Rollouts:
         stop: np.ndarray,
         first: int,
         closed: bool,
+        kept: np.ndarray | None = None,
     ) -> None:
         """One row, or rows side by side; those that end early once more, by themselves, to find that end."""
         before = running.copy() if first > 0 else running
         rest = stop, first
         width = self.lanes if len(y0) >= self.fewest else 1
-        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width, counts)
+        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width, counts, kept)
         for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
             one = slice(i, i + 1)
             if len(before):
@@ -247,12 +257,13 @@ class Rollouts:
         closed: bool,
         width: int,
         counts: np.ndarray = NONE,
+        kept: np.ndarray | None = None,
     ) -> None:
-        states = y0[:, : self.n_out]
+        run, states = "run" if kept is None else "kept", y0[:, : self.n_out]
         if y0.shape[1] > self.n_out:
-            name, (entries, kinds) = "run own", self.own_columns(table, y0[:, self.n_out :], width)
+            name, (entries, kinds) = f"{run} own", self.own_columns(table, y0[:, self.n_out :], width)
         else:
-            name, (entries, kinds) = "run", self.prepared(table)
+            name, (entries, kinds) = run, self.prepared(table)
         begun = int(save.searchsorted(0, "right")) if len(save) and save[0] <= 0 else 0
         if begun:
             out[:, :begun] = states[:, None]
@@ -267,7 +278,7 @@ class Rollouts:
         left = np.empty((len(y0), self.n_values)) if keeps or self.counted else running
         given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps
         outlets = later if len(later) else NEVER, len(later), outputs  # an empty array has no address
-        self.call(name, width, *given, *outlets, n_finite, left, int(keeps or self.counted), stop)
+        self.call(name, width, *given, *outlets, n_finite, left, int(keeps or self.counted), stop, *(() if kept is None else (kept,)))
         if apart:
             out[:, begun:] = outputs
         if self.counted:

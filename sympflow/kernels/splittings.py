@@ -8,6 +8,7 @@ of many in lanes, maps, single steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -15,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import Type, Value
+from sympflow.compiler.control import Type, Value, Variable
 from sympflow.compiler.functions import FUNCTIONS, added, times
-from sympflow.compiler.program import Program, Traced, derivatives, gradient, traced
+from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.approximations import OnInterval, Ranges, on_interval
@@ -425,9 +426,11 @@ class SplittingCode(Rollouts):
         if not self.timed:
             return [numbers(i) for i in range(len(table.outputs))]
         code, given = step.code, [numbers(i, lone=True) for i in range(self.size)]
+        return [code.operand(x, type) for x in table(*self._lettered(self._time(given, step), given))]
+
+    def _time(self, given: Sequence[Value], step: Value) -> Value:
         before, first, length = given[self._clock]
-        time = first + (code.convert("sitofp", step, "double") * length + before)
-        return [code.operand(x, type) for x in table(*self._lettered(time, given))]
+        return first + (step.code.convert("sitofp", step, "double") * length + before)
 
     @cached_property
     def _clock(self) -> slice:
@@ -441,6 +444,64 @@ class SplittingCode(Rollouts):
         assert driving is not None
         fixed = given[clock.stop :]
         return [*given[: clock.start], *fixed, *driving.values_at(time, given[0], fixed)]
+
+    # the reverse --------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _adjoints(self) -> list[Program]:
+        """Of the stage of each kind: the state, the numbers of a column, the time if it counts, and the cotangents."""
+        if any(isinstance(kind, WithinRange) for kind in self._kinds):
+            raise NotImplementedError("kicks that are polynomials in a range of positions have no reverse.")
+        if not self.timed:
+            return [adjoint(kind.body) for kind in self._kinds]
+        names = [f"x_{i}" for i in range(self.n_values)], [f"number_{i}" for i in range(self.size)]
+
+        def stage(body: Arranged, numbers: Sequence[Any]) -> list[Any]:
+            state, given, time = numbers[: self.n_values], numbers[self.n_values : -1], numbers[-1]
+            return body.body(*state, *body.table(*self._lettered(time, given)))
+
+        return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._kinds]
+
+    def check_reverse(self) -> None:
+        try:
+            self._adjoints  # noqa: B018
+        except (NotImplementedError, AttributeError, TypeError) as error:
+            raise ValueError(f"`system` has stages without a compiled reverse: {error}") from error
+
+    def adjoint(
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+    ) -> tuple[list[Value], list[Value]]:
+        code, type = step.code, values[0].type
+        zero = code.constant(0.0, type)
+        found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
+        for k, program in enumerate(self._adjoints):
+            n = len(program.inputs) - 2 * self.n_values - self.timed
+            column = [numbers(i, lone=True) for i in range(n)]
+            if self.timed:
+                column.append(self._time(column, step))
+            with code.given(code.apply("eq", (kind, k))) if len(self._adjoints) > 1 else nullcontext():
+                results = [code.operand(x, type) for x in program(*values, *column, *cotangents)]
+                for result, x in zip(found, results, strict=False):
+                    result.value = x
+        return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
+
+    def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+        """From cotangents (m, size, …) of the numbers of columns to those of the numbers of a table (n, m, …)."""
+        if self.timed:
+            return slopes.swapaxes(0, 1)
+        found, kinds = np.zeros((len(table), *np.delete(slopes.shape, 1))), self._kinds_of(table)
+        for k, program in enumerate(self._of_tables):
+            columns = kinds == k
+            n = len(program.inputs) - len(table)
+            with np.errstate(all="ignore"):
+                rows = program(*(row[columns] for row in table), *(slopes[columns, i] for i in range(n)))
+            for i, row in enumerate(rows):
+                found[i, columns] = row
+        return found
+
+    @cached_property
+    def _of_tables(self) -> list[Program]:
+        return [adjoint(kind.table) for kind in self._kinds]
 
     @property
     def given_numbers(self) -> int:
