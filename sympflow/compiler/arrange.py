@@ -39,10 +39,13 @@ class Arranged(NamedTuple):
         From the constants of a run to the numbers that `body` reads.
     body : Program
         From the states and the outputs of `table` to the results.
+    plain : Program
+        The same up to rounding, with results that may be made of one another: shorter, and soon differentiated.
     """
 
     table: Program
     body: Program
+    plain: Program
 
 
 class Polynomial(Number):
@@ -122,10 +125,13 @@ class Arrangement:
         self.states = [self.letter(node) for node in self._states]
         self.constants = [Polynomial(self, {(): x}) for x in self._constants]
 
-    def finish(self, outputs: Sequence[Any]) -> Arranged:
+    def finish(self, outputs: Sequence[Any], plain: Sequence[Any] | None = None) -> Arranged:
         """Return the programs of outputs: numbers of `body`, see `written`."""
-        body = Program([*self._states, *self._entries.values()], outputs)
-        return Arranged(Program(self._constants, self._from_table), body)
+        inputs = [*self._states, *self._entries.values()]
+        body = Program(inputs, outputs)
+        return Arranged(
+            Program(self._constants, self._from_table), body, body if plain is None else Program(inputs, plain)
+        )
 
     # polynomials --------------------------------------------------------------------------------------------------
 

@@ -147,6 +147,7 @@ class Shape:
         self.errors = made.states[2 * self.d :]
         self.number = dict(zip(splitting.numbers, made.constants, strict=True))
         self.values = [self.number[s.name] for s in symbols.parameters]
+        self.plain: list[Any] = []
 
     def arranged(self) -> tuple[int, Arranged]:
         """The cost of the stage, and its programs."""
@@ -161,7 +162,7 @@ class Shape:
         else:
             positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
-        arranged = made.finish(outputs)
+        arranged = made.finish(outputs, self.plain and [*self.plain, *momenta, *errors])
         return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
 
     def _kicked(self) -> list[Any]:
@@ -222,11 +223,13 @@ class Shape:
             moves = self._velocity(momenta, self.number["a"])
             return [made.written(q + x) for q, x in zip(self.q, moves, strict=True)], momenta
         positions = [made.node(q) for q in self.q]
+        self.plain = [*positions]
         for i in range(d):
             for j in range(d):
                 if M[i, j] != 0:
                     factor = made.written(made.number(times(self.number["a"], self._of_parameters(M[i, j]))))
                     positions[i] = made.moved(positions[i], factor, momenta[j])
+                    self.plain[i] = made.operation("fma", factor, momenta[j], self.plain[i])
         return positions, momenta
 
     def _damped(self, name: str, momenta: Sequence[Any]) -> list[Any]:
@@ -453,12 +456,12 @@ class SplittingCode(Rollouts):
         if any(isinstance(kind, WithinRange) for kind in self._kinds):
             raise NotImplementedError("kicks that are polynomials in a range of positions have no reverse.")
         if not self.timed:
-            return [adjoint(kind.body) for kind in self._kinds]
+            return [adjoint(kind.plain) for kind in self._kinds]
         names = [f"x_{i}" for i in range(self.n_values)], [f"number_{i}" for i in range(self.size)]
 
         def stage(body: Arranged, numbers: Sequence[Any]) -> list[Any]:
             state, given, time = numbers[: self.n_values], numbers[self.n_values : -1], numbers[-1]
-            return body.body(*state, *body.table(*self._lettered(time, given)))
+            return body.plain(*state, *body.table(*self._lettered(time, given)))
 
         return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._kinds]
 
