@@ -15,7 +15,6 @@ _HOME = {
     "Ball": "hamiltonian.domain",
     "Box": "hamiltonian.domain",
     "EnergySublevel": "hamiltonian.domain",
-    "ClusterStates": "hamiltonian.cluster_states",
     "LatticeStates": "hamiltonian.lattice_states",
     "Tube": "hamiltonian.domain",
     "time_transformed": "hamiltonian.time_transformation",

@@ -26,10 +26,7 @@ _MOST_SAMPLES = 100_000_000
 
 
 def check_t_span(t_span: Any, ends_by_event: bool | None = None) -> tuple[float, float]:
-    """Return the start and end, two finite numbers; the end may be infinite if the run `ends_by_event`.
-
-    None where there are no events that could end it.
-    """
+    """Return the start and end, two finite numbers; the end may be infinite if the run `ends_by_event`."""
     plain = type(t_span) is tuple and len(t_span) == 2 and {type(t_span[0]), type(t_span[1])} <= _PLAIN
     if not plain:
         check_not_followed("t_span", t_span)
@@ -258,15 +255,7 @@ def plain(value: Any) -> Any:
 
 
 def writable(path: Any) -> Path:
-    """`path` of a file to be written, its folder made.
-
-    Raises
-    ------
-    TypeError
-        If it is no path.
-    ValueError
-        If it is a folder, or its folder cannot be made.
-    """
+    """`path` of a file to be written, its folder made."""
     if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
         raise TypeError(f"`path` must be a file name or a pathlib.Path; got {type(path).__name__}.")
     file = Path(os.fsdecode(path))

@@ -265,10 +265,7 @@ class Solution:
 
 
 class StoredSolution(Solution):
-    """A solution whose outputs are in a store, from which `t` and `y` are read whenever they are asked for.
-
-    Nothing is kept of them: hold on to ``y = sol.y`` where it is needed more than once.
-    """
+    """A solution whose outputs are in a store, from which `t` and `y` are read whenever they are asked for."""
 
     store: RunStore | None = None
 
@@ -374,10 +371,7 @@ def check_solution(sol: object, name: str = "sol") -> None:
 
 
 def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> np.ndarray:
-    """H(y(t)) − H(y0) in float64, (..., n): the metric `sympflow.energy_error`, where it is documented.
-
-    The warning that the error is absolute is attributed to the caller `stacklevel` frames up.
-    """
+    """H(y(t)) − H(y0) in float64, (..., n): the metric `sympflow.energy_error`, where it is documented."""
     sol.system.check_conservative(
         "so its energy is lost and no error",
         "use sympflow.conformal_defect(sol), which is 0 for the exact flow, or sympflow.reference_error(sol)",
@@ -402,10 +396,7 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
 
 
 def _energy(sol: Solution, y: Array, t: Any) -> np.ndarray:
-    """H in float64, whatever the precision of the run, of each trajectory at its states (..., k, 2d) or (..., 2d).
-
-    `t` is the time of the states, of a driven system: a number, or (k,).
-    """
+    """H in float64, whatever the precision of the run, of each trajectory at its states (..., k, 2d) or (..., 2d)."""
     states = to_numpy(y).astype(float)
     with np.errstate(all="ignore"):
         if sol.rows is not None and not sol.rows.uniform and sol.system.autonomous:
@@ -427,13 +418,7 @@ def gathered(sol: Solution, measure: Callable[[Solution], Any]) -> Any:
 def joined(
     pieces: Sequence[tuple[np.ndarray, Solution]], system: HamiltonianSystem, y0: Array, rows: ParameterRows
 ) -> Solution:
-    """One solution of solutions (k, 2d, n) of some trajectories each, by their places in the flattened batch.
-
-    Raises
-    ------
-    ValueError
-        If their outputs are at other times.
-    """
+    """One solution of solutions (k, 2d, n) of some trajectories each, by their places in the flattened batch."""
     first = pieces[0][1]
     for _, part in pieces[1:]:
         if not np.array_equal(part.t, first.t):

@@ -380,11 +380,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
 
 
 def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
-    """The solution of a batch whose trajectories have parameters of their own.
-
-    Those whose values are numbers of one run are solved together, and where the method or the system has no such run,
-    those of equal values.
-    """
+    """The solution of a batch whose trajectories have parameters of their own."""
     states = problem.y0.reshape(-1, problem.y0.shape[-1])
     groups = []
     alike = action == "ignore" and problem.system.between_impulses is problem.system
@@ -535,11 +531,7 @@ def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> N
 
 
 def _run_endless(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
-    """The outcome of a run to an infinite end, and the problem with the end that was reached.
-
-    Where the method looks for events as it goes, and its grid costs nothing, it is one run, of `MOST_OPEN_STEPS` at
-    most; else there are ever longer ones.
-    """
+    """The outcome of a run to an infinite end, and the problem with the end that was reached."""
     search, size = problem.events, math.prod(problem.y0.shape)
     assert search is not None
     length = integrator.step_length(problem.system) or problem.system.dt

@@ -19,6 +19,26 @@ def test_a_name_and_a_formula_are_systems(system):
     np.testing.assert_array_equal(sol.y, solve(H(SPRING), "verlet", (0, 1), [1, 0], dt=0.1).y)
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda system: sympflow.compare(system, ["verlet"], t_span=(0, 1), repeats=1),
+        lambda system: sympflow.ensemble(system, "verlet", (0, 1)),
+        lambda system: sympflow.frequencies(system, "verlet", (0, 20)),
+        lambda system: sympflow.gali(system, "verlet", (0, 1)),
+        lambda system: sympflow.escape_times(system, "verlet", (0, 1)),
+        lambda system: sympflow.poincare_section(system, "verlet", (0, 1)),
+        lambda system: sympflow.stability(system, ["verlet"], t_span=(0, 1)),
+        lambda system: sympflow.choose_step(system, "verlet", 1e-3),
+        sympflow.shipped_flows,
+    ],
+)
+def test_every_door_takes_the_name_of_a_scene(call):
+    call("henon-heiles")
+    with pytest.raises(ValueError, match=r"^`system` 'henon-heile' is the name of no scene. Did you mean"):
+        call("henon-heile")
+
+
 SAME = {
     "RK45": "rk45",
     "Verlet": "verlet",

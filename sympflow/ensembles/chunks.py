@@ -139,7 +139,7 @@ class Chunk:
         carry, last = Carry(), np.full(len(self), grid.n_steps)
         for start in range(0, grid.n_steps + 1, most):
             save = np.arange(start, min(start + most, grid.n_steps + 1))
-            y, last, _ = stepper.kernel.run_batch(grid.h, self.y0, int(save[-1]), save, carry=carry)
+            y, last, _ = stepper.kernel.run(grid.h, self.y0, int(save[-1]), save, carry=carry)
             ran_out = np.flatnonzero((last < save[-1]) & (self.status == 0))
             for row in ran_out.tolist():
                 self.fail(row, self._reason(grid.time(int(last[row])), ""))

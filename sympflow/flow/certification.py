@@ -229,7 +229,7 @@ def _orbit(flow: _Flow, system: HamiltonianSystem, y: np.ndarray, done: int, n: 
         orbit[::2] = tensors.cpu().numpy()
         orbit[1::2] = flow(torch.from_numpy(lengths).to(flow.device), tensors[:-1]).cpu().numpy()
         return orbit
-    orbit[::2] = kernel.run_batch(flow.dt, y, n, np.arange(n + 1)).states.swapaxes(0, 1)
+    orbit[::2] = kernel.run(flow.dt, y, n, np.arange(n + 1)).states.swapaxes(0, 1)
     rows = orbit[:-1:2].reshape(-1, y.shape[1])
     orbit[1::2] = kernel.step(lengths.ravel(), rows).states.reshape(n, *y.shape)
     return orbit

@@ -14,8 +14,7 @@ from sympflow.arrays import untransformed
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.records import Description, numbers_checksum, read
 from sympflow.flow.tables import PrimedShape, Tables, free_numbers, substeps_of
-from sympflow.hamiltonian.domain import states_of
-from sympflow.hamiltonian.local_states import DRAWN, LocalStates
+from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -98,11 +97,11 @@ class PrimedKnown(KnownFlow):
     def description_for(self, system: HamiltonianSystem) -> Description:
         """Return the description of the flow for another size of its system."""
         domain = self.domain
-        if isinstance(domain, LocalStates):
+        if isinstance(domain, LatticeStates):
             domain = domain.of(system)
         elif domain is not None:
             assert self.system is not None
-            domain = states_of(self.system, domain.sample(DRAWN)).of(system)
+            domain = LatticeStates.of_states(self.system, domain.sample(DRAWN)).of(system)
         return replace(self.description, domain=domain)
 
     def check_ends(self, system: HamiltonianSystem) -> None:
@@ -162,7 +161,7 @@ class FrozenFlow(PrimedKnown):
         tables = _tables(shape, record["dt"], arrays)
         flow = cls(path, shape, tables, system, Description.of_record(record, ndof))
         flow.check_system(system)
-        if isinstance(flow.domain, LocalStates):
+        if isinstance(flow.domain, LatticeStates):
             flow.domain = flow.domain.of(system)
         return flow
 

@@ -14,7 +14,7 @@ from sympflow.arrays import is_tensor, values
 from sympflow.flow.records import Description
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, same_system, without_friction
-from sympflow.hamiltonian.local_states import LocalStates
+from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 
@@ -58,7 +58,7 @@ class KnownFlow:
         Open intervals of t in which it was never compared with anything: those between the times of labels, if these
         were few and it was fitted to nothing else. Results there come with a warning.
     lattice_terms : mapping of str to str
-        The terms of a lattice or of like bodies, for messages; {} of another system.
+        The terms of a lattice, for messages; {} of another system.
     drive_times : (float, float) or None
         The interval of t0 + t that the flow of a drive without a period was fitted in: beyond it there is a warning.
     recipe, figures : dict
@@ -139,8 +139,7 @@ class KnownFlow:
         self.identity = Identity.of(small, domain)
 
     def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
-        """The system whose H the flow keeps to know another: of a lattice or like bodies, where their number is no part
-        of the flow, a few of them; else that system itself."""
+        """The system whose H the flow keeps to know another: a few sites of a lattice, else that system itself."""
         return system
 
     @property
@@ -232,7 +231,7 @@ class KnownFlow:
     def domain_for(self, system: HamiltonianSystem) -> Domain | None:
         """Return Ω of the flow, or else of its system, ready to be asked for states; None if neither has one."""
         domain = self.domain or system.domain
-        if isinstance(domain, LocalStates):
+        if isinstance(domain, LatticeStates):
             return domain.of(system)
         if isinstance(domain, EnergySublevel) and domain.hamiltonian is None:
             return system.domain if domain == system.domain else domain.attach(system.hamiltonian)

@@ -46,7 +46,7 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Substep, Tables, columns_of, substeps_of
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.fingerprint import check_for_flows
-from sympflow.hamiltonian.local_states import LocalStates
+from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.monomials import Monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, Scheme, compose, scheme_named
@@ -329,7 +329,7 @@ class PrimedFlow(PrimedKnown, SympFlow):
     def bind(self, system: HamiltonianSystem) -> Self:
         """Give a flow that was loaded from a file the V and T of its system; itself.
 
-        The flow of a lattice or of like bodies takes the size of the one that it is given.
+        The flow of a lattice takes the size of the one that it is given.
 
         Raises
         ------
@@ -341,7 +341,7 @@ class PrimedFlow(PrimedKnown, SympFlow):
         if system.ndof != self.ndof:
             self.ndof = system.ndof
             self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
-        if isinstance(self.domain, LocalStates):
+        if isinstance(self.domain, LatticeStates):
             self.domain = self.domain.of(system)
         return self
 
@@ -350,7 +350,7 @@ class PrimedFlow(PrimedKnown, SympFlow):
 
         They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
         exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
-        lattice, or of like bodies, they serve any other one of the same terms: `solve` takes the flow as it is.
+        lattice they serve any other one of the same terms: `solve` takes the flow as it is.
 
         Raises
         ------

@@ -213,10 +213,10 @@ def shipped_flows(system: HamiltonianSystem | None = None, kind: str | None = No
     --------
     >>> sympflow.shipped_flows(sympflow.systems.pendulum())
     """
-    from sympflow.hamiltonian.system import HamiltonianSystem
+    if system is not None:
+        from sympflow.systems.given import given_system
 
-    if system is not None and not isinstance(system, HamiltonianSystem):
-        raise TypeError(f"`system` must be a HamiltonianSystem; got {system!r}: leave it out for all flows.")
+        system = given_system(system)
     if kind not in (None, "sympflow", "mlp"):
         raise ValueError(f"`kind` {kind!r} is unknown: choose 'sympflow' or 'mlp', or leave it out.")
     found = [f for f in _catalogue() if kind in (None, f.kind)]

@@ -30,41 +30,14 @@ SHORTEST, LONGEST, SCANNED = 1e-4, 1e4, 4001
 """Distances between which a minimum of V is looked for."""
 FAR, REACH = (10.0, 100.0), 2.0
 """Bond lengths at which V must have fallen off faster than bodies grow in number, and which a cut-off must have."""
-FEW = 4, 7, 13
-"""Bodies of a piece in one, two and three dimensions."""
-JUDGED = 13
-"""Bodies of the cluster on which a flow is judged, where there are more."""
 MOST_WRITTEN = 45
 """Differences of coordinates of two bodies up to which pairs are written out: six bodies in space."""
-MANY = 8, 19, 38
-"""Bodies of a cluster of which long runs are made, in one, two and three dimensions."""
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
 """Pairs up to which the energy at the end of a run is always looked at, and steps beside which it costs nothing."""
-MOST_SHAKEN, SHAKEN, SHAKE = 13, 6, 0.3
-"""Bodies of clusters of which several minima are compared, their number, and how far their starts are apart."""
 
 
 class PairsHamiltonian(LocalHamiltonian):
-    """H = Σ_i |p_i|²/2m_i + Σ_{i<j} V(r_ij), see `HamiltonianSystem.pairs`.
-
-    Positions (..., d) are [q_1, …, q_n], `dim` coordinates each.
-
-    Attributes
-    ----------
-    n_bodies, dim : int
-    masses : ndarray of shape (n,)
-    box : ndarray of shape (dim,) or None
-    cutoff : float or None
-    softening : float
-    V : Expr
-        In the letters `s` = r², `first`, `second` and `c`.
-    columns : ndarray of shape (k, n)
-        The quantities of bodies that V depends on.
-    first, second : tuple of Symbol
-        Their letters, of the two bodies of a pair.
-    c : tuple of Symbol
-        Letters of the parameters, whose values are `constants`.
-    """
+    """H = Σ_i |p_i|²/2m_i + Σ_{i<j} V(r_ij), see `HamiltonianSystem.pairs`."""
 
     loops, noun = "pairs", "system of bodies"
     quadratic_kinetic = True
@@ -235,13 +208,11 @@ class PairsHamiltonian(LocalHamiltonian):
         return all((x == x[0]).all() for x in (self.masses, *self.columns))
 
     @property
-    def has_piece(self) -> bool:
-        return self.uniform and self.box is None and self.bond_length is not None
-
-    @property
     def apart(self) -> float:
         """A power of two near six bonds: bodies nearer than one repel each other, beside which all else is rounding."""
-        return 1.0 if not self.has_piece or self.bond_length is None else 2.0 ** round(math.log2(6 * self.bond_length))
+        return (
+            1.0 if self.box is not None or self.bond_length is None else 2.0 ** round(math.log2(6 * self.bond_length))
+        )
 
     @cached_property
     def bond_length(self) -> float | None:
@@ -269,91 +240,9 @@ class PairsHamiltonian(LocalHamiltonian):
         """V of two bodies at distances (n,), the first two bodies where they differ."""
         return Pairs(self, np.zeros(len(r), int), np.ones(len(r), int), [r[:, None]]).values(0)
 
-    def few(self) -> int:
-        """The number of bodies of a piece of which nothing else is said."""
-        return FEW[self.dim - 1]
-
-    def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
-        if boundary != "periodic":
-            raise TypeError("`boundary` is of lattices, and bodies in pairs have none: leave it out.")
-        if not self.has_piece:
-            raise TypeError(
-                "`system` has no piece: that is of bodies of one kind and mass, without `box`, which a potential of "
-                "short range with a minimum holds together. Make a smaller one by HamiltonianSystem.pairs."
-            )
-        n = self.few() if sites is None else plain(sites)
-        if not isinstance(n, int) or isinstance(n, bool) or n < 2:
-            raise ValueError(f"`sites` must be a number of bodies, 2 or more; got {sites!r}.")
-        other = copy.copy(self)
-        other._functions = self._functions  # of one pair, whatever their number
-        other.n_bodies, other.ndof = n, n * self.dim
-        other.masses, other.columns = np.full(n, self.masses[0]), np.repeat(self.columns[:, :1], n, axis=1)
-        other.masses.setflags(write=False)
-        other.inverse_mass = None if self.inverse_mass is None else np.full(other.ndof, self.inverse_mass[0])
-        return other
-
     @property
     def numbers(self) -> int:
         return 4 * self.dim * self.n_bodies * (self.n_bodies - 1)
-
-    def judged(self) -> tuple[Any, ...]:
-        return (JUDGED,) if self.n_bodies > JUDGED else ()
-
-    def many(self) -> tuple[Any, ...]:
-        return (MANY[self.dim - 1],)
-
-    @cached_property
-    def terms(self) -> dict[str, str]:
-        if not self.has_piece:
-            return {}
-        put: dict[Any, Any] = dict(zip(self.c, self.constants, strict=True))
-        for row in (self.first, self.second):
-            put |= {a: column[0] for a, column in zip(row, self.columns, strict=True)}
-        put = {a: sp.Integer(int(v)) if float(v).is_integer() else sp.Float(float(v)) for a, v in put.items()}
-        V = self.V.xreplace(put).subs(self.s, sp.Symbol("r", positive=True) ** 2)
-        cutoff = "none" if self.cutoff is None else f"{self.cutoff:.9g}"
-        return {
-            "pair potential": str(V),
-            "softening": f"{self.softening:.9g}",
-            "cut-off": cutoff,
-            "mass": f"{self.masses[0]:.9g}",
-            "number of coordinates of a body": str(self.dim),
-        }
-
-    def minimum(self, near: np.ndarray | None = None) -> np.ndarray:
-        """Positions (d,) in a minimum of V: the one next to given positions, or to a ball of a close packing."""
-        from scipy.optimize import minimize
-
-        length = self.bond_length
-        assert length is not None
-        starts = [] if near is None else [near]
-        if near is None:
-            few = self.n_bodies <= MOST_SHAKEN
-            starts = [length * _packed(self.n_bodies, self.dim, hollow).ravel() for hollow in (False, True)[: 1 + few]]
-            shakes = np.random.default_rng(0).standard_normal((SHAKEN * few, self.ndof))
-            starts += list(starts[0] + SHAKE * length * shakes)
-        with np.errstate(all="ignore"):
-            found = [
-                minimize(
-                    lambda q: (float(self.potential(q)), self.potential_gradient(q)), x, jac=True, method="L-BFGS-B"
-                )
-                for x in starts
-            ]
-        x = min(found, key=lambda m: m.fun if np.isfinite(m.fun) else np.inf).x.reshape(self.n_bodies, self.dim)
-        return (x - x.mean(0)).ravel()
-
-    def pressed_energy(self, y: np.ndarray) -> np.ndarray:
-        """The kinetic energy of each body, and its half of that of the pairs that are closer than at rest: (..., n)."""
-        length = self.bond_length
-        assert length is not None
-        p = self._of_bodies(y[..., self.ndof :])
-        energy = (p * p).sum(-1, keepdims=True) / (2 * self.masses[:, None])
-        least = float(self._of_distance(np.array([length]))[0])
-        for pairs in self._pairs(y[..., : self.ndof]):
-            close = pairs.s < length**2 + self.softening**2
-            half = np.where(close, pairs.values(0) - least, 0.0)[..., None] / 2
-            energy = _added(_added(energy, pairs.i, half), pairs.j, half)
-        return energy[..., 0]
 
     @property
     def slopes(self) -> list[sp.Expr]:
@@ -403,10 +292,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return not self.softening and self.n_bodies > 1
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
-        """By an energy that is off by more than T + |V| of the start, and a T of more than twice that.
-
-        Unless V by array operations takes long beside the run.
-        """
+        """By an energy that is off by more than T + |V| of the start, and a T of more than twice that."""
         pairs = self.n_bodies * (self.n_bodies - 1) // 2
         T0, T = ((self._of_bodies(y[:, self.ndof :]) ** 2).sum(-1) @ (0.5 / self.masses) for y in (starts, ends))
         found = T > 2 * T0
@@ -561,16 +447,6 @@ def _added(out: Array, ends: np.ndarray, values: Array) -> Array:
     places = np.add.outer(np.add.outer(n * k * np.arange(many), k * ends), np.arange(k))
     sums = np.bincount(places.ravel(), weights=values.ravel(), minlength=many * n * k)
     return out + sums.reshape(out.shape).astype(out.dtype)
-
-
-def _packed(n: int, dim: int, hollow: bool) -> np.ndarray:
-    """The n points next to one, or to a hollow, of the closest packing in `dim` dimensions, 1 apart: (n, dim)."""
-    axes = np.array([[1.0, 0, 0], [0.5, 0.75**0.5, 0], [0.5, 12**-0.5, (2 / 3) ** 0.5]])[:dim, :dim]
-    reach = 2 + math.ceil((2 * n) ** (1 / dim))
-    steps = np.arange(-reach, reach + 1)
-    points = np.stack(np.meshgrid(*[steps] * dim), axis=-1).reshape(-1, dim) @ axes
-    away = np.linalg.norm(points - hollow * axes.sum(0) / (dim + 1), axis=-1)
-    return points[np.argsort(away.round(9), kind="stable")[:n]]
 
 
 def _checked_dim(dim: Any) -> int:

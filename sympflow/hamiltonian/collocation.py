@@ -77,10 +77,7 @@ def stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times:
 
 
 def _tensor_stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times: Any) -> tuple[Array, int]:
-    """`stages` of tensors: solved without a graph, then three more iterations in it, which give it derivatives.
-
-    They are Newton's with the matrix of the solution held fixed: each makes derivatives of one more order right.
-    """
+    """`stages` of tensors: solved without a graph, then three more iterations in it, which give it derivatives."""
     import torch
 
     A, _, scale = (torch.as_tensor(c, dtype=y.dtype, device=y.device) for c in tableau)
@@ -96,11 +93,7 @@ def _tensor_stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any
 
 
 def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, times: Any, A: Any, scale: Any) -> tuple[Any, int]:
-    """The K of `stages` for tensors, by the same iteration, and its count over all states.
-
-    Under `torch.func.vmap` it runs until the last lane has converged; where a graph is traced, which cannot depend on
-    values, `TRACED_ITERATIONS` times.
-    """
+    """The K of `stages` for tensors, by the same iteration, and its count over all states."""
     import torch
 
     eps = torch.finfo(y.dtype).eps

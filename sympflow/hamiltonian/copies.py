@@ -105,16 +105,7 @@ def distance(x: Array, s: np.ndarray) -> Array:
 
 
 def coupling_strength(system: HamiltonianSystem) -> float:
-    """The default ω: the fastest rate of the linearised motion, see `fastest_rate`.
-
-    The copies stay together where the coupling is as strong as what drives them apart; far stronger, its frequency asks
-    for shorter steps.
-
-    Raises
-    ------
-    ValueError
-        If there is neither a y0 nor a domain.
-    """
+    """The default ω: the fastest rate of the linearised motion, see `fastest_rate`."""
     rate = fastest_rate(system)
     if rate is None:
         raise ValueError(

@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_number, checked_states, floats, sample_count, vector
 from sympflow.arrays import Array, to_numpy
-from sympflow.hamiltonian.cluster_states import ClusterStates
 from sympflow.hamiltonian.lattice_states import LatticeStates
-from sympflow.hamiltonian.local_states import LocalStates
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
@@ -255,34 +253,18 @@ class EnergySublevel:
 
 def domain_of(domain: Domain, system: Hamiltonian) -> Domain:
     """The domain of a system, ready to be asked for states: one that depends on H gets that of the system."""
-    return domain.of(system) if isinstance(domain, EnergySublevel | LocalStates) else domain
-
-
-OF_ANY_SIZE: dict[str, type[LocalStates]] = {"lattice": LatticeStates, "pairs": ClusterStates}
-"""The states of systems by one piece, by the `loops` of these."""
+    return domain.of(system) if isinstance(domain, EnergySublevel | LatticeStates) else domain
 
 
 def remedy_for(system: Hamiltonian) -> str:
     """Domains that a system of which none is known may be given, as code."""
     local = system.local
-    own = [OF_ANY_SIZE[local.loops].__name__ + "(density)"] if local is not None and local.has_piece else []
+    own = ["LatticeStates(density)"] if local is not None and local.has_piece else []
     names = [*own, "Box(low, high)", "Ball(center, radius)", "EnergySublevel(energy, box)"]
     return ", ".join(f"sympflow.{name}" for name in names[:-1]) + f" or sympflow.{names[-1]}"
 
 
-def states_of(system: Hamiltonian, states: np.ndarray) -> LocalStates:
-    """The domain of any size that states (..., 2d) of a system by one piece are of.
-
-    Raises
-    ------
-    ValueError
-        If they have no energy above that of the system at rest, or there is no such domain.
-    """
-    assert system.local is not None
-    return OF_ANY_SIZE[system.local.loops].of_states(system, states)
-
-
-def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel | LocalStates | Tube:
+def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel | LatticeStates | Tube:
     """The domain that `to_dict` described.
 
     Raises
@@ -304,8 +286,6 @@ def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel
                 return EnergySublevel(box=box, **_numbers(fields))
             case "LatticeStates":
                 return LatticeStates(**_numbers(fields))
-            case "ClusterStates":
-                return ClusterStates(**_numbers(fields))
             case "Tube":
                 return Tube(**_numbers(fields))
     except (KeyError, TypeError, ValueError) as error:

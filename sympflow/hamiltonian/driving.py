@@ -29,22 +29,7 @@ MOST_TURNS = 1000
 
 
 class Samples:
-    """A function of t by the polynomials of a SciPy spline, a parameter of H.
-
-    Parameters
-    ----------
-    spline : PPoly, BPoly or BSpline of scipy.interpolate
-        Of one variable and real values, as `CubicSpline(t, a)` or `make_interp_spline(t, a)` makes them.
-
-    Attributes
-    ----------
-    c : ndarray of shape (k, n)
-        The coefficients of the n polynomials, the highest powers of t − x[i] first.
-    x : ndarray of shape (n + 1,)
-        The ends of their intervals, which increase.
-    periodic : bool
-        True if the spline goes on beyond its ends periodically; if not, a run beyond them is refused.
-    """
+    """A function of t by the polynomials of a SciPy spline, a parameter of H."""
 
     def __init__(self, c: np.ndarray, x: np.ndarray, periodic: bool) -> None:
         self.c, self.x, self.periodic = c, x, periodic
@@ -53,13 +38,7 @@ class Samples:
 
     @classmethod
     def of(cls, name: str, spline: Any) -> Samples:
-        """Return the samples of a SciPy spline that is given as a parameter.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If it is none, or not one of real values of one variable.
-        """
+        """Return the samples of a SciPy spline that is given as a parameter."""
         if isinstance(spline, Samples):
             return spline
         from scipy.interpolate import BPoly, BSpline, PPoly
@@ -214,10 +193,7 @@ def _on_tensors(samples: Samples, t: Any, order: int) -> Any:
 
 
 class sampled(sp.Function):
-    """A derivative of samples in an expression: sampled(name, order, t), of order −1 the antiderivative.
-
-    The name is that of the parameter with the digest of its samples.
-    """
+    """A derivative of samples in an expression: sampled(name, order, t), of order −1 the antiderivative."""
 
     nargs = 3
     is_real = True
@@ -263,13 +239,7 @@ DURATION = sp.Symbol("duration", real=True)
 
 
 def drift(slope: tuple[sp.Expr, ...], time: sp.Symbol | None) -> tuple[sp.Expr, ...]:
-    """∫_t^{t+s} ∇T(p, u) du, an expression in p, t and s, which is `DURATION`, for each entry of the slope ∇T(p, t).
-
-    Raises
-    ------
-    ValueError
-        If a term of ∇T is no product of a function of p and one of t of which the integral is elementary.
-    """
+    """∫_t^{t+s} ∇T(p, u) du, an expression in p, t and s, which is `DURATION`, for each entry of the slope ∇T(p, t)."""
     return tuple(sp.Add(*[_integrated(term, time) for term in sp.Add.make_args(_sum_of(f, time))]) for f in slope)
 
 
@@ -317,13 +287,7 @@ def _not_elementary(term: sp.Expr, time: sp.Symbol) -> ValueError:
 
 
 def check_span(samples: Mapping[str, Samples], t0: float, t1: float) -> None:
-    """Refuse a run that leaves the times of samples, beyond which a spline is no more than its last polynomial.
-
-    Raises
-    ------
-    ValueError
-        With the samples' times.
-    """
+    """Refuse a run that leaves the times of samples, beyond which a spline is no more than its last polynomial."""
     for name, each in samples.items():
         low, high = each.span
         if not each.periodic and not (low <= min(t0, t1) and max(t0, t1) <= high):

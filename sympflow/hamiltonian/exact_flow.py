@@ -18,11 +18,7 @@ def reference_step(
     check: Callable[[], None] = lambda: None,
     t0: np.ndarray | None = None,
 ) -> np.ndarray:
-    """φ_H,t(x) by DOP853, for states x (n, 2d): (n, 2d), with NaN where the solution does not exist.
-
-    `check` is called at every evaluation of the vector field, and may raise to end it. `t0` (n,) are the times of the
-    states, of a driven system.
-    """
+    """φ_H,t(x) by DOP853, for states x (n, 2d): (n, 2d), with NaN where the solution does not exist."""
     scale = np.abs(x).max(0)
     scale = np.where(scale > 0, scale, 1.0)
 

@@ -58,25 +58,7 @@ class Unreadable(ValueError):
 
 
 def read(text: str, names: Collection[str] = ()) -> sp.Expr:
-    """The expression that a text states.
-
-    Parameters
-    ----------
-    text : str
-        ``^`` is the same as ``**``.
-    names : collection of str
-        Names that are symbols even if they are constants or functions otherwise.
-
-    Returns
-    -------
-    sympy.Expr
-        Its symbols are real.
-
-    Raises
-    ------
-    Unreadable
-        If the text is not an expression of the kind described, or a larger one than anything can be done with.
-    """
+    """The expression that a text states."""
     if len(text) > MAX_TEXT:
         raise Unreadable(
             f"it has {len(text):,} characters, more than {MAX_TEXT:,}: a system that large is better given by one site "
@@ -95,13 +77,7 @@ def read(text: str, names: Collection[str] = ()) -> sp.Expr:
 
 
 def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
-    """A SymPy expression as `read` gives one of a text: a number, its symbols real; of a matrix with one entry that.
-
-    Raises
-    ------
-    Unreadable
-        If it is no number, or one that is not real or not finite wherever it is evaluated, or too long to be.
-    """
+    """A SymPy expression as `read` gives one of a text: a number, its symbols real; of a matrix with one entry that."""
     shape = getattr(expression, "shape", ())
     if shape == (1, 1):
         expression = expression[0, 0]

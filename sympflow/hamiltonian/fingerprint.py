@@ -32,10 +32,7 @@ PROBES = 8
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction.
-
-    Of a driven system each of the 8 has its own time, at which H at the ninth is taken too.
-    """
+    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction."""
     states = _fixed_states(system.ndof)
     if system.local is not None:
         states[:, : system.ndof] *= system.local.apart
@@ -66,21 +63,7 @@ def _close(u: np.ndarray, v: np.ndarray) -> bool:
 
 
 def check_for_flows(system: Hamiltonian, takes_friction: bool = False, takes_driving: bool = False) -> None:
-    """Refuse a system of which a flow would leave something out: friction, a force that is none of H, or the time.
-
-    Parameters
-    ----------
-    system : Hamiltonian
-    takes_friction : bool
-        True for flows that hold the friction −Γp.
-    takes_driving : bool
-        True for flows that take the time.
-
-    Raises
-    ------
-    ValueError
-        With the reason.
-    """
+    """Refuse a system of which a flow would leave something out: friction, a force that is none of H, or the time."""
     if system.external_force is not None or not takes_friction:
         system.check_conservative(
             "which trained flows have only where they are primed, with H = ½ pᵀM⁻¹p + V(q)",
@@ -106,21 +89,7 @@ Known = WeakKeyDictionary["Hamiltonian", bool]
 
 @dataclass(eq=False)
 class Identity:
-    """The H of a system as a flow keeps it, to know it again all over its domain, and along a run.
-
-    It tells nothing of friction, of which the fingerprint has Γ.
-
-    A fingerprint probes H near the origin alone, and two systems may agree there and differ where the flow is used.
-
-    Attributes
-    ----------
-    states : ndarray of shape (n, 2d)
-        States of Ω, its extreme ones among them; n may be 0.
-    energies : ndarray of shape (n,)
-        H there.
-    expression : str or None
-        H itself, of a symbolic system, if it is not longer than 20,000 characters.
-    """
+    """The H of a system as a flow keeps it, to know it again all over its domain, and along a run."""
 
     states: np.ndarray
     energies: np.ndarray
@@ -153,10 +122,7 @@ class Identity:
         return found
 
     def first_difference(self, system: Hamiltonian, states: np.ndarray | None = None) -> int | None:
-        """Return the index of the first of the states (n, 2d), by default its own, where H is another than a system's.
-
-        None if there is none, or where it cannot be told, as without an expression for other states than its own.
-        """
+        """The index of the first of the states (n, 2d), by default its own, where H differs from a system's."""
         if states is None:
             if not len(self.states):
                 return None
@@ -220,13 +186,7 @@ class Identity:
 
     @classmethod
     def from_dict(cls, description: Any, ndof: int) -> Self:
-        """Return the identity that `to_dict` described; None stands for what was not finite.
-
-        Raises
-        ------
-        ValueError
-            If the description is not one of an identity of d degrees of freedom.
-        """
+        """Return the identity that `to_dict` described; None stands for what was not finite."""
         names = {"states", "energies", "expression"}
         if not isinstance(description, Mapping) or set(description) != names:
             raise ValueError("it is not a table of states, energies and an expression")

@@ -22,26 +22,7 @@ _COORDINATE = re.compile(r"([qp])([1-9]\d*)?")
 
 
 class SymbolicForce:
-    """F(q, p) by expressions, one for each momentum: an `ExternalForce`.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        With symbols; its parameters are known by their names.
-    force : str, sympy.Expr or a list of d of these
-    params : mapping of str to float, optional
-        Values of further symbols.
-
-    Attributes
-    ----------
-    expressions : list of d sympy.Expr
-        In q1 … qd, p1 … pd and numbers.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `sympflow.doubled` says.
-    """
+    """F(q, p) by expressions, one for each momentum: an `ExternalForce`."""
 
     def __init__(self, system: HamiltonianSystem, force: Any, params: Mapping[str, float] | None) -> None:
         symbols = system.symbols

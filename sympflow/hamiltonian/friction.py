@@ -10,18 +10,7 @@ from sympflow.arrays import Array, is_tensor, library
 
 
 class Friction:
-    """The friction of a damped system, p' = −∂H/∂q − Γp.
-
-    Parameters
-    ----------
-    damping : ndarray of shape (), (d,) or (d, d)
-        Γ, symmetric and positive semi-definite, in its simplest form: see `matrices.damping`.
-
-    Attributes
-    ----------
-    rates : ndarray of shape () or (d,)
-        The eigenvalues of Γ, none negative.
-    """
+    """The friction of a damped system, p' = −∂H/∂q − Γp."""
 
     def __init__(self, damping: np.ndarray) -> None:
         self.damping = damping
@@ -54,10 +43,7 @@ class Friction:
         return -(p @ G) if G.ndim == 2 else -(G * p)
 
     def drift(self, p: Array, s: Any) -> tuple[Array, Array]:
-        """∫₀ˢ e^{−Γu}p du and e^{−Γs}p, for p (..., d) and times s: a number, or one that broadcasts against p.
-
-        By the first, times M⁻¹, a drift with friction moves q; the second is its momentum at the end. s has any sign.
-        """
+        """∫₀ˢ e^{−Γu}p du and e^{−Γs}p, for p (..., d) and times s: a number, or one that broadcasts against p."""
         rates = _like(self.rates, p)
         mean, decay = _factors(rates, s)
         if self._modes is None:

@@ -613,11 +613,7 @@ def _like(constant: np.ndarray, x: Array) -> Array:
 
 
 def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array, t: Any = None) -> Array:
-    """∇³V(q)(v, w), the derivative of ∇²V·w along v: (..., d), each, to (..., d).
-
-    Good to ε^⅘ of ∇³V, 1e-12 of it in float64, where the force changes on lengths ℓ like |q|; where ℓ is far below |q|
-    the rounding of q itself leaves (ε|q|/ℓ)^⅘.
-    """
+    """∇³V(q)(v, w), the derivative of ∇²V·w along v: (..., d), each, to (..., d)."""
     along, other = direction(v), direction(w)
     with np.errstate(all="ignore"):
         h = step(q, length_of_change(system, q, along, other, t))
@@ -639,11 +635,7 @@ def direction(v: Array) -> Array:
 
 
 def length_of_change(system: Hamiltonian, q: Array, along: Array, other: Array, t: Any = None) -> Array:
-    """ℓ = ‖∇V‖ / ‖∇²V v̂‖, on which the force changes along unit vectors v̂: (..., d) to (..., 1).
-
-    It does not depend on where the origin lies, as |q| does. Where ∇²V v̂ nearly vanishes it says nothing: then it is
-    (‖∇V‖ / ‖∇³V(v̂, ŵ)‖)^½, which is less. It is kept between √ε|q| and |q|, or 1 where that is more.
-    """
+    """ℓ = ‖∇V‖ / ‖∇²V v̂‖, on which the force changes along unit vectors v̂: (..., d) to (..., 1)."""
     xp = _library(q)
     force, change = _largest(system.force(q, t)), _largest(system.hessian_vector(q, along, t))
     first = _bounded(xp.where(change > 0, force / (change + (change == 0)), np.inf), q)

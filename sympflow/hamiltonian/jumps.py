@@ -147,24 +147,7 @@ def check_continuous(
     values: Mapping[sp.Symbol, Any] | None = None,
     names: Mapping[sp.Symbol, str] | None = None,
 ) -> None:
-    """Refuse an expression that jumps in some of its symbols, where a force would be infinite for no time at all.
-
-    Parameters
-    ----------
-    argument : str
-        Name of the argument, for messages.
-    f : sympy.Expr
-    states : iterable of Symbol
-    values : mapping of Symbol to float or ndarray, optional
-        Those of parameters in f. All other symbols are tried at values of all sizes.
-    names : mapping of Symbol to str, optional
-        Names of symbols as the user wrote them.
-
-    Raises
-    ------
-    ValueError
-        With the place and the values on both sides.
-    """
+    """Refuse an expression that jumps in some of its symbols, where a force would be infinite for no time at all."""
     states = set(states)
     refuse_deltas(argument, f, names)
     [f], _ = with_letters([f])
@@ -325,11 +308,7 @@ class Zeros:
         return np.where(np.abs(slope) * near > 1e-6 * np.abs(self._of_time(t + near)[0]), slope, 0.0)
 
     def within(self, low: float, high: float, step: float, most: int = MOST_TURNS) -> np.ndarray:
-        """Return the zeros between two times, of a periodic g those of the first `most` periods.
-
-        Of a g that is neither linear nor periodic those where its sign changes within a time `step`, in the first
-        `MOST_POINTS` of these times.
-        """
+        """Return the zeros between two times, of a periodic g those of the first `most` periods."""
         period = None if self.root is not None else self._period
         if self.root is not None:
             found = np.array([self.root])
@@ -439,13 +418,7 @@ class Impulse(sp.Function):
 def split_impulses(
     argument: str, H: sp.Expr, time: sp.Symbol | None, q: Iterable[sp.Symbol], p: Iterable[sp.Symbol]
 ) -> tuple[sp.Expr, dict[sp.Expr, sp.Expr]]:
-    """H without its delta functions of t, and the potential W(q, t) that each of them, δ(g(t)), multiplies, by g.
-
-    Raises
-    ------
-    ValueError
-        If one is not of t alone, a derivative, not linear in H, or multiplies momenta.
-    """
+    """H without its delta functions of t, and the potential W(q, t) that each of them, δ(g(t)), multiplies, by g."""
     q, p = set(q), set(p)
     rest: list[sp.Expr] = []
     found: dict[sp.Expr, sp.Expr] = {}
@@ -529,11 +502,7 @@ def common_period(f: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples] | 
 def has_period(
     H: sp.Expr, time: sp.Symbol, states: Iterable[sp.Symbol], samples: Mapping[str, Samples], period: float
 ) -> bool:
-    """Return True if H, up to a function of t alone, has a period: every term of it by its functions of t.
-
-    Where these have other periods, as cos(t) in cos(t)**2, or are rounded, as in t − floor(t), by values at times and
-    states of all sizes.
-    """
+    """Return True if H, up to a function of t alone, has a period: every term of it by its functions of t."""
     rng, states = np.random.default_rng(0), set(states)
     for term in sp.Add.make_args(H.replace(Impulse, sp.Abs)):
         if time not in term.free_symbols or not term.free_symbols & states:

@@ -38,26 +38,7 @@ WELLS, FAR = 8, 100.0
 
 
 class LatticeHamiltonian(LocalHamiltonian):
-    """H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), see `HamiltonianSystem.lattice`.
-
-    Positions (..., d) are those of the fields one after the other, each of the lattice's shape.
-
-    Attributes
-    ----------
-    shape : tuple of int
-    boundary : tuple of str
-        For each axis.
-    fields : tuple of str
-    params : dict of str to float or ndarray of that shape
-    U, T : Expr
-        U and T of one site, in the letters `x`, `p` and `c`.
-    bonds : dict of int to Expr
-        V by the distance of the ends of a bond, in the letters `r` and `c`.
-    x, p, r, v, w : tuple of Symbol
-        Letters of the fields: at a site, momenta, differences along a bond; and two directions.
-    c : tuple of Symbol
-        Letters of the parameters in the order of `params`.
-    """
+    """H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), see `HamiltonianSystem.lattice`."""
 
     loops = noun = "lattice"
 
@@ -331,11 +312,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     # the linear part ------------------------------------------------------------------------------------------------
 
     def linear_and_rest(self, interval: float) -> tuple[SpectralPart, list[Any]]:
-        """The quadratic terms of sites and bonds as they are written, in normal modes, and U(q), the rest of V.
-
-        Parameters of sites enter the linear part by their mean. At ends that are not periodic only bonds to the next
-        site have known modes, so that longer ones belong to the rest.
-        """
+        """The quadratic terms of sites and bonds as they are written, in normal modes, and U(q), the rest of V."""
         from sympflow.hamiltonian.normal_modes import SpectralPart, Transform, dispersion
 
         F, n_sites = len(self.fields), math.prod(self.shape)
@@ -393,22 +370,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     def of_terms(
         self, key: str, expressions: Callable[[sp.Expr, tuple[sp.Symbol, ...]], list[sp.Expr]], q: Array
     ) -> list[tuple[int | None, int, list[Array]]]:
-        """The values of expressions of U and of each bond along each axis, at all sites and bonds.
-
-        Parameters
-        ----------
-        key : str
-            A name, under which generated functions are kept.
-        expressions : callable
-            Of U in the fields, and of V in the differences along a bond.
-        q : array or Tensor of shape (..., d)
-
-        Returns
-        -------
-        list of axis, distance, values (..., *sites or bonds)
-            None and 0 for the sites. Bonds stand in the order of their first ends; of fixed ends those to the wall
-            before come first.
-        """
+        """The values of expressions of U and of each bond along each axis, at all sites and bonds."""
         x, found = self._on_sites(q), list[tuple[int | None, int, list[Array]]]()
         if self.U != 0:
             found.append((None, 0, self._site_values(f"onsite {key}", partial(expressions, self.U, self.x), self.x, x)))

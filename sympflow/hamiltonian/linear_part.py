@@ -250,11 +250,7 @@ def linear_part(system: Scene) -> LinearPart:
 
 
 def _equilibrium(system: Scene, K: np.ndarray) -> np.ndarray:
-    """c in the range of K where ∇V vanishes along it, so that the rest U stays small beside the stiff ½ (q−c)ᵀK(q−c).
-
-    By q ← q − K⁺∇V(q) from 0, or from y0 where V is singular there. Where that does not converge, K is no curvature of
-    V, and where it starts is as good as any c.
-    """
+    """c in the range of K where ∇V vanishes along it: the rest U is then small beside ½ (q−c)ᵀK(q−c)."""
     inverse, t0 = np.linalg.pinv(K, rcond=1 / GAP**2, hermitian=True), float(system.t_span[0])
     starts = [np.zeros(system.ndof)] + ([] if system.y0 is None else [system.y0[: system.ndof]])
     with np.errstate(all="ignore"):

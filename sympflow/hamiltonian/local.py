@@ -64,13 +64,7 @@ class LocalHamiltonian(Definition, ABC):
 
     @abstractmethod
     def with_params(self, values: Mapping[str, Any]) -> Self:
-        """Return the definition with other values of some parameters.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If there is no such parameter, or values are bad.
-        """
+        """Return the definition with other values of some parameters."""
 
     def check_names(self, names: Iterable[str]) -> None:
         """Refuse names that are no parameters, with those that there are."""
@@ -93,35 +87,14 @@ class LocalHamiltonian(Definition, ABC):
                 )
 
     def linear_and_rest(self, interval: float) -> tuple[Any, list[Any]]:
-        """The quadratic part of H, in its normal modes, and the part that remains, if there is one.
-
-        Parameters
-        ----------
-        interval : float
-            The length of the default one: see `LinearPart`.
-
-        Returns
-        -------
-        SpectralPart, and a list of one part as `sympflow.hamiltonian.parts` has them, or none
-
-        Raises
-        ------
-        ValueError
-            If there is no quadratic part whose modes are known.
-        """
+        """The quadratic part of H, in its normal modes, and the part that remains, if there is one."""
         raise ValueError(
             f"`system` is made of {self.loops}, of which no linear part is known: take a method that splits into T and "
             "V, such as 'srkn6b'."
         )
 
     def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
-        """Return the definition with the same terms on a few sites: see `HamiltonianSystem.piece`.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If there is none.
-        """
+        """Return the definition with the same terms on a few sites: see `HamiltonianSystem.piece`."""
         raise TypeError(
             f"`system` is no lattice, of which a few sites are a piece: make a smaller one by HamiltonianSystem."
             f"{self.loops}."
@@ -166,20 +139,11 @@ class LocalHamiltonian(Definition, ABC):
         return {}
 
     def written_out(self) -> sp.Expr | None:
-        """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters.
-
-        None where a flow is fitted to the system as it is, by array operations, as of bodies, all of which meet.
-        """
+        """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""
         return None
 
     def potential_hessian(self, q: Array, *t: Array) -> Array:
-        """∇²V(q), dense: (..., d) to (..., d, d).
-
-        Raises
-        ------
-        ValueError
-            If that has more than 5e7 entries: `hessian_vector` needs none of them.
-        """
+        """∇²V(q), dense: (..., d) to (..., d, d)."""
         d = self.ndof
         self.check_dense(np.prod(q.shape, dtype=float) * d, "∇²V")
         xp = library(q)
@@ -187,12 +151,7 @@ class LocalHamiltonian(Definition, ABC):
         return self.hessian_vector(q[..., None, :], basis + 0 * q[..., None, :], *t)
 
     def check_dense(self, entries: float, what: str) -> None:
-        """Refuse a matrix with more than 5e7 entries: ∇²V, or that of the equations of an implicit step.
-
-        Raises
-        ------
-        ValueError
-        """
+        """Refuse a matrix with more than 5e7 entries: ∇²V, or that of the equations of an implicit step."""
         if entries > MOST_DENSE:
             raise ValueError(
                 f"`system` has {self.ndof:,} degrees of freedom, of which {what} is dense, with {entries:.3g} entries: "
@@ -280,13 +239,7 @@ def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Sy
 
 
 def check_memory(ndof: float, what: str) -> None:
-    """Refuse a system whose runs do not fit into the memory of the machine, before anything is allocated.
-
-    Raises
-    ------
-    ValueError
-        With the bytes that a run needs, and those that there are.
-    """
+    """Refuse a system whose runs do not fit into the memory of the machine, before anything is allocated."""
     needed = 8.0 * VECTORS_OF_A_RUN * ndof
     try:
         available = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")

@@ -24,19 +24,7 @@ Monomials = tuple[tuple[int, ...], ...]
 
 
 def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
-    """Return the monomials up to a total degree that a kick of a trained flow can use, for H = ½ pᵀM⁻¹p + V(q).
-
-    The flows that kicks and drifts compose to are, by the formula of Baker, Campbell and Hausdorff, those of T, V and
-    their commutators. Of these the ones that are potentials again are V, |∇V|²_{M⁻¹}, and whatever products ∇fᵀM⁻¹∇g of
-    such f and g make further (the first of them: Blanes, Casas & Ros, Appl. Numer. Math. 39 (2001) 245). Where V is a
-    polynomial, these are the monomials in them. Else they are those that are unchanged by the changes of sign of
-    coordinates that leave V unchanged.
-
-    Raises
-    ------
-    ValueError
-        If there are none, or too many.
-    """
+    """Return the monomials up to a total degree that a kick of a trained flow can use, for H = ½ pᵀM⁻¹p + V(q)."""
     assert symbols.V is not None
     d = symbols.ndof
     if math.comb(d + degree, d) > 1000 * MOST_MONOMIALS:

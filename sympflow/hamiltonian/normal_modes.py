@@ -17,16 +17,7 @@ ZERO = 1e-12
 
 
 class Transform:
-    """The orthonormal transform W of fields on a lattice to its plane or standing waves, axis by axis.
-
-    Periodic axes have cosines and sines, in the order 1, cos θ, sin θ, cos 2θ, …; fixed ends sines, free ends cosines.
-    So W diagonalises every symmetric coupling between neighbours, and on periodic axes of any range.
-
-    Parameters
-    ----------
-    shape : tuple of int
-    boundary : tuple of {"periodic", "fixed", "free"}
-    """
+    """The orthonormal transform W of fields on a lattice to its plane or standing waves, axis by axis."""
 
     def __init__(self, shape: tuple[int, ...], boundary: tuple[str, ...]) -> None:
         self.shape, self.boundary = shape, boundary
@@ -136,22 +127,7 @@ def _cosine_norms(x: Any) -> Any:
 
 
 class SpectralPart:
-    """A quadratic Hamiltonian of fields on a lattice that a `Transform` and a small matrix for each wave diagonalise.
-
-    It has the interface of `LinearPart`: with q = C X and p = C⁻ᵀY it is Σ_j Ω_j(Y_j² + σ_j X_j²)/2, with the fields
-    one after the other; but there is no dense matrix in it.
-
-    Parameters
-    ----------
-    transform : Transform
-    rates : ndarray of shape (F, *shape)
-        Ω of each mode.
-    kinds : ndarray of str of that shape
-        As of `LinearPart`.
-    matrices : ndarray of shape (*shape, F, F), optional
-        M of each wave, C = Wᵀ M; the identity by default.
-    interval : float
-    """
+    """A quadratic H of fields on a lattice, diagonal by a `Transform` and a small matrix for each wave."""
 
     dense = diagonal = False
 
@@ -175,16 +151,7 @@ class SpectralPart:
     def of_matrices(
         cls, transform: Transform, inverse_mass: np.ndarray, stiffness: np.ndarray, interval: float = 0.0
     ) -> SpectralPart:
-        """The part ½ pᵀBp + ½ qᵀKq.
-
-        Parameters
-        ----------
-        transform : Transform
-        inverse_mass : ndarray of shape (F,)
-            The diagonal of B at each site.
-        stiffness : ndarray of shape (*shape, F, F)
-            K of each wave.
-        """
+        """The part ½ pᵀBp + ½ qᵀKq."""
         L = np.sqrt(inverse_mass)
         squares, V = np.linalg.eigh(L[:, None] * stiffness * L)
         squares[abs(squares) <= ZERO * abs(squares).max(initial=0.0)] = 0.0

@@ -20,17 +20,7 @@ MOST_SHOWN = 4  # values of a row, in messages
 
 
 class Rows(NamedTuple):
-    """Trajectories that one run takes together.
-
-    Attributes
-    ----------
-    places : ndarray of int, shape (n,)
-        The trajectories' places in the batch, in the order of its flattened shape.
-    system : HamiltonianSystem
-        The system of the first of them.
-    letters : ndarray of shape (k, n) or None
-        The values, for each, of `system.symbols.parametric.parameters`; None where `system` is that of all.
-    """
+    """Trajectories that one run takes together."""
 
     places: np.ndarray
     system: HamiltonianSystem
@@ -38,23 +28,7 @@ class Rows(NamedTuple):
 
 
 class ParameterRows:
-    """The parameters of each trajectory of a batch.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        It has the parameters.
-    values : mapping of str to ndarray
-        Of some of its parameters, each of the shape of the batch.
-
-    uniform : bool
-        True if they were given as numbers, which make another system of the whole batch. Arrays never are, whatever
-        their values: what becomes of a trajectory does not depend on the others.
-
-    Attributes
-    ----------
-    shape : tuple of int
-    """
+    """The parameters of each trajectory of a batch."""
 
     def __init__(self, system: HamiltonianSystem, values: Mapping[str, np.ndarray], uniform: bool = False) -> None:
         self.system, self.values, self.uniform = system, dict(values), uniform
@@ -65,13 +39,7 @@ class ParameterRows:
         return {name: np.ravel(value) for name, value in self.values.items()}
 
     def system_of(self, row: int) -> HamiltonianSystem:
-        """The system of a trajectory, by its place in the flattened batch.
-
-        Raises
-        ------
-        ValueError
-            If it has none, with its values.
-        """
+        """The system of a trajectory, by its place in the flattened batch."""
         try:
             return self.system.with_params(**{name: float(column[row]) for name, column in self._columns.items()})
         except (ValueError, TypeError) as error:
@@ -91,12 +59,7 @@ class ParameterRows:
             yield Rows(index, self.system_of(int(index[0])))
 
     def by_form(self) -> Iterator[Rows]:
-        """The trajectories by the `parametric` form of H; those whose values belong to the code, by their values.
-
-        Systems by one piece have the same code for all values, and run one value after the other.
-
-        A value that makes a part of H 0, 1 or −1 has a form of its own, as it has in a system that is made with it.
-        """
+        """The trajectories by the `parametric` form of H; those whose values belong to the code, by their values."""
         symbols = self.system.symbols
         if symbols is None:
             yield from self.distinct()
@@ -138,10 +101,7 @@ class ParameterRows:
         return any(s.name in self._columns for s in part.free_symbols)
 
     def _part(self, part: sp.Expr) -> np.ndarray:
-        """The values of a part of H that depends on parameters alone, as SymPy has them; NaN where they are not real.
-
-        Of shape (N,), or (1,) where it depends on none of these parameters.
-        """
+        """The values of a part of H that depends on parameters alone, by SymPy; NaN where they are not real."""
         assert self.system.symbols is not None
         fixed = self.system.symbols.written[1]
         columns = {s: self._columns[s.name] for s in part.free_symbols if s.name in self._columns}
@@ -225,20 +185,7 @@ def _groups(columns: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...]) -> ParameterRows:
-    """The values of `params` for each trajectory of a batch of states, broadcast as NumPy does.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    params : mapping of str to array_like
-    batch : tuple of int
-        y0.shape[:-1].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If `params` is no mapping of parameters of the system to finite real numbers of shapes that fit.
-    """
+    """The values of `params` for each trajectory of a batch of states, broadcast as NumPy does."""
     if not isinstance(params, Mapping):
         raise TypeError(f"`params` must be a mapping of names to numbers or arrays; got {type(params).__name__}.")
     if not params:

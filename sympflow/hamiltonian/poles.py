@@ -67,13 +67,7 @@ class Poles(Protocol):
     def look(
         self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Numbers (..., m) that differ on the two sides of a place, H and T: states (..., 2d), times (...).
-
-        Numbers are values of the parameters of a `parametric` form.
-
-        Where these cost more than such a number, H is 0, or NaN where it is no number, and T None. Where H has no
-        part T there is one of its size.
-        """
+        """Numbers (..., m) that differ on the two sides of a place, H and T: states (..., 2d), times (...)."""
 
     def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
         """The values that vanish at the places: (..., m)."""
@@ -86,12 +80,7 @@ class Poles(Protocol):
 
 
 class SymbolicPoles:
-    """The places of H, as it is written.
-
-    Parameters
-    ----------
-    symbols : SymbolicHamiltonian
-    """
+    """The places of H, as it is written."""
 
     def __init__(self, symbols: Any) -> None:
         self._symbols = symbols
@@ -153,12 +142,7 @@ class _Lattice(Protocol):
 
 
 class LatticePoles:
-    """The places of the terms of a lattice, at each site and bond.
-
-    Parameters
-    ----------
-    lattice : LatticeHamiltonian
-    """
+    """The places of the terms of a lattice, at each site and bond."""
 
     def __init__(self, lattice: _Lattice) -> None:
         self._lattice = lattice
@@ -286,10 +270,7 @@ _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 
 @lru_cache(maxsize=64)
 def places(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> tuple[Place, ...]:
-    """The places where f may be infinite or no number, for all that can be told from it, by letters of x.
-
-    An exponent by a parameter counts as negative where it is written so.
-    """
+    """The places where f may be infinite or no number, for all that can be told from it, by letters of x."""
     return tuple(place for place in _places(f, x) if _removable(f, place) is None)
 
 

@@ -15,10 +15,7 @@ SERIES_UP_TO = 2.0
 
 
 class sinc(sp.Function):
-    """The n-th derivative of sin(x)/x: its series where |x| < 2, beyond by n f⁽ⁿ⁻¹⁾ + x f⁽ⁿ⁾ = sin⁽ⁿ⁾ x.
-
-    SymPy's own function has derivatives whose terms cancel near 0. Of numbers it is that one.
-    """
+    """The n-th derivative of sin(x)/x: its series where |x| < 2, beyond by n f⁽ⁿ⁻¹⁾ + x f⁽ⁿ⁾ = sin⁽ⁿ⁾ x."""
 
     nargs = (1, 2)
     is_real = True

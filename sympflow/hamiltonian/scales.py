@@ -44,12 +44,7 @@ _KNOWN: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
 
 
 def natural_scale(scene: Scene) -> np.ndarray:
-    """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω).
-
-    s_i⁴ = ∂²H/∂q_i² / ∂²H/∂p_i² at q = p = 0, if both are positive and finite; else s_i² = ω/|∂²H/∂p_i²| at y0, or
-    over the domain, ω being `fastest_rate`. Without a y0 and a domain s_i = 1. Of a driven system it is that at
-    `t_span[0]`. Large lattices and pairs have the ω of a random direction at y0, and their masses.
-    """
+    """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω)."""
     system = scene.between_impulses
     if system not in _KNOWN:
         with np.errstate(all="ignore"):
@@ -77,10 +72,7 @@ def distance(system: Scene, change: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def smallest_size(scene: Scene, y0: np.ndarray) -> float:
-    """A size that neither all q nor all p of an orbit from the states y0 (..., 2d) are less than; never 0.
-
-    Of states at 0 it is that of their motion in a step `dt`, 1 where there is none.
-    """
+    """A size that neither all q nor all p of an orbit from the states y0 (..., 2d) are less than; never 0."""
     system = scene.between_impulses
     scale = weights(system)
     size = np.abs(scale * y0).max(initial=0.0)
@@ -120,10 +112,7 @@ def _of_large(system: Any) -> np.ndarray:
 
 
 def fastest_rate(system: Any) -> float | None:
-    """The largest |λ| of J∇²H at y0, or the median over the domain; `SLOW`/dt where that is 0, None without states.
-
-    Where H depends on t, the largest of a few times within its period, or else the system's interval.
-    """
+    """The largest |λ| of J∇²H at y0, or the median over the domain; `SLOW`/dt where that is 0, None without states."""
     if system.y0 is None and system.domain is None:
         return None
     t0, t1 = system.t_span
@@ -132,10 +121,7 @@ def fastest_rate(system: Any) -> float | None:
 
 
 def default_step(scene: Scene, y: np.ndarray | None = None) -> float:
-    """`STEP` over the largest rate at states y (..., 2d), by default y0 or those of the domain, to two digits.
-
-    `STEP` itself where nothing moves, or no rate can be told, as of large lattices and pairs.
-    """
+    """`STEP` over the largest rate at states y (..., 2d), by default y0 or those of the domain, to two digits."""
     system = scene.between_impulses
     rate = 0.0
     if system.ndof <= MOST_DENSE:

@@ -59,14 +59,7 @@ FAR = 1000.0
 
 @dataclass(frozen=True)
 class Kick:
-    """The impulses of H at a time: with terms δ(g(t))·W(q, t) the flow p −= Σ ∇W(q, t)/|g'(t)|.
-
-    Attributes
-    ----------
-    t : float
-    potentials : tuple of (float, SymbolicHamiltonian)
-        1/|g'(t)| and W of each.
-    """
+    """The impulses of H at a time: with terms δ(g(t))·W(q, t) the flow p −= Σ ∇W(q, t)/|g'(t)|."""
 
     t: float
     potentials: tuple[tuple[float, SymbolicHamiltonian], ...]
@@ -206,11 +199,7 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def parametric(self) -> SymbolicHamiltonian:
-        """H with symbols for what depends on parameters alone: one for all values that leave its structure as it is.
-
-        What is 0, 1 or −1 stays a number, and so do exponents. H itself, where nothing is left to replace, or where
-        symbols would change what is separable or quadratic.
-        """
+        """H with symbols for what depends on parameters alone: one for all values that leave its structure as it is."""
         if self._written is None:
             return self
         written, values = self._written
@@ -239,13 +228,7 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def parametric_parts(self) -> tuple[list[sp.Expr], set[sp.Symbol]]:
-        """Parts of H, as written, that are letters or 0, ±1 in the `parametric` form, and parameters that stay numbers.
-
-        Raises
-        ------
-        TypeError, OverflowError
-            If the value of such a part is no real number.
-        """
+        """Parts of H that are letters or 0, ±1 in the `parametric` form, and parameters that stay numbers."""
         letters = _Letters(self.written[1])
         letters.put_into(self.written[0])
         return [*letters.found, *letters.numbers], letters.replaced
@@ -265,10 +248,7 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def jumps(self) -> bool:
-        """True if H jumps at some times, at those of samples or of a function of the time that jumps, or has impulses.
-
-        In a time of `FAR` about 0 and about every zero of a linear function.
-        """
+        """True if H jumps at some times: of samples, of a function of the time that jumps, or of impulses."""
         if self.impulses or self.shortest_piece < math.inf:
             return True
         return any(each.at_root or len(each.times(-FAR, FAR, FAR / MOST_POINTS)) for each in self._switches)
@@ -325,13 +305,7 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def drift(self) -> tuple[sp.Expr, ...]:
-        """∫_t^{t+s} ∇T(p, u) du in p, t and s, which is `driving.DURATION`.
-
-        Raises
-        ------
-        ValueError
-            If the integral is not elementary.
-        """
+        """∫_t^{t+s} ∇T(p, u) du in p, t and s, which is `driving.DURATION`."""
         return drift(tuple(gradient(self.T, self.p)), self.time)
 
     @cached_property
@@ -388,10 +362,7 @@ class SymbolicHamiltonian(Definition):
         return self._scalar("Ht")(y, t)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
-        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name.
-
-        Of a `parametric` form it takes `numbers`, values of the parameters.
-        """
+        """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
         return self._function(name, lambda: expressions, assemble)
 
     def potential(self, q: Array, *t: Array) -> Array:
@@ -534,13 +505,7 @@ COORDINATE_LIKE = re.compile(r"[pqv]?[xyzr]\d?|[PQX]\d*|v|[pq]_?\w|[vpq]?_?(thet
 
 
 def renamed(expression: str | sp.Expr, q: Any, p: Any) -> sp.Expr:
-    """H in q1 … qd, p1 … pd, of an expression in the coordinates of these names, symbols or functions of the time.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If they are not d names each, all different.
-    """
+    """H in q1 … qd, p1 … pd, of an expression in the coordinates of these names, symbols or functions of the time."""
     rows = [[x] if isinstance(x, str | sp.Basic) else list(x or ()) for x in (q, p)]
     names = [str(x.func if isinstance(x, sp.Function) else x) for row in rows for x in row]
     if len(rows[0]) != len(rows[1]) or len(set(names)) < len(names) or not names:
@@ -555,13 +520,7 @@ def renamed(expression: str | sp.Expr, q: Any, p: Any) -> sp.Expr:
 
 
 def named_time(time: str | sp.Symbol | None, params: Mapping[str, Any]) -> sp.Symbol | None:
-    """The symbol of the time, "t" where a parameter is sampled and none is named; None without.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is no name, or the name of something else.
-    """
+    """The symbol of the time, "t" where a parameter is sampled and none is named; None without."""
     if time is None:
         if not any(isinstance(value, Samples) for value in params.values()):
             return None
@@ -696,20 +655,7 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
 
 
 class _Letters:
-    """Symbols for the parts of H that depend on parameters alone, with the values of these parts.
-
-    Numbers in front of such a part are no part of it: of the derivatives they are exact. Within functions of several
-    arguments, in exponents, and in roots of products, of which SymPy takes numbers out, parameters are replaced by
-    their values.
-
-    Attributes
-    ----------
-    found : dict of Expr to (Symbol, float)
-    numbers : dict of Expr to float
-        The parts whose values, 0, 1 or −1, stay numbers.
-    replaced : set of Symbol
-        The parameters that were replaced by their values somewhere.
-    """
+    """Symbols for the parts of H that depend on parameters alone, with the values of these parts."""
 
     def __init__(self, values: Mapping[sp.Symbol, sp.Expr]) -> None:
         self.values = values
@@ -766,13 +712,7 @@ _AMBIGUOUS = {
 
 
 def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the parameters as numbers of Python, or samples of a function of t.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If they are no mapping of names to finite real numbers, or a name is that of a coordinate.
-    """
+    """Return the parameters as numbers of Python, or samples of a function of t."""
     if not isinstance(params, Mapping | None):
         raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
     checked: dict[str, Any] = {}
@@ -850,13 +790,7 @@ def _of_machine_numbers(f: sp.Expr) -> sp.Expr:
 
 
 def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], library: str) -> Callable[..., list[Any]]:
-    """The values of the expressions, as a function of the variables' arrays of "numpy" or "torch".
-
-    Raises
-    ------
-    TypeError
-        If the library has no function for something in the expressions.
-    """
+    """The values of the expressions, as a function of the variables' arrays of "numpy" or "torch"."""
     written = _by_products if library == "numpy" else _with_tensor_functions
     code = [written(_by_reciprocals(_of_machine_numbers(f))) for f in expressions]
     sums = [_in_pieces(f) for f in code]

@@ -27,9 +27,9 @@ from sympflow.hamiltonian.times import check_period, probe_times
 if TYPE_CHECKING:
     import sympy
 
+    from sympflow.hamiltonian.lattice_states import LatticeStates
     from sympflow.hamiltonian.linear_part import LinearPart
     from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.hamiltonian.local_states import LocalStates
     from sympflow.hamiltonian.symbolic import Kick
 
 MOST_DEGREES = 1_000_000
@@ -408,25 +408,22 @@ class HamiltonianSystem(Hamiltonian):
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
     ) -> HamiltonianSystem:
-        """A few sites of a lattice, or a few bodies, with the same terms: what a flow for a large one is fitted on.
+        """A few sites of a lattice with the same terms: what a flow for a large one is fitted on.
 
-        A ring has as many bonds for each site as the inside of a large lattice, whatever the ends of that are. Bodies
-        have a piece if they are of one kind and mass, without `box`, and V has a minimum and a short range, so that it
-        holds a few of them together.
+        A ring has as many bonds for each site as the inside of a large lattice, whatever the ends of that are.
 
         Parameters
         ----------
         sites : int or sequence of ints, optional
             Sites along each axis; the default is 6 of a lattice of one axis, 4 by 4 of one of two and 3 by 3 by 3 of
-            one of three, more where bonds reach farther. Of bodies their number: 4, 7 or 13 in one, two or three
-            dimensions.
+            one of three, more where bonds reach farther.
         boundary : str, or one for each axis
-            As in `lattice`; of lattices only.
+            As in `lattice`.
 
         Returns
         -------
         HamiltonianSystem
-            With `sympflow.LatticeStates` or `sympflow.ClusterStates` of the same energy density as its domain, where
+            With `sympflow.LatticeStates` of the same energy density as its domain, where
             the system has a domain or a `y0` from which that is found. Arrays in `params` are cut to the first sites.
 
         Raises
@@ -456,19 +453,18 @@ class HamiltonianSystem(Hamiltonian):
         scene = None, self.t_span, self.dt, None
         return HamiltonianSystem._of_pieces(local, self.damping, self.name, domain, *scene)
 
-    def local_states(self) -> LocalStates | None:
+    def local_states(self) -> LatticeStates | None:
         """The states, for any size, at the energy density of the domain, or else of `y0`; None without both."""
         domain = self.domain
         if domain is None and self.y0 is None:
             return None
-        from sympflow.hamiltonian.domain import states_of
-        from sympflow.hamiltonian.local_states import DRAWN, LocalStates
+        from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 
-        if isinstance(domain, LocalStates):
+        if isinstance(domain, LatticeStates):
             return domain
         states = self.y0 if domain is None else domain.sample(DRAWN)
         assert states is not None
-        return states_of(self, states)
+        return LatticeStates.of_states(self, states)
 
     @cached_property
     def _few_sites(self) -> HamiltonianSystem:
@@ -889,19 +885,7 @@ COUNTED = {
 
 
 def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]) -> HamiltonianSystem:
-    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    count : callable
-        Called with what is evaluated, a value of `COUNTED`, and the states or positions (..., k).
-
-    Returns
-    -------
-    HamiltonianSystem
-        Equal to `system`, so that whatever is kept by system is found by the view too.
-    """
+    """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it."""
     view = copy.copy(system)
     vars(view).pop("between_impulses", None)  # the view itself, where there are none
     view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]

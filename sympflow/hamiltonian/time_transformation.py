@@ -68,6 +68,8 @@ def time_transformed(
     >>> bool(sol.y[2, -1] > 600)  # the physical time
     True
     """
+    if not isinstance(system, HamiltonianSystem):
+        raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
     system.check_conservative(
         "and no Hamiltonian in another time", "solve it in the physical time, by 'verlet' or 'dop853' for instance"
     )
@@ -124,11 +126,7 @@ def checked_shift(shift: Any) -> float:
 
 
 def time_scale(system: HamiltonianSystem, c: float) -> float:
-    """ds/dt where the kinetic energy equals B = c − E, at the energy E of the system's y0: 2B.
-
-    For Newtonian attraction and c = 0 that is the mean along the orbit, by the virial theorem. Where B is not positive
-    it is c − V at y0.
-    """
+    """ds/dt where the kinetic energy equals B = c − E, at the energy E of the system's y0: 2B."""
     if system.y0 is None:
         return 1.0
     B = c - _energy(system)

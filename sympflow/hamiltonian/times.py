@@ -23,13 +23,7 @@ def stage_time(t: Any, c: float, h: Any) -> Any:
 
 
 def checked_time(t: Any, x: Array, batch: tuple[int, ...]) -> Any:
-    """Return a time as a float, or as an array of doubles of the library of x, a number or of the shape of the batch.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is no real number, nor an array of them that fits the states.
-    """
+    """Return a time as a float, or as doubles of the library of x with the shape of the batch; checked."""
     if isinstance(t, float):
         return t
     if is_tensor(t) or (is_tensor(x) and np.ndim(t)):
@@ -78,15 +72,7 @@ def probe_times(t0: float, t1: float) -> np.ndarray:
 
 
 def check_period(H: Callable[[np.ndarray, float], Any], ndof: int, y0: np.ndarray | None, period: float) -> None:
-    """Test H(y, t), up to a function of t alone, at states of all sizes, at times and a period later.
-
-    What it may differ by is measured by its change in time at the same state, whatever else H holds.
-
-    Raises
-    ------
-    ValueError
-        If it differs: the period is not one of H.
-    """
+    """Test H(y, t), up to a function of t alone, at states of all sizes, at times and a period later."""
     rng = np.random.Generator(np.random.PCG64(20260104))
     states = rng.uniform(-1, 1, (1, 5, 2 * ndof)) * 10.0 ** np.arange(-3, 4)[:, None, None]
     states = states.reshape(-1, 2 * ndof)

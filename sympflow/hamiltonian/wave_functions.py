@@ -20,18 +20,7 @@ from sympflow.hamiltonian.normal_modes import SpectralPart, Transform
 
 
 class WaveFunctionHamiltonian(LocalHamiltonian):
-    """H = ½ Σ_k ω(k)(Q_k² + P_k²) + Σ_sites f(ρ), ρ = (q² + p²)/2, see `HamiltonianSystem.schroedinger`.
-
-    Q and P are the real Fourier coefficients of q and p.
-
-    Attributes
-    ----------
-    grid : tuple of int
-        Sites along each axis.
-    length : tuple of float
-        Of each axis.
-    params : dict of str to float or ndarray of that shape
-    """
+    """H = ½ Σ_k ω(k)(Q_k² + P_k²) + Σ_sites f(ρ), ρ = (q² + p²)/2, see `HamiltonianSystem.schroedinger`."""
 
     loops = "schroedinger"
     separable = False
@@ -116,13 +105,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         return concatenate(flat)
 
     def hessian(self, y: Array) -> Array:
-        """∇²H, dense: (..., 2d) to (..., 2d, 2d).
-
-        Raises
-        ------
-        ValueError
-            If that has more than 5e7 entries.
-        """
+        """∇²H, dense: (..., 2d) to (..., 2d, 2d)."""
         d, xp = self.ndof, library(y)
         if np.prod(y.shape, dtype=float) * 2 * d > MOST_DENSE:
             raise ValueError(
@@ -147,11 +130,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         return linear, [PhaseTurn(self)] if self.f != 0 else []
 
     def turned(self, y: Array, s: Any) -> Array:
-        """The flow of Σ f(ρ) over a time s, (..., 1) or one for all: ψ turns by f'(ρ)s at each site.
-
-        By half turns, which are exact, and three shears: cosine and sine of an angle that hardly changes from step to
-        step would change the norm by the same rounding each time.
-        """
+        """The flow of Σ f(ρ) over a time s, (..., 1) or one for all: ψ turns by f'(ρ)s at each site."""
         q, p = self._fields(y)
         angle, xp = self._of_density(1, q, p).reshape(*y.shape[:-1], self.ndof) * s, library(y)
         half_turns = xp.round(angle / math.pi)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt, check_not_followed
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, join, lanes, stack
+from sympflow.arrays import Array, differentiable, finite_states, full_of_nan, is_tensor, join, lanes, stack, transformed
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import (
@@ -322,19 +322,24 @@ class KernelStepper(Stepper):
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
     ) -> tuple[Array, np.ndarray]:
-        start: dict[str, Any] = {"t0": t0} if self.driven else {}
-        if carry is not None:
-            start["carry"] = carry
         if y0.ndim == 1:
-            states, last, iterations = self.kernel.run(h, y0, n_steps, save, **start)
+            states, last, iterations = self.kernel.run(h, y0, n_steps, save, carry, t0)
             self.iterations += iterations
             return states, np.asarray(last)
         rows = y0.reshape(-1, y0.shape[-1])
-        states, finite, iterations = self.kernel.run_batch(h, rows, n_steps, save, **start)
+        states, finite, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
         self.iterations += iterations
         return states.swapaxes(0, 1).reshape(len(save), *y0.shape), np.asarray(finite).reshape(y0.shape[:-1])
 
+    def by_arrays(self, y: Array, h: Any, t: Any, *followed: Any) -> Array:
+        """A step of tensors by tensor operations, which torch follows: of `Problem.followed` too."""
+        return self.integrator.checked_step(self.system, t, y, h)
+
     def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        if is_tensor(y):
+            from sympflow.integrators.tensors import stepped
+
+            return stepped(self, y, h, t)
         start = (np.broadcast_to(t, y.shape[:-1]).reshape(-1),) if self.driven else ()
         if y.ndim == 2 and np.shape(h) == (len(y),):
             states, iterations = self.kernel.step(h, y, *start)
@@ -352,39 +357,22 @@ def compiled_loops(
     compensated: bool = False,
     reason: str | None = None,
     told: list[str] | None = None,
+    system: HamiltonianSystem | None = None,
 ) -> Any:
-    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
-
-    The one place where this is decided.
-
-    Parameters
-    ----------
-    make : callable
-        Raises a ValueError with the reason where there is no compiled form.
-    y0 : array or tensor
-    backend : "auto", "compiled" or "array"
-    compensated : bool
-        Compiled loops are needed, for compensated sums.
-    reason : str, optional
-        Why the method has no compiled form at all.
-    told : list of str, optional
-        Takes the reason that `make` gives, where array operations step in for it.
-
-    Raises
-    ------
-    ValueError
-        If compiled loops are asked for, or needed, and there are none.
-    """
+    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations."""
     if backend == "array":
         reason = "`backend` is 'array': choose 'auto'."
     elif is_tensor(y0):
-        reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
+        reason = reason or _no_loops_for(y0, system)
     elif y0.dtype != np.float64:
         reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
     asked = reason is None
     if reason is None:
         try:
-            return make()
+            loops = make()
+            if is_tensor(y0) and differentiable(y0):
+                loops.check_reverse()
+            return loops
         except ValueError as error:
             reason = str(error)
     if backend == "compiled":
@@ -397,6 +385,19 @@ def compiled_loops(
     return None
 
 
+def _no_loops_for(y0: Array, system: HamiltonianSystem | None) -> str | None:
+    """Why a tensor needs array operations, if it does."""
+    if system is None:
+        return "`y0` is a tensor: pass a NumPy array, or use backend='array'."
+    if y0.device.type != "cpu":
+        return f"`y0` is on {y0.device}: move it to the CPU, or use backend='array'."
+    if transformed(y0):
+        return "`y0` is followed by torch.func, forward mode or torch.compile: use backend='array'."
+    if system.learns(y0):
+        return "`system` has numbers that torch follows: use backend='array'."
+    return None
+
+
 def rollout(
     step: Callable[[int, Array], Array],
     y: Array,
@@ -405,11 +406,7 @@ def rollout(
     block: int = 64,
     carry: Carry | None = None,
 ) -> tuple[Array, np.ndarray]:
-    """Apply `step(k, y)` n_steps times; the states at the counts `save`, and the last finite count of each trajectory.
-
-    Finiteness is tested once a block; a block that ends non-finite is run again to find where. The run stops when no
-    trajectory is finite any more; later states are NaN. With a `carry` it goes on from there, and leaves its end in it.
-    """
+    """States at the counts `save` of n_steps times `step(k, y)`, and the last finite count of each trajectory."""
     k = 0
     if carry is not None and carry.running is not None:
         k, y = carry.steps, carry.running
@@ -606,10 +603,7 @@ class GridRun:
         }
 
     def _placed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
-        """Output times and their remainders, the counts whose states are to be saved, and where among these each is.
-
-        The last is None where every output is a state of its own.
-        """
+        """Output times and their remainders, the counts whose states are to be saved, and where among these each is."""
         problem, grid = self.problem, self.grid
         t = problem.t_eval
         t, count, remainder = grid.outputs(t, problem.save_every)
@@ -702,10 +696,7 @@ class GridRun:
         return len(states) - 1, False
 
     def _samples(self, search: EventSearch, k: int, states: Array, h: float) -> Array:
-        """States (n, parts − 1, 2d) that divide steps of length h, all computed at once.
-
-        They are those from `states` (n, 2d), the first of which is at grid point k.
-        """
+        """States (n, parts − 1, 2d) that divide steps of length h, all computed at once."""
         parts = search.parts(h, self.problem.system.dt)
         search.n_dense += len(states) * (parts - 1)
         lengths = h * np.arange(1, parts) / parts * np.ones((len(states), 1))
@@ -744,11 +735,7 @@ class GridRun:
         return f"{what} after t = {t:.17g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
 
     def report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
-        """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there.
-
-        `stats["failed_at"]` is the time of the last finite state on the grid, in a batch an array with NaN for those
-        that reached their end.
-        """
+        """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there."""
         grid = self.grid
         done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
         outcome.finite = done and (outcome.finite or _all_finite(outcome.y))
@@ -782,10 +769,7 @@ class GridRun:
 
 
 def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
-    """Flag a run under `torch.func.vmap` of which some lane failed: `ok` (n, ...) is False where one is not finite.
-
-    The states of all lanes stay, for they are one tensor: no time of one may depend on another.
-    """
+    """Flag a run under `torch.func.vmap` of which some lane failed: `ok` (n, ...) is False where one is not finite."""
     what, remedy = breakdown.value
     bad = ~ok.all(0)
     outcome.status = np.where(bad, -1, 0) if bad.ndim else -1
@@ -797,10 +781,7 @@ def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
 
 
 class GridSolution:
-    """Dense output of a fixed-step method: a shorter step from the last grid point before t.
-
-    Call it with a time or an array of times (n,); the result has shape (..., 2d) or (..., 2d, n).
-    """
+    """Dense output of a fixed-step method: a shorter step from the last grid point before t."""
 
     def __init__(self, stepper: Stepper, grid: Grid, states: Array) -> None:
         self.stepper, self.grid, self.states = stepper, grid, states
@@ -842,15 +823,7 @@ def _all_finite(y: Array) -> bool:
 
 
 class Recorder:
-    """The outputs and events of a run whose steps the method chooses, taken from its steps one by one.
-
-    Parameters
-    ----------
-    problem : Problem
-        Of a single trajectory, or of a batch that shares its steps.
-    times : ndarray of shape (n,)
-        The outputs that are wanted within the steps; none where every step is one.
-    """
+    """The outputs and events of a run whose steps the method chooses, taken from its steps one by one."""
 
     def __init__(self, problem: Problem, times: np.ndarray) -> None:
         self.search, self.wanted = problem.events, times.tolist()
@@ -863,10 +836,7 @@ class Recorder:
         return None if self.search is None else self.search.end
 
     def take(self, t_old: float, y_old: Array, t: float, y: Any, dense: Callable[[float], Array]) -> tuple[float, Any]:
-        """Take a step; return its end, or the event within it that ends the run.
-
-        `y` is the state at t, where it is known; `dense` gives the states within the step.
-        """
+        """Take a step; return its end, or the event within it that ends the run."""
         if self.search is not None:
             y = dense(t) if y is None else y
             t, y = self.search.step(t_old, y_old, t, y, dense) or (t, y)
@@ -885,13 +855,7 @@ class Recorder:
 
 
 def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch) -> Outcome:
-    """Run an integrator that does not look for events itself: they are sought on its dense output afterwards.
-
-    Raises
-    ------
-    ValueError
-        If the integrator has no dense output.
-    """
+    """Run an integrator that does not look for events itself: they are sought on its dense output afterwards."""
     full = integrator.run(replace(problem, t_eval=None, save_every=1, dense_output=True, events=None))
     if full.sol is None:
         raise ValueError(

@@ -16,6 +16,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.registry import build, check_applies
+from sympflow.systems.given import given_system
 
 TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
 """Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
@@ -39,33 +40,7 @@ def choose_method(
     plain: bool = True,
     flows: bool = True,
 ) -> tuple[Integrator, str]:
-    """Return the method that suits a system, and the reason in words.
-
-    The first of these that applies: a flow that ships for the system, whose domain holds y0; where V is negative and
-    falls without bound towards q = 0, steps on the logarithmic Hamiltonian; the scheme 'srkn11b' where the kinetic
-    energy is ½ pᵀM⁻¹p; 'kahan_li8' where H is separable; 'gauss_legendre6'; 'dop853'. With `rtol` or `atol` it is
-    'dop853', and with `dt` no flow.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    y0 : array or tensor of shape (..., 2d)
-    options : dict
-        Of the method, that are given: a method which does not take them is passed over.
-    tol : float, optional
-        The relative energy error, by which a flow is chosen.
-    plain : bool
-        True if a method in another time will do, for which states are found at the times of outputs.
-    flows : bool
-        True if a trained flow will do.
-
-    Raises
-    ------
-    TypeError
-        If no method that applies takes the options.
-    ValueError
-        If no method applies.
-    """
+    """Return the method that suits a system, and the reason in words."""
     refused: Exception | None = None
     between = system.between_impulses
     for name, reason in _candidates(between, y0, options, tol, plain, flows):
@@ -170,6 +145,7 @@ def choose_step(
     >>> dt = sympflow.choose_step(sympflow.systems.henon_heiles(), "srkn11b", 1e-9)
     """
     integrator = build(method, {})
+    system = given_system(system)
     y = np.asarray(system.y0 if y0 is None else to_numpy(y0), dtype=float)
     if y.ndim == 0 or y.shape[-1] != 2 * system.ndof:
         raise ValueError(f"`y0` must have shape (..., {2 * system.ndof}), states [q, p]; got {y.shape}.")

@@ -92,19 +92,7 @@ class OnClock(Protocol):
 
 
 class LogarithmicClock(NamedTuple):
-    """A method with equal steps in s, on one system.
-
-    Attributes
-    ----------
-    method : OnClock
-    system, transformed : HamiltonianSystem
-    dt : float
-        The physical length of a step where the kinetic energy is B = c − E.
-    new_step : float
-        The length of a step in s.
-    numbers : tuple of float
-        Those of a trained clock; () without one.
-    """
+    """A method with equal steps in s, on one system."""
 
     method: OnClock
     system: HamiltonianSystem
@@ -195,10 +183,7 @@ def _rows(y: Array, h: Any) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=256)
 def physical_length(h: float, scale: float, clock: tuple[float, ...]) -> float:
-    """The physical length of a step h in the new time where the kinetic energy is B = scale/2: h/scale.
-
-    To it a trained clock adds Σ_k c_k h^(3+2k) B^k, of the numbers c_k, the last one first.
-    """
+    """The physical length of a step h in the new time where the kinetic energy is B = scale/2: h/scale."""
     square, total = h * h * scale / 2, 0.0
     for c in clock:
         total = total * square + c
@@ -532,10 +517,7 @@ class _Path:
 
 
 def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
-    """The outcome of a run, or None where there is no compiled pass for it or it did not reach its end.
-
-    None for dense output, for outputs at every step, and for whatever is an error: `PhysicalRun` says what it is.
-    """
+    """The outcome of a run, or None where there is no compiled pass for it or it did not reach its end."""
     system, y0, times = problem.system, problem.y0, problem.t_eval
     length, dt = abs(problem.t1 - problem.t0), clock.dt
     if problem.dense_output or problem.backend == "array" or y0.dtype != np.float64 or system.written is None:

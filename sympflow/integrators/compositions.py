@@ -98,10 +98,7 @@ class Composition(ABC):
 
     @abstractmethod
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        """One step of length h, a number or one for each state, from y (..., 2d).
-
-        `t` is the time at its beginning, of a driven system: a number or one for each state.
-        """
+        """One step of length h, a number or one for each state, from y (..., 2d)."""
 
     @abstractmethod
     def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -135,17 +132,7 @@ MOST_GROWTH = 1.0
 
 
 class KineticPotential(Composition):
-    """H = T(p) + V(q): drifts q += a h ∇T(p) and kicks p −= b h ∇V(q).
-
-    With friction a drift is the exact flow of q' = M⁻¹p, p' = −Γp, and the kicks stay as they are. Among vector fields
-    that are polynomials in p, kicks have the degree −1, and of drifts the friction lowers the degree: brackets of kicks
-    and drifts that vanish without friction by their degree vanish with it, those of Nyström and force-gradient schemes
-    among them, and brackets of degree −1, such as force gradients, are the same. So every scheme keeps its order.
-
-    Where H depends on t, the drift is the flow of T(p, t) + E, with which the time moves, E its momentum, and a kick is
-    at a time that stands still, force gradients too. A drift raises the degree by at most 1 if E counts 2, a kick
-    lowers it by 1 as before, and so every scheme keeps its order once more.
-    """
+    """H = T(p) + V(q): drifts q += a h ∇T(p) and kicks p −= b h ∇V(q)."""
 
     compensates: ClassVar[bool] = True
     takes_values: ClassVar[bool] = True
@@ -346,11 +333,7 @@ def _bends_of_gradient(system: HamiltonianSystem, q: Array, U: np.ndarray, t: An
 
 
 class ExactMaps(Composition):
-    """A step that is a list of exact flows of the parts of H; a subclass defines the list.
-
-    Where H depends on t, its momentum E belongs to a part that does not, with which the time moves; all others are
-    solved exactly at a time that stands still.
-    """
+    """A step that is a list of exact flows of the parts of H; a subclass defines the list."""
 
     takes_driving: ClassVar[bool] = True
     parts: ExactParts
@@ -446,11 +429,7 @@ def rollout_in_modes(
 
 
 class LinearRest(ExactMaps):
-    """H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): kicks by U, and drifts replaced by the exact linear flow.
-
-    The step is limited by U and by resonances of the linear frequencies with the step, not by the largest of them. The
-    system must have a `linear_part`.
-    """
+    """H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): kicks by U, and drifts replaced by the exact linear flow."""
 
     label: ClassVar[str] = "linear"
 
@@ -537,11 +516,7 @@ def _each_class(s: Any, parts: ExactParts) -> Any:
 
 
 class SolvableParts(ExactMaps):
-    """A symmetric composition of Strang steps over any number of parts of H that are solved exactly.
-
-    A Strang step of length h is φ₁(h/2) ∘ … ∘ φ_n(h) ∘ … ∘ φ₁(h/2). Where H depends on t, the time moves with the
-    innermost part; one that depends on it is divided into two halves, before and after.
-    """
+    """A symmetric composition of Strang steps over any number of parts of H that are solved exactly."""
 
     label: ClassVar[str] = "parts"
     counts_as_scheme: ClassVar[bool] = False

@@ -129,6 +129,8 @@ class Problem:
     events: EventSearch | None = None
     letters: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
+    followed: tuple[Any, ...] = ()
+    """The same as tensors (N,), of those whose gradients are wanted: of one form of H, which has them by their names."""
     progress: Progress | None = None
     """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None

@@ -54,19 +54,7 @@ class Passage(NamedTuple):
 def note_poles(
     outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None, stacklevel: int
 ) -> bool:
-    """End a run where it passed a place at which H is infinite or no number, and warn where it seems to have done so.
-
-    No solution passes such a place, but a step of fixed length sees nothing of what lies between its ends. Compared are
-    first the signs of what vanishes there, and H, at the start and at some outputs, at the cost of as many evaluations.
-    Where one of them is off, the steps are looked at: those that are outputs, or the run is executed again.
-
-    Between two states with H infinite on the way the status becomes −1. Where the place is a point in more than one
-    dimension, no sign changes; there is a warning if a step was long beside its distance and H changed for good.
-
-    `values` are the parameters of the trajectories, where they have some of their own.
-
-    Returns True if the run, or a trajectory of it, was ended.
-    """
+    """End a run where it passed a place at which H is infinite or no number; warn where it may have."""
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
     if problem.letters is not None:
@@ -154,11 +142,7 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> N
 def _look(
     system: HamiltonianSystem, looked: tuple[np.ndarray, np.ndarray, np.ndarray | None]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """True for states (n, N) with signs or H unlike the first ones, and for a start without H.
-
-    Also the largest kinetic energy, or change of the potential one, beside which H is judged: (N,).
-    None if there is no such state.
-    """
+    """True for states (n, N) with signs or H unlike the first ones, and for a start without H."""
     cells, H, T = looked
     if T is not None and (cells == cells[0]).all() and (H.max(0) - H.min(0) <= OFF * np.abs(T).max(0)).all():
         return None
@@ -269,20 +253,7 @@ def _end(
 
 
 def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem, told: bool = False) -> None:
-    """Add to the message, and as `stats["blow_up_time"]`, when the solution of a failed run becomes infinite.
-
-    The method's own last states tell little of when: a step leaps over a singularity and is finite for a while beyond
-    it, and one beyond the method's limit grows without a singularity. So the solution is followed again, by steps of
-    order 8 that are adapted to a tolerance, from y0; where the end is not reached in `MOST_TRIED` of them, from a state
-    some hundred steps before it, if that still has the energy of y0. The solution is singular where the steps become
-    too short to move t while the state grows without bound. Nothing is said where that is not settled, or the functions
-    of the system do not take NumPy arrays, or it has friction or is driven, with which energy tells nothing.
-
-    `blow_up_time` is an estimate. In a batch it is an array, NaN for
-    the trajectories that have none; without any it is left out.
-
-    `told` says that the message tells of a pole already.
-    """
+    """Add to the message, and as `stats["blow_up_time"]`, when the solution of a failed run becomes infinite."""
     if not told:
         _note_last_state(outcome, problem)
     if not (problem.system.conservative and problem.system.autonomous):  # a state of the solution is told by its energy
@@ -364,11 +335,7 @@ def _tail_states(
     h: np.ndarray,
     wanted: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) and states (n, 2d), `TAIL` to 2·`TAIL` steps before the end where `wanted`; else the beginning.
-
-    From the outputs where they hold one, and else by executing the run again from its beginning, bit by bit the same:
-    from elsewhere a chaotic orbit would take another course.
-    """
+    """Times (n,) and states (n, 2d), `TAIL` to 2·`TAIL` steps before the end where `wanted`; else the beginning."""
     sign, d2, y0 = 1.0 if problem.t1 >= problem.t0 else -1.0, 2 * problem.system.ndof, to_numpy(problem.y0)
     blocks = np.where(wanted, np.maximum(0, np.abs(failed_at - problem.t0) // (TAIL * h) - 1), 0)
     goal = problem.t0 + sign * blocks * TAIL * h
@@ -394,10 +361,7 @@ def _tail_states(
 def _end_of_solution(
     system: HamiltonianSystem, t: np.ndarray, y: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Solutions from y (n, 2d) at t (n,) to `end`: where they become infinite, else NaN; which go on; which are open.
-
-    Open are those whose steps are spent. By Dormand and Prince's method of order 8, each with steps of its own.
-    """
+    """Where solutions from y (n, 2d) at t (n,) to `end` become infinite, else NaN; which go on; which are open."""
     from scipy.integrate import DOP853
 
     A, B, E3, E5 = DOP853.A, DOP853.B, DOP853.E3, DOP853.E5

@@ -45,15 +45,7 @@ def _domain(flow: KnownFlow | None, system: HamiltonianSystem) -> Domain | None:
 
 
 def check_system_along(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
-    """A trained flow must have run on its own system: H is compared at the start and at a few states of the run.
-
-    A formula that is that of the flow needs no comparison.
-
-    Raises
-    ------
-    ValueError
-        If H of the system is another one at one of these states.
-    """
+    """A trained flow must have run on its own system: H is compared at the start and at a few states of the run."""
     identity = integrator.identity_for(system)
     if identity is None or identity.is_proved(system):
         return
@@ -77,10 +69,7 @@ def check_system_along(outcome: Outcome, integrator: Integrator, system: Hamilto
 
 
 def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stacklevel: int) -> None:
-    """Warn of a run that leapt over a singularity of V, and goes on with any energy.
-
-    A fixed step sees nothing of two bodies that meet between its ends. Looked at is the last output.
-    """
+    """Warn of a run that leapt over a singularity of V, and goes on with any energy."""
     n, width = len(outcome.t), 2 * system.ndof
     if not n:
         return
@@ -107,10 +96,7 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stackle
 def warn_of_loss(
     outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array, stacklevel: int
 ) -> None:
-    """Warn of a run that left the domain of its flow and lost far more energy than the flow does inside.
-
-    Looked at is the last output of a conservative system.
-    """
+    """Warn of a run that left the domain of its flow and lost far more energy than the flow does inside."""
     flow = integrator.known_flow(system)
     certificate = None if flow is None else flow.certified
     if certificate is None or "domain_exit" not in outcome.stats or not (system.conservative and system.autonomous):
@@ -135,13 +121,7 @@ def warn_of_loss(
 
 
 def check_start(flow: KnownFlow, system: HamiltonianSystem, y0: Array, compiled: bool) -> None:
-    """A flow that is taken for its accuracy must start where its accuracy was measured.
-
-    Raises
-    ------
-    ValueError
-        If a state of y0 is not in the domain of the flow.
-    """
+    """A flow that is taken for its accuracy must start where its accuracy was measured."""
     if compiled and _surely_within(flow, system, y0, 0.0):
         return
     domain = _domain(flow, system)

@@ -54,13 +54,7 @@ class Projected:
 
 
 def extended_run(run: Callable[[Problem], Outcome], extension: Extension, problem: Problem) -> Outcome:
-    """The outcome of a problem that is run on an extended phase space.
-
-    Warns
-    -----
-    RuntimeWarning
-        If the states of the run depart from those that stand for a state of the system.
-    """
+    """The outcome of a problem that is run on an extended phase space."""
     search = problem.events
     lifted = None if search is None else EventSearch(_of_projections(search, extension), search.max_interval)
     store = problem.store

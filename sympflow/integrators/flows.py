@@ -157,13 +157,7 @@ class FlowIntegrator(OwnStepper):
         return float(self.dt if self.dt is not None else self.known_flow(system).dt)
 
     def flow_like(self, system: HamiltonianSystem, y: Array) -> FlowMap:
-        """Return the flow for states such as y: a shipped one in their dtype and on their device, a given one as it is.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the given flow has another dtype or device.
-        """
+        """Return the flow for states such as y: a shipped one in their dtype and on their device."""
         import torch
 
         flow = self.flow_for(system)
@@ -373,11 +367,7 @@ class SympFlowIntegrator(FlowIntegrator):
         return self.flow is not None and self.flow.origin is not None
 
     def resolved(self, system: HamiltonianSystem, y0: Array, length: float, n_times: int = 0) -> FixedStep:
-        """Return the integrator that runs: with `tol`, over a `length` that is worth it, a flow in another time.
-
-        So does a flow in another time of this system that is given. A `tol` that no other meets is worth any length.
-        The more of its states are asked for at given times, the longer that is.
-        """
+        """Return the integrator that runs: with `tol`, over a `length` that is worth it, a flow in another time."""
         if self.flow is not None:
             return self._given_in_another_time(system)
         if self.tol is None or self.compensated or is_tensor(y0) or y0.dtype != np.float64:
@@ -526,10 +516,7 @@ class LogSympFlow(FixedStep):
         return replace(self, flow=found[0].load(system), shift=found[0].shift if self.shift is None else self.shift)
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock:
-        """Return the flow on its clock.
-
-        Where the kinetic energy is B, ds/dt is the scale. Without y0 no B is known, by which a trained clock advances.
-        """
+        """Return the flow on its clock."""
         flow: FlowMap = self.flow
         if flow is None:
             raise ValueError(

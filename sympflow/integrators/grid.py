@@ -32,9 +32,7 @@ def no_event(n_steps: int, t: float) -> str:
 def warn_of_jumps(
     system: HamiltonianSystem, t0: float, t1: float, dt: float | None, method: str | None, stacklevel: int
 ) -> bool:
-    """Warn where H is known to jump, and a method of fixed steps loses its order: within a step of length dt, or where
-    one ends if the `method`, by its name, takes a force there. Return True if it does.
-    """
+    """Warn, and return True, where H jumps within a step, or at the end of one at which the `method` takes a force."""
     if dt is None or not math.isfinite(t1) or t0 == t1:
         return False
     times = system.jump_times(min(t0, t1), max(t0, t1), dt / 4)
@@ -73,17 +71,7 @@ def _jumps_into(system: HamiltonianSystem, t: float, t0: float, t1: float, dt: f
 
 
 class Grid:
-    """Times t0 + k·h, k = 0 … n_steps, and a last shorter step of length `remainder` if h does not divide t1 − t0.
-
-    Counts are integers and times are t0 + k·h, never a running sum. A quotient within a few ulp of an integer is that
-    integer: ⌊0.3/0.1⌋ is 2 in floating point, but three steps of 0.1 lead to 0.3.
-
-    Parameters
-    ----------
-    t0, t1 : float
-    dt : float
-        Positive step length; `h` bears the sign of t1 − t0.
-    """
+    """Times t0 + k·h, k = 0 … n_steps, and a last shorter step of length `remainder` if h does not divide t1 − t0."""
 
     def __init__(self, t0: float, t1: float, dt: float) -> None:
         self.t0, self.t1 = float(t0), float(t1)
@@ -146,15 +134,7 @@ class Grid:
 
 
 class Outputs:
-    """The outputs of a run by their numbers 0 … n − 1: `Grid.outputs`, of which a part is made at a time.
-
-    Attributes
-    ----------
-    n : int
-        How many there are.
-    last : int
-        The steps that they need.
-    """
+    """The outputs of a run by their numbers 0 … n − 1: `Grid.outputs`, of which a part is made at a time."""
 
     def __init__(self, grid: Grid, t_eval: np.ndarray | None, save_every: int) -> None:
         self.grid, self.t_eval, self.every = grid, t_eval, save_every

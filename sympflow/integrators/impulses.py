@@ -16,16 +16,7 @@ Run = Callable[[Integrator, Problem], tuple[Outcome, Problem]]
 
 
 def run_between_impulses(run: Run, integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
-    """The outcome of a problem of a system with impulses, by runs from each to the next, and the problem.
-
-    States are continuous from the right: at an impulse the state is the one after it, whatever the direction of the
-    run. So the impulses of an interval are those that lie after its earlier end and not after its later one.
-
-    Parameters
-    ----------
-    run : callable
-        Runs an integrator on a problem without impulses.
-    """
+    """The outcome of a problem of a system with impulses, by runs from each to the next, and the problem."""
     t0, t1, times, search = problem.t0, problem.t1, problem.t_eval, problem.events
     low, high = min(t0, t1), max(t0, t1)
     near = 8 * EPS * max(abs(low), abs(high))
@@ -106,10 +97,7 @@ def _merged(found: list[Outcome], problem: Problem, ends: np.ndarray) -> Outcome
 
 @dataclass(frozen=True)
 class BetweenImpulses:
-    """The dense output of a run with impulses: that of the piece in which t lies, at an impulse the later one.
-
-    `times` are the ends of the pieces, which decrease in a run back in time.
-    """
+    """The dense output of a run with impulses: that of the piece in which t lies, at an impulse the later one."""
 
     pieces: tuple[Callable[[Any], Array], ...]
     times: np.ndarray

@@ -19,15 +19,7 @@ Time = Any
 
 
 class Interpolant:
-    """One step from t0 to t1: the polynomial Σ_j c_j x^j in x = (t − t0)/(t1 − t0).
-
-    Parameters
-    ----------
-    begin, end : float or tensor
-        t0 and t1: tensors where the length of the step carries a gradient.
-    coefficients : sequence of arrays or tensors (..., 2d)
-        The first is the state at t0.
-    """
+    """One step from t0 to t1: the polynomial Σ_j c_j x^j in x = (t − t0)/(t1 − t0)."""
 
     def __init__(self, begin: Time, end: Time, coefficients: Sequence[Array]) -> None:
         self.begin, self.end, self.coefficients = begin, end, coefficients
@@ -65,10 +57,7 @@ def hermite(t0: Time, t1: Time, y0: Array, y1: Array, f0: Array, f1: Array) -> I
 
 
 class Piecewise:
-    """Dense output: the interpolants of consecutive steps, up to t_end.
-
-    Call it with a time or an array of times (n,); the result has shape (..., 2d) or (..., 2d, n).
-    """
+    """Dense output: the interpolants of consecutive steps, up to t_end."""
 
     def __init__(self, steps: Sequence[Interpolant], y0: Array, t0: float, t_end: float) -> None:
         self.steps, self.y0 = steps, y0
@@ -112,13 +101,7 @@ class Piecewise:
 
 
 class Batch:
-    """The dense output of a batch that was run in parts: (..., 2d) or (..., 2d, n), NaN after the end of a part.
-
-    Parameters
-    ----------
-    sources : sequence of (Outcome, int)
-        For each trajectory the run that it was part of, and its place there.
-    """
+    """The dense output of a batch that was run in parts: (..., 2d) or (..., 2d, n), NaN after the end of a part."""
 
     def __init__(self, sources: Sequence[tuple[Outcome, int]], batch: tuple[int, ...], t_span: tuple[float, float]):
         self.batch, (self.t_min, self.t_max) = batch, sorted(t_span)

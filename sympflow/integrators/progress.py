@@ -16,21 +16,7 @@ WIDTH = 24  # characters of the bar
 
 
 class Progress:
-    """Progress of one call: the part of a total that is done, as it is told.
-
-    Parameters
-    ----------
-    asked : bool or callable
-        True for a bar on stderr; or a function of what is done and the total.
-    total : float or int
-    told : callable
-        Text beside the bar on what is done.
-
-    Raises
-    ------
-    TypeError
-        If `progress` is neither.
-    """
+    """Progress of one call: the part of a total that is done, as it is told."""
 
     def __init__(self, asked: Asked, total: Any, told: Callable[[Any], str]) -> None:
         check_progress(asked)

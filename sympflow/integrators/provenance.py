@@ -37,15 +37,7 @@ def flow_checksum(integrator: Integrator, system: HamiltonianSystem) -> str | No
 def provenance(
     system: HamiltonianSystem, integrator: Integrator, t_span: tuple[float, float]
 ) -> dict[str, str | float | list[float]]:
-    """Return the attributes of what a method computed of a system: texts, numbers and lists, as JSON and NetCDF have.
-
-    Returns
-    -------
-    dict
-        `sympflow_version`, `system` (its name), `hamiltonian` (H as it was written, of a symbolic system), `params`
-        (JSON), `damping` (JSON, of a damped system), `method`, `options`, `t_span`, `dt` (of fixed steps),
-        `flow_checksum` (of a trained flow), and `units`, which are those of the system.
-    """
+    """Return the attributes of a result of a method on a system: texts, numbers and lists, for JSON and NetCDF."""
     told: dict[str, Any] = {"sympflow_version": __version__, "system": system.name}
     if system.symbols is not None and len(system.symbols.text) <= LONGEST_EXPRESSION:
         told["hamiltonian"] = str(system.symbols.written[0])
@@ -63,10 +55,7 @@ def provenance(
 
 
 def known_by(system: HamiltonianSystem, integrator: Integrator, backend: str) -> Known:
-    """Return what every store knows its call by: the version, the system and the method, by all that they are made of.
-
-    The domain of a system, and the name of its time, are no part of it.
-    """
+    """Return the identity of a stored call: the version, the system and the method, by all their parts."""
     known = Known({"version": __version__, "backend": backend})
     known.add("system", system.name, system)
     options = f"{name_of(integrator)}, {option_text(integrator)}, flow={flow_checksum(integrator, system)}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -40,13 +41,7 @@ class ExplicitStep(ByVectorField):
 
     @staticmethod
     def compiled(system: HamiltonianSystem, name: str, *arguments: Any) -> Any:
-        """Return a function of `kernels.explicit_loops` called for a symbolic system.
-
-        Raises
-        ------
-        ValueError
-            If the system cannot be compiled, with the reason.
-        """
+        """Return a function of `kernels.explicit_loops` called for a symbolic system."""
         if system.symbols is None:
             raise ValueError(
                 "`system` cannot be compiled: its vector field is not symbolic. Use HamiltonianSystem.from_sympy, or "
@@ -110,7 +105,7 @@ class RungeKutta(ExplicitStep):
         if (HIDES * np.abs(y.reshape(-1, 2, system.ndof)).max((0, 2), initial=0.0) > self.atol).all():
             return float(self.atol)
         size = smallest_size(system, y)
-        return self.atol * size if HIDES * size <= self.atol else float(self.atol)
+        return max(self.atol * size, sys.float_info.min) if HIDES * size <= self.atol else float(self.atol)
 
 
 def weighted(weights: Any, K: list[Array]) -> Array:
@@ -119,11 +114,7 @@ def weighted(weights: Any, K: list[Array]) -> Array:
 
 
 def hopeless(n_steps: int, t0: float, t: float, t1: float, most: int) -> str | None:
-    """Why a run that has taken `n_steps` of `most` to t goes no further, or None.
-
-    It has taken as many as it may; or, looked at every ten thousand steps, needs ten times as many at its pace: on an
-    interval of 1e300, say, or with steps too short to move t.
-    """
+    """Why a run that has taken `n_steps` of `most` to t goes no further, or None."""
     left = abs(t1 - t)
     spent = n_steps >= most and left > 0
     if math.isinf(left):

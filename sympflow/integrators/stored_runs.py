@@ -55,15 +55,7 @@ class Driver(Protocol):
 
 
 class StoredRun:
-    """One run whose outputs a store takes; the outcome has none. A run that was stored before goes on.
-
-    Parameters
-    ----------
-    run : Driver
-        One with a stepper that takes a carry.
-    store : RunStore
-        One that is open.
-    """
+    """One run whose outputs a store takes; the outcome has none. A run that was stored before goes on."""
 
     def __init__(self, run: Driver, store: RunStore) -> None:
         self.run, self.store = run, store

@@ -12,17 +12,7 @@ Row = tuple[float, ...]
 
 @dataclass(frozen=True)
 class Tableau:
-    """Stages K_i = f(y + h Σ_j A_ij K_j) and the step y + h Σ_i B_i K_i.
-
-    Attributes
-    ----------
-    middle : tuple of float
-        Weights of the state at the middle of the step, y + h Σ_i middle_i K_i, from which the dense output is
-        interpolated; the last stage is the slope that torchdiffeq carries to the next step. Empty for fixed steps.
-    carries_slope : bool
-        torchdiffeq begins the next step with the slope of the last stage, which here is not the slope at y₁: the run is
-        then not the iteration of a one-step map.
-    """
+    """Stages K_i = f(y + h Σ_j A_ij K_j) and the step y + h Σ_i B_i K_i."""
 
     A: tuple[Row, ...]
     B: Row

@@ -40,10 +40,7 @@ Visit = Callable[[Interpolant], bool]
 
 
 class Trace:
-    """The right-hand side that torchdiffeq is given, in elapsed time: it counts its calls and announces the steps.
-
-    A subclass makes the interpolant of a step from what torchdiffeq's public callbacks tell.
-    """
+    """The right-hand side that torchdiffeq is given, in elapsed time: it counts its calls and announces the steps."""
 
     def __init__(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> None:
         self.system, self.visit, self.t_span = system, visit, t_span
@@ -214,13 +211,7 @@ COUNTS = ("n_steps", "force_evaluations", "hessian_evaluations")
 
 
 def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace) -> Outcome:
-    """The outcome of a batch that failed when run jointly.
-
-    A part that fails is divided, until what fails is one trajectory: the fast ones from the others where some are much
-    faster, as before a singularity, else into halves. So a few that fail cost a few runs, not one run a trajectory.
-    The steps of all parts count against one bound, the method's; where it is
-    met, what had been computed is kept, of the part or of what it is a half of, whichever came further.
-    """
+    """The outcome of a batch that failed when run jointly."""
     batch, times = problem.y0.shape[:-1], joint.t
     rows = problem.y0.reshape(-1, problem.y0.shape[-1])
     n = len(rows)
@@ -581,10 +572,7 @@ class FixedGrid(ExplicitStep, FixedStep):
         return Stepper(self, problem, told) if kernel is None else KernelStepper(self, problem, kernel)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact.
-
-        Under `torch.func.vmap` or `torch.compile`, which torchdiffeq's loop does not allow, the same steps by `step`.
-        """
+        """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact."""
         if not readable(problem.y0):
             return super().rollout(problem, h, n_steps, save)
         import torch

@@ -62,15 +62,7 @@ def first_window(stepper: Steps, problem: Problem, n_steps: int, n_saved: int) -
 
 
 class Pace:
-    """The lengths of windows, by the time that the last one took.
-
-    Parameters
-    ----------
-    first : int
-        Steps of the first.
-    seconds : float
-        The time that one is to take.
-    """
+    """The lengths of windows, by the time that the last one took."""
 
     def __init__(self, first: int, seconds: float = SECONDS) -> None:
         self.n, self.seconds = first, seconds
@@ -88,26 +80,7 @@ class Pace:
 
 
 class Pieces:
-    """A run in pieces.
-
-    Parameters
-    ----------
-    stepper : Steps
-        One that takes a carry.
-    problem : Problem
-    h : float
-    carry : Carry
-        Where it begins; it is not changed.
-    finite : ndarray of int, optional
-        Of a run that goes on, the last finite step of each trajectory so far.
-
-    Attributes
-    ----------
-    carry : Carry
-        Where the run is.
-    finite : ndarray of int
-        Index of the last finite state of each trajectory; `carry.steps` of those that go on.
-    """
+    """A run in pieces."""
 
     def __init__(
         self, stepper: Steps, problem: Problem, h: float, carry: Carry, finite: np.ndarray | None = None
@@ -134,14 +107,7 @@ class Pieces:
 
 
 class Saved:
-    """The states that the windows of a run have saved, as one array (n, ..., 2d).
-
-    Parameters
-    ----------
-    n : int
-        How many there will be.
-    y0 : array or tensor
-    """
+    """The states that the windows of a run have saved, as one array (n, ..., 2d)."""
 
     def __init__(self, n: int, y0: Array) -> None:
         self.n, self.y0 = n, y0

@@ -14,7 +14,7 @@ from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, Map
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
+from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
 from sympflow.schemes import CURVATURE, Scheme
@@ -91,8 +91,6 @@ class PrimedFlowKernel(Kernel):
         friction, where the numbers of a step are no polynomials in h.
     """
 
-    saves_finite = True
-
     def __init__(
         self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False, step: ArrayStep | None = None
     ) -> None:
@@ -115,49 +113,14 @@ class PrimedFlowKernel(Kernel):
         """Count those of the numbers that the kernel has: see `Kernel`."""
         return self._tables.evaluations(n_steps, n_saved, n_extra, "compiled")
 
-    def run(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        """`n_steps` times ψ̄_h from one state, of a driven system at the time t0: see `Kernel`."""
+    def runs(self, task: Task) -> Run:
+        """`n_steps` times ψ̄_h from every row, of a driven system at the time t0: see `Kernel`."""
         if not self._tables.processed:
-            return self._kernel(h).run(abs(h), y0, n_steps, save, carry, t0)
-        tables = self._processed(h, t0)
-        rollout = partial(self._functions().rollout_processed, *tables)
-        width, work = len(y0) * (1 + self._compensated), _stages(tables, n_steps, save) * len(y0) // 2
-        return run_state(rollout, y0, n_steps, save, carry, width, work)
-
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        if len(y0) == 1:
-            return _one_row(partial(self.run, t0=t0), h, y0, n_steps, save, carry)
-        if not self._tables.processed:
-            return self._kernel(h).run_batch(abs(h), y0, n_steps, save, threads, carry, t0)
-        tables, rollout = self._processed(h, t0), self._functions().rollout_processed_batch
-
-        def rows(_: slice, *rest: Any) -> None:
-            rollout(*tables, *rest)
-
-        size = y0.shape[1]
-        width, work = (
-            size * (1 + self._compensated),
-            _stages(tables, n_steps, save) * size / 2 / self._splitting.abreast,
-        )
-        return run_states(rows, y0, n_steps, save, threads, carry, width, work)
+            return self._kernel(task.h).runs(task._replace(h=abs(task.h)))
+        tables, (N, size) = self._processed(task.h, task.t0), task.y0.shape
+        work = _stages(tables, task) * size / 2 / (self._splitting.abreast if N > 1 else 1.0)
+        rollout = partial(self._functions().run_processed, *tables)
+        return run_states(rollout, task, size * (1 + self._compensated), work)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h.
@@ -247,9 +210,9 @@ class PrimedFlowKernel(Kernel):
         return self._tables.kept(("processed", h, loops.values), make)
 
 
-def _stages(tables: Sequence[np.ndarray], n_steps: int, save: np.ndarray) -> int:
+def _stages(tables: Sequence[np.ndarray], task: Task) -> int:
     """Stages of a step of a run with a processor, with its share of those of the outputs."""
-    return tables[1].shape[1] + tables[2].shape[1] * -(-len(save) // max(n_steps, 1))
+    return tables[1].shape[1] + tables[2].shape[1] * -(-len(task.save) // max(task.n_steps, 1))
 
 
 def _stepped_by(step: ArrayStep, y: np.ndarray, h: np.ndarray, t: Any = 0.0) -> np.ndarray:
@@ -280,8 +243,6 @@ class SplitFlowKernel(Kernel):
         Δt.
     """
 
-    saves_finite = True
-
     def __init__(self, maps: MapSource, parts: ExactParts, dt: float) -> None:
         from sympflow.kernels.parts_loops import parts_loops
 
@@ -289,25 +250,11 @@ class SplitFlowKernel(Kernel):
         self._loops = parts_loops(parts)
         self._kernel = self._loops.kernel(lambda h: maps.maps(float(h)))
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
-        """`n_steps` times ψ̄_h from one state: see `Kernel`."""
-        return self._kernel.run(h, y0, n_steps, save, carry)
+    def runs(self, task: Task) -> Run:
+        """`n_steps` times ψ̄_h from every row: see `Kernel`."""
+        return self._kernel.runs(task)
 
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        if len(y0) == 1:
-            return _one_row(self.run, h, y0, n_steps, save, carry)
-        return self._kernel.run_batch(h, y0, n_steps, save, threads, carry)
-
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         h = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
         out = np.array(y, dtype=np.float64)
@@ -318,17 +265,6 @@ class SplitFlowKernel(Kernel):
             if rows.any():
                 out[rows] = self._loops.step_by_coefficients(sequence, dt, np.abs(h[rows]), y[rows])
         return Steps(out)
-
-
-def _one_row(
-    run: Callable[..., Run], h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None
-) -> Run:
-    """The run of a batch of one state, by that of one state."""
-    one = None if carry is None else Carry(carry.steps, None if carry.running is None else carry.running[0])
-    states, n_finite, _ = run(h, y0[0], n_steps, save, carry=one)
-    if carry is not None and one is not None and one.running is not None:
-        carry.advance(n_steps, one.running[None])
-    return Run(states[None], np.array([n_finite]))
 
 
 class ClockedFlowKernel(Kernel):
@@ -360,27 +296,15 @@ class ClockedFlowKernel(Kernel):
         self._scheme, self._kernel = scheme, splitting_loops(system).kernel(scheme)
         self._advance, self._numbers, self._time = advance, numbers, system.ndof - 1
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
-        """`n_steps` times ψ̄_h from one state, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
-        Y, n_finite, _ = self._kernel.run(h, y0, n_steps, save, carry)
-        Y[:, self._time] += np.asarray(save) * self._advance(float(h), float(y0[-1]))
+    def runs(self, task: Task) -> Run:
+        """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
+        Y, n_finite, _ = self._kernel.runs(task)
+        B = task.y0[:, -1]
+        advance = self._advance(task.h, B) if len(B) > 1 else np.array([self._advance(task.h, float(B[0]))])
+        Y[:, :, self._time] += np.asarray(task.save) * advance[:, None]
         return Run(Y, n_finite)
 
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        Y, n_finite, _ = self._kernel.run_batch(h, y0, n_steps, save, threads, carry)
-        Y[:, :, self._time] += np.asarray(save) * self._advance(h, y0[:, -1])[:, None]
-        return Run(Y, n_finite)
-
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         out = self._kernel.step(h, y).states
         if len(out) == 1:  # as plain numbers, ten times faster
@@ -427,33 +351,17 @@ class CollocatedFlowKernel(Kernel):
 
         self._kernel, self._steps = implicit_kernel(system, tableau), steps
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
-        """`n_steps` times ψ̄_h from one state, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
-        return self._whole(self._kernel.run, h, y0, n_steps, save, carry)
-
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d), where it pays on several threads."""
-        return self._whole(partial(self._kernel.run_batch, threads=threads), h, y0, n_steps, save, carry)
-
-    def _whole(
-        self, run: Callable[..., Run], h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None
-    ) -> Run:
-        m = self._steps
+    def runs(self, task: Task) -> Run:
+        """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
+        m, carry = self._steps, task.carry
         inner = None if carry is None else Carry(m * carry.steps, carry.running, carry.spare)
-        states, n_finite, iterations = run(h / m, y0, m * n_steps, m * np.asarray(save), carry=inner)
+        asked = task._replace(h=task.h / m, n_steps=m * task.n_steps, save=m * np.asarray(task.save), carry=inner)
+        states, n_finite, iterations = self._kernel.runs(asked)
         if carry is not None and inner is not None:
-            carry.advance(n_steps, inner.running)
+            carry.advance(task.n_steps, inner.running)
         return Run(states, n_finite // m, iterations)
 
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         share, iterations = np.asarray(h, dtype=np.float64) / self._steps, 0
         for _ in range(self._steps):

@@ -24,7 +24,7 @@ from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.program import traced
 from sympflow.kernels.activations import SLOPES
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
+from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts, aligned
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.threads import run_rows
@@ -97,29 +97,11 @@ class MLPFlowKernel(Kernel):
     def __reduce__(self) -> tuple[Any, ...]:
         return MLPFlowKernel, self._given
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
-        """`n_steps` times ψ̄_h from one state: see `Kernel`."""
-        Y, n_finite, _ = self.run_batch(h, y0[None], n_steps, save, 1, carry)
-        return Run(Y[0], int(n_finite[0]))
+    def runs(self, task: Task) -> Run:
+        """`n_steps` times ψ̄_h from every row: see `Kernel`."""
+        return run_states(partial(self._rollouts.run, task.h, closed=False), task, task.y0.shape[1], STEP)
 
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-
-        def rows(_: slice, *rest: Any) -> None:
-            arguments: tuple[Any, ...] = h, *rest, False
-            self._rollouts.rollout_batch(*arguments)
-
-        return run_states(rows, y0, n_steps, save, threads, carry, y0.shape[1], STEP)
-
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,), negative for the inverse."""
         steps, out = np.empty(len(y)), np.empty(y.shape)
         steps[:] = h
@@ -132,15 +114,9 @@ class MLPFlowKernel(Kernel):
 
     def _steps(self, sign: float, y: np.ndarray, h: np.ndarray) -> np.ndarray:
         """Steps of one sign."""
-        given = np.concatenate([y, np.abs(h)[:, None]], axis=1)
-        out, finite = np.empty((len(y), 1, y.shape[1])), np.empty(len(y), dtype=np.int64)
-
-        def rows(i: slice, stop: np.ndarray) -> None:
-            running = np.empty((len(y[i]), 0))
-            self._rollouts.rollout_batch(sign, given[i], 1, ONE, out[i], finite[i], stop, 0, running, False)
-
-        run_rows(rows, len(y), STEP, None)
-        return out[:, 0]
+        batch = Batch.whole(np.concatenate([y, np.abs(h)[:, None]], axis=1), 1, ONE, y.shape[1])
+        run_rows(lambda i, _: self._rollouts.run(sign, batch.rows(i.start, i.stop), False), len(y), STEP, None)
+        return batch.out[:, 0]
 
 
 class _Layout(NamedTuple):

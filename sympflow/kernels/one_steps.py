@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from sympflow.compiler.program import Program, traced
 from sympflow.hamiltonian.driving import with_letters
 from sympflow.hamiltonian.recorded import check_recorded, evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_states
+from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.samples import check_samples, sampled_value
@@ -177,8 +178,6 @@ class OneStepKernel(Kernel):
         What the method adds to the numbers of steps of lengths h (n,): (n, k).
     """
 
-    saves_finite = True
-
     def __init__(self, code: OneStep, single: OneStep, more: Callable[[np.ndarray], np.ndarray] | None = None) -> None:
         self._code, self._single, self._more = code, single, more
 
@@ -192,40 +191,11 @@ class OneStepKernel(Kernel):
             numbers.append(self._more(h))
         return np.concatenate(numbers, axis=1)
 
-    def run(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        """`n_steps` steps of length `h` from one state: see `Kernel`."""
-        Y, n_finite, iterations = self.run_batch(h, y0[None], n_steps, save, None, carry, t0)
-        return Run(Y[0], int(n_finite[0]), iterations)
-
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d), where it pays on several threads."""
-        code, counts = self._code, np.zeros(len(y0))
-        rollout: Any = code.rollout_batch
-        columns = np.repeat(self._numbers(np.array([h]), np.array([t0])), 3, axis=0), np.zeros(3, dtype=np.int64)
-
-        def rows(i: slice, *rest: Any) -> None:
-            rollout(columns, *rest, closed=False, counts=counts[i])
-
-        width = code.n_values - code.counted
-        Y, n_finite, _ = run_states(rows, y0, n_steps, save, threads, carry, width, code.work)
-        return Run(Y, n_finite, int(counts.sum()))
+    def runs(self, task: Task) -> Run:
+        code, numbers = self._code, self._numbers(np.array([task.h]), np.array([task.t0]))
+        columns = np.repeat(numbers, 3, axis=0), np.zeros(3, dtype=np.int64)
+        rollout = partial(code.run, columns, closed=False)
+        return run_states(rollout, task, code.n_values - code.counted, code.work, counts=code.counted)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""

@@ -22,11 +22,11 @@ from sympflow.compiler.program import Program, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
 from sympflow.kernels.one_steps import Lettered, recorded
 from sympflow.kernels.passes import row_products
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
+from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers
 from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
-from sympflow.kernels.threads import NEVER, given
+from sympflow.kernels.threads import given
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
@@ -353,9 +353,9 @@ class PartsLoops:
         code, groups = self._singles(maps), [*((k,) for k in codes.tolist()), (IDLE,), (IDLE,)]
         columns = code.columns(groups, np.concatenate([entries, 0 * entries[:, :1], 0 * entries[:, :1]], axis=1))
         rows = np.concatenate([start, np.arange(len(y), dtype=float)[:, None]], axis=1)
-        out, n_finite = np.empty((len(y), 1, start.shape[1])), np.empty(len(y), dtype=np.int64)
-        code.rollout_batch(columns, rows, 1, ONE, out, n_finite, NEVER, 0, np.empty((len(y), 0)), False)
-        return self.states(out[:, 0])
+        batch = Batch.whole(rows, 1, ONE, start.shape[1])
+        code.run(columns, batch, False)
+        return self.states(batch.out[:, 0])
 
     def step_modes(self, sequence: Sequence[Map], modes: np.ndarray) -> np.ndarray:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
@@ -505,47 +505,15 @@ class _Table(NamedTuple):
 class PartsKernel(Kernel):
     """The compiled loops of one splitting of a system into parts, a `Kernel`: see `PartsLoops.kernel`."""
 
-    saves_finite = True
-
     def __init__(self, loops: PartsLoops, maps: Maps) -> None:
         self.loops, self.maps = loops, maps
 
-    def run(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        """`n_steps` steps of length `h` from one state: see `Kernel`."""
-        loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
-        (code, columns), start = loops.run_table(sequence, h, t0), loops.modes(y0[None])[0]
-        rollout, work = partial(code.rollout, columns), len(sequence) * loops.parts.ndof
-        Y, n_finite, _ = run_state(rollout, start, n_steps, save, carry, len(start), work)
-        return Run(loops.states(Y, save, y0), n_finite)
-
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        loops, sequence = self.loops, self.maps(np.asarray(h, dtype=float))
-        (code, columns), start = loops.run_table(sequence, h, t0), loops.modes(y0)
-
-        def rows(_: slice, *rest: Any) -> None:
-            code.rollout_batch(columns, *rest)
-
+    def runs(self, task: Task) -> Run:
+        loops, sequence = self.loops, self.maps(np.asarray(task.h, dtype=float))
+        (code, columns), start = loops.run_table(sequence, task.h, task.t0), loops.modes(task.y0)
         work = len(sequence) * loops.parts.ndof
-        Y, n_finite, _ = run_states(rows, start, n_steps, save, threads, carry, start.shape[1], work)
-        return Run(loops.states(Y, save, y0[:, None]), n_finite)
+        Y, n_finite, _ = run_states(partial(code.run, columns), task._replace(y0=start), start.shape[1], work)
+        return Run(loops.states(Y, task.save, task.y0[:, None]), n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""

@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.carry import Carry
-from sympflow.kernels.threads import given, run_one, run_rows
+from sympflow.kernels.threads import NEVER, given, run_rows
 
-__all__ = ["Carry", "Kernel", "Run", "Steps", "run_state", "run_states"]
+if TYPE_CHECKING:
+    from sympflow.kernels.reverse import Recorded
 
-NOTHING = np.empty(0), np.empty((0, 0))
-"""The running state of runs that are not cut, of one state and of a batch."""
+__all__ = ["Batch", "Carry", "Kernel", "Run", "Steps", "Task", "run_states"]
+
+NOTHING: Any = np.empty(0)
+
+
+class Task(NamedTuple):
+    """A run that is asked for, of states `y0` (N, 2d): see `Kernel.run`."""
+
+    h: float
+    y0: np.ndarray
+    n_steps: int
+    save: np.ndarray
+    carry: Carry | None = None
+    t0: float = 0.0
+    threads: int | None = None
+
+    @property
+    def goes_on(self) -> bool:
+        """True if the run goes on from a place where it was cut."""
+        return self.carry is not None and self.carry.running is not None
 
 
 class Run(NamedTuple):
@@ -36,86 +55,117 @@ class Run(NamedTuple):
     iterations: int = 0
 
 
-def run_state(
-    rollout: Callable[..., int],
-    y0: np.ndarray,
-    n_steps: int,
-    save: np.ndarray,
-    carry: Carry | None,
+class Batch(NamedTuple):
+    """Rows of a run for compiled code: what it is given and what it fills.
+
+    Attributes
+    ----------
+    y0 : ndarray of shape (N, 2d), or (N, 2d + n) with values of its own behind each state
+    n_steps : int
+    save : ndarray of int64
+    out : ndarray of shape (N, n, 2d)
+    n_finite : ndarray of int64 of shape (N,)
+    first : int
+        Steps that were made before: the run goes on from `running`.
+    running : ndarray of shape (N, K), or (N, 0) where the end of the run is not needed
+    counts : ndarray of shape (N,), or (0,) of stages that count nothing
+    stop : ndarray of int64 of shape (1,)
+        The run ends soon once it is not 0.
+    kept : ndarray, optional
+        Room for the states before all stages: see `sympflow.kernels.runs.run_function`.
+    """
+
+    y0: np.ndarray
+    n_steps: int
+    save: np.ndarray
+    out: np.ndarray
+    n_finite: np.ndarray
+    first: int
+    running: np.ndarray
+    counts: np.ndarray = NOTHING
+    stop: np.ndarray = NEVER
+    kept: np.ndarray | None = None
+
+    @classmethod
+    def whole(cls, y0: np.ndarray, n_steps: int, save: np.ndarray, n_out: int) -> Batch:
+        """A run from its beginning, of which the end is not needed."""
+        out, n_finite = np.empty((len(y0), len(save), n_out)), np.empty(len(y0), dtype=np.int64)
+        return cls(y0, n_steps, save, out, n_finite, 0, np.empty((len(y0), 0)))
+
+    def rows(self, begin: int, end: int, stop: np.ndarray | None = None) -> Batch:
+        """Some of the rows, and what stops them."""
+        stop = self.stop if stop is None else stop
+        if begin == 0 and end >= len(self.y0):
+            return self if stop is self.stop else self._replace(stop=stop)
+        y0, n_steps, save, out, finite, first, running, counts, *_ = self
+        i = slice(begin, end)
+        return Batch(y0[i], n_steps, save, out[i], finite[i], first, running[i], counts[i], stop)
+
+    @property
+    def ended(self) -> Sequence[int]:
+        """The rows that ended early."""
+        if len(self.n_finite) == 1:
+            return (0,) if self.n_finite[0] < self.n_steps else ()
+        return np.flatnonzero(self.n_finite < self.n_steps).tolist()
+
+
+def run_states(
+    rollout: Callable[[Batch], None],
+    task: Task,
     width: int,
-    work: int,
-    out: np.ndarray | None = None,
+    work: float,
+    start: np.ndarray | None = None,
+    counts: bool = False,
 ) -> Run:
-    """The run of one state by ``rollout(y0, n_steps, save, out, stop, first, running)``, which is compiled.
+    """A run of every row of a task by `rollout`, which is compiled, on as many threads as pay.
 
     Parameters
     ----------
     rollout : callable
-        Returns the index of the last step that ends in a finite state.
-    y0 : ndarray of shape (2d,)
-    n_steps, save, carry
-        See `Kernel.run`.
+        Fills some rows of a batch.
+    task : Task
     width : int
         K, the size of the running state.
-    work : int
+    work : float
         About how many nanoseconds a step takes.
-    out : ndarray of shape (n, 2d), optional
-        Where the states go.
+    start : ndarray of shape (N, 2d + n), optional
+        The states with values of their own behind them.
+    counts : bool
+        True if stages count iterations.
     """
-    y0, save = given(y0), given(save, np.int64)
-    if out is None:
-        out = np.empty((len(save), len(y0)))
-    first, running = 0, NOTHING[0]
+    y0, save, carry, first = given(task.y0), given(task.save, np.int64), task.carry, 0
+    N, before = len(y0), None
+    running = np.empty((N, 0))
     if carry is not None:
-        first, running = carry.steps, np.empty(width) if carry.running is None else carry.running.copy()
-        _check_running(running, (width,))
-    n_finite = run_one(lambda stop: rollout(y0, n_steps, save, out, stop, first, running), (n_steps - first) * work)
-    if carry is not None:
-        carry.advance(n_steps, running)
-    return Run(out, n_finite)
-
-
-def run_states(
-    rollout: Callable[..., None],
-    y0: np.ndarray,
-    n_steps: int,
-    save: np.ndarray,
-    threads: int | None,
-    carry: Carry | None,
-    width: int,
-    work: float,
-) -> Run:
-    """`run_state` of every row of `y0` (N, 2d), as many threads as pay.
-
-    `rollout` is called with the rows that it is to run before everything else, and with their `n_finite` after `out`.
-    """
-    y0, save = given(y0), given(save, np.int64)
-    out, n_finite = np.empty((len(y0), len(save), y0.shape[1])), np.empty(len(y0), dtype=np.int64)
-    first, running, before = 0, NOTHING[1], None
-    if carry is not None:
-        first, before, shape = carry.steps, carry.running, (len(y0), width)
-        fits = carry.spare is not None and carry.spare.shape == shape
-        running = carry.spare if fits else np.empty(shape)  # new memory of many orbits takes as long as some steps
-        _check_running(running if before is None else before, shape)
+        first, before, spare, shape = carry.steps, carry.running, carry.spare, (N, width)
+        fits = spare is not None and spare.shape == shape
+        running = spare if fits else np.empty(shape)  # new memory of many orbits takes as long as some steps
+        if before is not None:
+            before = _fitting(before, shape)
+        _fitting(running, shape)
+    out, n_finite = np.empty((N, len(save), y0.shape[1])), np.empty(N, dtype=np.int64)
+    counted = np.zeros(N) if counts else NOTHING
+    batch = Batch(y0 if start is None else start, task.n_steps, save, out, n_finite, first, running, counted)
 
     def rows(i: slice, stop: np.ndarray) -> None:
         if before is not None:
             running[i] = before[i]
-        rollout(i, y0[i], n_steps, save, out[i], n_finite[i], stop, first, running[i])
+        rollout(batch.rows(i.start, i.stop, stop))
 
-    run_rows(rows, len(y0), (n_steps - first) * work, threads)
+    run_rows(rows, N, (task.n_steps - first) * work, task.threads)
     if carry is not None:
-        carry.advance(n_steps, running)
-    return Run(out, n_finite)
+        carry.advance(task.n_steps, running)
+    return Run(out, n_finite, int(counted.sum()) if counts else 0)
 
 
-def _check_running(running: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Refuse what loops would read beyond, as a damaged store may hold."""
-    if running.shape != shape or running.dtype != np.float64:
+def _fitting(running: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """The running states as rows; refused where loops would read beyond, as a damaged store may hold."""
+    if running.dtype != np.float64 or running.shape not in (shape, shape[1:] if shape[0] == 1 else shape):
         raise ValueError(
             f"`store` is damaged: its run goes on from {running.dtype} of shape {running.shape}, not {shape}. Name "
             "another folder."
         )
+    return running.reshape(shape)
 
 
 class Steps(NamedTuple):
@@ -125,11 +175,8 @@ class Steps(NamedTuple):
     iterations: int = 0
 
 
-class Kernel(Protocol):
-    """Compiled loops of a method on one system; states are [q, p], float64.
-
-    For a driven system, and for no other, `run` and `run_batch` are given ``t0=``, the time of the states `y0`, and
-    `step` has a third argument t (N,), the times of its states.
+class Kernel:
+    """Compiled loops of a method on one system; states are [q, p], float64. A subclass says `runs` and `step`.
 
     Attributes
     ----------
@@ -139,17 +186,26 @@ class Kernel(Protocol):
         The name of what runs, of `stats["backend"]`.
     """
 
-    saves_finite: bool
-    backend: str = "compiled"
+    saves_finite = True
+    backend = "compiled"
 
-    def run(self, h: float, y0: np.ndarray, n_steps: int, save: np.ndarray, carry: Carry | None = None) -> Run:
-        """`n_steps` steps from one state.
+    def run(
+        self,
+        h: float,
+        y0: np.ndarray,
+        n_steps: int,
+        save: np.ndarray,
+        carry: Carry | None = None,
+        t0: float = 0.0,
+        threads: int | None = None,
+    ) -> Run:
+        """`n_steps` steps from one state, or from every row.
 
         Parameters
         ----------
         h : float
             Step, negative to go back.
-        y0 : ndarray of shape (2d,)
+        y0 : ndarray of shape (2d,) or (N, 2d)
         n_steps : int
         save : ndarray of int64, sorted, in 0 … n_steps
             The steps whose states are kept.
@@ -157,24 +213,33 @@ class Kernel(Protocol):
             Where the run goes on, and leaves its end: of `n_steps` steps those after ``carry.steps`` are made. All
             counts, those of `save` and of the result too, are from `y0`, which is the state that the first piece began
             with; `save` begins after ``carry.steps``.
+        t0 : float
+            The time of the states `y0`, of a driven system.
+        threads : int, optional
+            As many as pay by default.
         """
-        ...
+        if y0.ndim > 1:
+            return self.runs(Task(h, y0, n_steps, save, carry, t0, threads))
+        found = self.runs(Task(h, y0[None], n_steps, save, carry, t0, threads))
+        if carry is not None and carry.running is not None:
+            carry.running = carry.running[0]
+        return Run(found.states[0], int(found.n_finite[0]), found.iterations)
 
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d); `threads` is the number of threads, by default as many as pay."""
-        ...
+    def runs(self, task: Task) -> Run:
+        """The runs of a task, in vector lanes and, where it pays, on several threads."""
+        raise NotImplementedError
 
-    def step(self, h: ArrayLike, y: np.ndarray) -> Steps:
-        """One step from each row of `y` (N, 2d), each of its own length `h` (N,)."""
-        ...
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,), of a driven system at times t."""
+        raise NotImplementedError
+
+    def check_reverse(self) -> None:
+        """Raise a ValueError, with the reason, where runs cannot be differentiated: see `recorded`."""
+        raise ValueError("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
+
+    def recorded(self, task: Task) -> Recorded:
+        """`runs` of which cotangents can be pulled back."""
+        raise NotImplementedError
 
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The `step` from each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d); None where they are not compiled."""

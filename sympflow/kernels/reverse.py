@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.kernels.rollouts import NONE, Rollouts, aligned, zeros
+from sympflow.kernels.protocol import Batch
+from sympflow.kernels.rollouts import Rollouts, aligned, zeros
 from sympflow.kernels.threads import BLOCK, NEVER, given, run_rows
 
 __all__ = ["Recorded"]
@@ -33,8 +34,6 @@ class Recorded:
     save : ndarray of int64, sorted, in 0 … n_steps
     work : float
         About how many nanoseconds a step of a row takes.
-    kept : bool
-        False if all states would not be used, as no cotangents are to come.
 
     Attributes
     ----------
@@ -90,9 +89,8 @@ class Recorded:
         for first, to in pairwise(self._ends):
             history.append(self._room(n, to) if self._whole else running.copy())
             chosen, kept = self._saved(first, to), history[-1] if self._whole else None
-            out = self.states[i, chosen]
-            rest = to, self._save[chosen], stop, first, True, kept
-            code._some(self._table, self._y0[i], out, found, running, NONE, *rest)
+            batch = Batch(self._y0[i], to, self._save[chosen], self.states[i, chosen], found, first, running)
+            code.run(self._table, batch._replace(stop=stop, kept=kept))
             self.n_finite[i] = np.where(alive, found, self.n_finite[i])
             alive &= found >= to
         if self._n_steps == 0:
@@ -165,15 +163,13 @@ class Recorded:
         for (first, to), kept in reversed([*zip(pairwise(self._ends), self._histories[i.start], strict=True)]):
             if not self._whole:
                 running, kept = kept, self._room(n, to - first)
-                finite, nothing = np.empty(n, dtype=np.int64), np.empty((n, 0, code.n_out))
-                rest = finite, stop, first, running, False, width, NONE, kept
-                code._run(table, y0, to, self._save[:0], nothing, *rest)
-            later = self._save[slice(*self._save.searchsorted((first, to), "right").tolist())]
+                nothing = np.empty((n, 0, code.n_out)), np.empty(n, dtype=np.int64)
+                batch = Batch(y0, to, self._save[:0], *nothing, first, running, stop=stop, kept=kept)
+                code.run(table, batch, False)
             chosen = slice(*self._save.searchsorted((first, to), "right").tolist())
-            outputs = np.ascontiguousarray(given[:, chosen])
-            if not len(later):
-                later, outputs = NEVER, np.zeros(1)
-            count = chosen.stop - chosen.start
+            later, outputs, count = self._save[chosen], np.ascontiguousarray(given[:, chosen]), chosen.stop - chosen.start
+            if not count:
+                later = outputs = NEVER
             arguments = entries, kinds, len(kinds) - 2, kept, rows, n, first, to, later, count, outputs, found
             code.call(name, width, *arguments)
         of_states[i] = rows

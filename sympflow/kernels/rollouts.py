@@ -11,12 +11,12 @@ import numpy as np
 
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
+from sympflow.kernels.protocol import Batch
 from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "aligned", "filled", "zeros"]
 
-NONE = np.empty(0)
 LINE = 8  # numbers in a line of memory
 START = np.zeros(1, dtype=np.int64)
 AT_ONCE = 4096  # trajectories with tables of their own
@@ -110,6 +110,14 @@ class Rollouts:
         """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
         raise NotImplementedError
 
+    def check_reverse(self) -> None:
+        """Raise a ValueError, with the reason, where there is none."""
+        raise ValueError("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
+
+    def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+        """From cotangents (m, size, …) of the numbers of columns to those of the numbers of a table (n, m, …)."""
+        raise NotImplementedError
+
     def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
         """One column of many states: see `sympflow.kernels.runs.Over`."""
         each(lambda values: self.stage(values, numbers, kind, step))
@@ -172,94 +180,23 @@ class Rollouts:
             arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, places
         self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
 
-    def rollout(
-        self,
-        table: Any,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool = True,
-    ) -> int:
-        """The steps from `first` to `n_steps` from `y0` (2d,), the states after ``save[i]`` steps into ``out[i]``."""
-        finite = np.empty(1, dtype=np.int64)
-        self._run(table, y0[None], n_steps, save, out[None], finite, stop, first, running[None], closed, 1)
-        return int(finite[0])
+    def run(self, table: Any, batch: Batch, closed: bool = True) -> None:
+        """Run the rows of a batch in the lanes of registers; those that end early once more, alone, to find where."""
+        size = AT_ONCE if batch.y0.shape[1] > self.n_out else len(batch.y0)
+        for k in range(0, len(batch.y0), size or 1):
+            part = batch.rows(k, k + size)
+            if len(part.y0) < self.fewest:
+                self._run(table, part, closed, 1)
+                continue
+            before = part.running.copy() if part.first > 0 else part.running
+            self._run(table, part, closed, self.lanes)
+            for i in part.ended if self.lanes > 1 and not part.stop[0] else ():
+                part.running[i] = before[i]
+                self._run(table, part.rows(i, i + 1), closed, 1)
 
-    def rollout_batch(
-        self,
-        table: Any,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool = True,
-        counts: np.ndarray = NONE,
-    ) -> None:
-        """`rollout` of every row of `y0` (N, 2d), in the lanes of registers; with own values (N, 2d + n) behind it.
-
-        The counts (N,) of stages that count go into `counts`.
-        """
-        rest = n_steps, save, stop, first, closed
-        if len(y0) == 1 or y0.shape[1] > self.n_out:
-            size = AT_ONCE if y0.shape[1] > self.n_out else 1
-            for k in range(0, len(y0), size):
-                rows = slice(k, k + size)
-                self._some(table, y0[rows], out[rows], n_finite[rows], running[rows], counts[rows], *rest)
-            return
-        self._some(table, y0, out, n_finite, running, counts, *rest)
-
-    def _some(
-        self,
-        table: Any,
-        y0: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        running: np.ndarray,
-        counts: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        closed: bool,
-        kept: np.ndarray | None = None,
-    ) -> None:
-        """One row, or rows side by side; those that end early once more, by themselves, to find that end."""
-        before = running.copy() if first > 0 else running
-        rest = stop, first
-        width = self.lanes if len(y0) >= self.fewest else 1
-        self._run(table, y0, n_steps, save, out, n_finite, *rest, running, closed, width, counts, kept)
-        for i in np.flatnonzero(n_finite < n_steps) if width > 1 and not stop[0] else ():
-            one = slice(i, i + 1)
-            if len(before):
-                running[i] = before[i]
-            found = out[one], n_finite[one]
-            self._run(table, y0[one], n_steps, save, *found, *rest, running[one], closed, 1, counts[one])
-
-    def _run(
-        self,
-        table: Any,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        out: np.ndarray,
-        n_finite: np.ndarray,
-        stop: np.ndarray,
-        first: int,
-        running: np.ndarray,
-        closed: bool,
-        width: int,
-        counts: np.ndarray = NONE,
-        kept: np.ndarray | None = None,
-    ) -> None:
-        run, states = "run" if kept is None else "kept", y0[:, : self.n_out]
+    def _run(self, table: Any, batch: Batch, closed: bool, width: int) -> None:
+        y0, n_steps, save, out, n_finite, first, running, counts, stop, kept = batch
+        run, states, more = "run" if kept is None else "kept", y0[:, : self.n_out], () if kept is None else (kept,)
         if y0.shape[1] > self.n_out:
             name, (entries, kinds) = f"{run} own", self.own_columns(table, y0[:, self.n_out :], width)
         else:
@@ -275,37 +212,29 @@ class Rollouts:
         if self.n_values > start.shape[1]:
             start = np.concatenate([start, np.zeros((len(states), self.n_values - start.shape[1]))], axis=1)
         keeps = running.shape[-1] > 0
-        left = np.empty((len(y0), self.n_values)) if keeps or self.counted else running
+        left = np.empty((len(y0), self.n_values)) if keeps or self.counted else NEVER
         given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps
         outlets = later if len(later) else NEVER, len(later), outputs  # an empty array has no address
-        self.call(name, width, *given, *outlets, n_finite, left, int(keeps or self.counted), stop, *(() if kept is None else (kept,)))
+        self.call(name, width, *given, *outlets, n_finite, left, int(keeps or self.counted), stop, *more)
         if apart:
             out[:, begun:] = outputs
         if self.counted:
             counts[:], left = left[:, -1], left[:, :-1]
         if keeps:
             running[:] = left
-        for i in np.flatnonzero(n_finite < n_steps) if width == 1 else ():
+        for i in batch.ended if width == 1 else ():
             out[i, np.searchsorted(save, n_finite[i], side="right") :] = np.nan
             if keeps:
                 running[i] = np.nan
 
-    def rollout_processed(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> int:
-        """`rollout` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
-        n_steps, save, out, stop, first, running = rest
-        finite = np.empty(1, dtype=np.int64)
-        rows = n_steps, save, out[None], finite, stop, first, running[None]
-        self.rollout_processed_batch(before, run, after, y0[None], *rows)
-        return int(finite[0])
-
-    def rollout_processed_batch(self, before: Any, run: Any, after: Any, y0: np.ndarray, *rest: Any) -> None:
-        """The same of every row of `y0` (N, 2d)."""
-        n_steps, save, out, n_finite, stop, first, running = rest
+    def run_processed(self, before: Any, table: Any, after: Any, batch: Batch) -> None:
+        """`run` in other coordinates: `before` into them, and `after`, which begins with the last stage, out."""
+        y0, _, save, out, n_finite, *_ = batch
         start = y0
-        if first == 0:
+        if batch.first == 0:
             start = np.empty_like(y0)
             self.mapped(before, y0, start)
-        self.rollout_batch(run, start, n_steps, save, out, n_finite, stop, first, running, False)
+        self.run(table, batch._replace(y0=start), False)
         self.mapped(after, out.reshape(-1, self.n_out), out.reshape(-1, self.n_out), save)
         out[:, : np.searchsorted(save, 0, side="right")] = y0[:, None]
         good = np.isfinite(out).all(-1)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, run_state, run_states
+from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.stages import StageTable, check_damping, run_table, step_table
 from sympflow.kernels.threads import given
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
@@ -21,6 +21,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.kernels.approximations import Ranges
+    from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.rollouts import Rollouts
     from sympflow.kernels.splittings import Splitting
     from sympflow.kernels.stage_times import Driving
@@ -347,8 +348,6 @@ class SplittingLoops:
 class SplittingKernel(Kernel):
     """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`."""
 
-    saves_finite = True
-
     def __init__(
         self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None
     ) -> None:
@@ -359,39 +358,10 @@ class SplittingKernel(Kernel):
         """The numbers of a run whose steps are h, as the loops read them; of a driven system from a time t0 on."""
         return self.loops.rows(run_table(self.scheme, h), h, t0, ranges=self._ranges)
 
-    def run(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        """`n_steps` steps of length `h` from one state: see `Kernel`."""
-        table = self.table(h, t0)
-        work = table.shape[1] * self.loops.work
-        return run_state(partial(self._functions().rollout, table), y0, n_steps, save, carry, self._width, work)
-
-    def run_batch(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        threads: int | None = None,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        """`run` for every row of `y0` (N, 2d), in vector lanes and, where it pays, on several threads."""
-        goes_on = carry is not None and carry.running is not None
-        rollout, table, start = self._functions().rollout_batch, self.table(h, t0), self._rows(y0, goes_on)
-
-        def rows(i: slice, _: np.ndarray, *rest: Any) -> None:
-            rollout(table, start[i], *rest)
-
-        work = table.shape[1] * self.loops.work / self.loops.abreast
-        return run_states(rows, y0, n_steps, save, threads, carry, self._width, work)
+    def runs(self, task: Task) -> Run:
+        code, table, start = self._functions(), self.table(task.h, task.t0), self._rows(task)
+        work = table.shape[1] * self.loops.work / (self.loops.abreast if len(task.y0) > 1 else 1.0)
+        return run_states(partial(code.run, table), task, self._width, work, start)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
@@ -399,13 +369,28 @@ class SplittingKernel(Kernel):
         h = h.repeat(len(y)) if h.ndim == 0 else h
         return Steps(self.loops.step_rows(step_table(self.scheme), h, h, y, self.scheme.monomials, t))
 
+    def check_reverse(self) -> None:
+        self._functions().check_reverse()
+
+    def recorded(self, task: Task) -> Recorded:
+        from sympflow.kernels.reverse import Recorded
+
+        table, rows = self.table(task.h, task.t0), self._rows(task)
+        work = table.shape[1] * self.loops.work / self.loops.abreast
+        return Recorded(self._functions(), table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
+
+    def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of tensors, with `values` of the parameters, by tensor operations."""
+        rows = self.loops.rows(replace(step_table(self.scheme), more=None))[..., 0]
+        return self._functions().stepped(rows, y, h, t, values)
+
     def varied(self, values: np.ndarray) -> VariedKernel:
         """The loops of batches whose trajectories have these values (k, N) of `SplittingLoops.values`."""
         return VariedKernel(self.loops, self.scheme, self.compensated, values)
 
-    def _rows(self, y: np.ndarray, goes_on: bool = False) -> np.ndarray:
-        """The states of a batch (N, 2d) as the loops read them; a run that goes on reads no states from them."""
-        return given(y)
+    def _rows(self, task: Task) -> np.ndarray | None:
+        """The states of a task as the loops read them, where they have more; a run that goes on reads none."""
+        return None
 
     def _functions(self) -> Rollouts:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, ranges=self._ranges)
@@ -424,23 +409,12 @@ class VariedKernel(SplittingKernel):
         self._values = np.ascontiguousarray(values.T, dtype=np.float64)
         self._latest = np.empty((0, 0))
 
-    def run(
-        self,
-        h: float,
-        y0: np.ndarray,
-        n_steps: int,
-        save: np.ndarray,
-        carry: Carry | None = None,
-        t0: float = 0.0,
-    ) -> Run:
-        raise TypeError("`y0` must be a batch (N, 2d): trajectories have their own parameters.")
-
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         return self.loops.rows(run_table(self.scheme, h), h, t0, varied=True)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         lengths, times = (np.broadcast_to(np.asarray(x, dtype=np.float64), len(y)) for x in (h, t))
-        scheme, rows = self.scheme, self._rows(y)
+        scheme, rows = self.scheme, self._with_values(y)
         if self.loops.friction is not None:
             return Steps(self._damped_step(lengths, rows, times))
         table, given = step_table(scheme), (scheme.monomials, times)
@@ -448,23 +422,25 @@ class VariedKernel(SplittingKernel):
 
     def _damped_step(self, h: np.ndarray, rows: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Runs of one step: numbers with friction are no polynomials in h, and most rows have one h and t."""
-        rollout, out = self._functions().rollout_batch, np.empty((len(rows), 1, 2 * self.loops.ndof))
-        once, stop = np.ones(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
+        code, out = self._functions(), np.empty((len(rows), 2 * self.loops.ndof))
         moments, which = np.unique(np.stack([h, t]), axis=1, return_inverse=True)
         for k, (length, time) in enumerate(moments.T.tolist()):
             index = np.flatnonzero(which.reshape(-1) == k)
-            states, finite, nothing = out[index], np.empty(len(index), dtype=np.int64), np.empty((len(index), 0))
-            rollout(self.table(length, time), rows[index], 1, once, states, finite, stop, 0, nothing)
-            out[index] = states
-        return out[:, 0]
+            batch = Batch.whole(rows[index], 1, np.ones(1, dtype=np.int64), out.shape[1])
+            code.run(self.table(length, time), batch)
+            out[index] = batch.out[:, 0]
+        return out
 
-    def _rows(self, y: np.ndarray, goes_on: bool = False) -> np.ndarray:
-        if not (goes_on and len(self._latest) == len(y)):
-            self._latest = np.empty((len(y), y.shape[1] + self._values.shape[1]))
-            self._latest[:, : y.shape[1]] = y
-            values = self._latest[:, y.shape[1] :].reshape(-1, *self._values.shape)
-            values[:] = self._values
+    def _rows(self, task: Task) -> np.ndarray | None:
+        if len(task.y0) % len(self._values):
+            raise TypeError("`y0` must be a batch (N, 2d): trajectories have their own parameters.")
+        if not (task.goes_on and len(self._latest) == len(task.y0)):
+            self._latest = self._with_values(task.y0)
         return self._latest
+
+    def _with_values(self, y: np.ndarray) -> np.ndarray:
+        """The states of a batch with the values behind them."""
+        return np.concatenate([y, np.tile(self._values, (len(y) // len(self._values), 1))], axis=1, dtype=np.float64)
 
     def _functions(self) -> Rollouts:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)

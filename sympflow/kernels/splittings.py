@@ -489,7 +489,6 @@ class SplittingCode(Rollouts):
         return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
     def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-        """From cotangents (m, size, …) of the numbers of columns to those of the numbers of a table (n, m, …)."""
         if self.timed:
             return slopes.swapaxes(0, 1)
         found, kinds = np.zeros((len(table), *np.delete(slopes.shape, 1))), self._kinds_of(table)
@@ -505,6 +504,25 @@ class SplittingCode(Rollouts):
     @cached_property
     def _of_tables(self) -> list[Program]:
         return [adjoint(kind.table) for kind in self._kinds]
+
+    def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of length h at t from tensors (..., 2d), by tensor operations.
+
+        `numbers` (n, m) are those of the columns of a step of length 1, `values` those of the parameters.
+        """
+        import torch
+
+        state = [*y.unbind(-1), *[torch.zeros_like(y[..., 0])] * (self.n_values - self.n_out)]
+        kick, kinds = kicks_of(self._splitting.level, len(self._splitting.monomials))[0], self._kinds_of(numbers)
+        powers = [1, *kick.powers]
+        for k, column in zip(kinds, numbers.T.tolist(), strict=True):
+            given = [c * h**power for c, power in zip(column, powers, strict=False)]
+            if self.timed:
+                given = self._lettered(t + column[len(powers)] * h, [*given, 0.0, 0.0, 0.0, *values])
+            else:
+                given += values
+            state = self._kinds[k].plain(*state, *self._kinds[k].table(*given))
+        return torch.stack([x.expand(y.shape[:-1]) for x in state[: self.n_out]], dim=-1)
 
     @property
     def given_numbers(self) -> int:

@@ -7,7 +7,7 @@ k(q), w_p' = w_p + ∇k w_q, and likewise of a drift. Vectors are scaled by powe
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -21,7 +21,7 @@ from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Carry, run_states
+from sympflow.kernels.protocol import Carry, Task, run_states
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import EARLY, Splitting, SplittingCode, shared
@@ -399,11 +399,9 @@ class TangentKernel:
         """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
         code, k = self._code, self.vectors
 
-        def rollout(_: slice, *rest: Any) -> None:
-            code.rollout_batch(table, *rest)
-
         work = table.shape[1] * code.n_out / 2
-        run = run_states(rollout, start, int(looks[-1]), looks, threads, carry, code.n_values, work)
+        task = Task(0.0, start, int(looks[-1]), looks, carry, threads=threads)
+        run = run_states(partial(code.run, table), task, code.n_values, work)
         w = run.states[..., self._width : -k].reshape(*run.states.shape[:2], k, self._width)
         w = w if scale is None else w * scale
         with np.errstate(all="ignore"):

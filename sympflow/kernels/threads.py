@@ -70,7 +70,7 @@ def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_ro
     `rows` releases the GIL; for `stop` see `run_one`.
     """
     n_blocks = -(-n_rows // BLOCK)
-    threads = threads_for(n_blocks, n_rows * work_per_row, threads)
+    threads = threads_for(n_blocks, n_rows * work_per_row, threads) if n_blocks > 1 else 1
     if threads == 1:
         run_one(partial(rows, slice(0, n_rows)), n_rows * work_per_row)
         return

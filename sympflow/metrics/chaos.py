@@ -25,6 +25,7 @@ from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.systems.given import given_system
 
 ALIGNED = 1e-12
 """Below this SALI and GALI an orbit is chaotic for sure, and ends: what is left is rounding."""
@@ -236,6 +237,7 @@ def gali(
     ----------
     .. [1] C. Skokos, T. Bountis, C. Antonopoulos, Physica D 231 (2007) 30–54.
     """
+    system = given_system(system)
     orbits = checked_orbits(system, method, t_span, y0, options, "deviation vectors are followed on")
     check_counts(k=k)
     if not 2 <= k <= 2 * system.ndof:

@@ -16,6 +16,7 @@ from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.systems.given import given_system
 
 WINDOW = 256  # steps between which orbits that have left are put aside
 MOST_VALUES = 1 << 21  # numbers of states that are held at a time
@@ -99,6 +100,7 @@ def escape_times(
     >>> round(float(found.time), 3), int(found.status)
     (4.656, 1)
     """
+    system = given_system(system)
     orbits = checked_orbits(system, method, t_span, y0, options, "escapes are located on")
     region = region_of(outside, system)
     rows = orbits.rows

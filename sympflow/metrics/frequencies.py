@@ -16,6 +16,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.grid import Grid
 from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.solver import solve
+from sympflow.systems.given import given_system
 
 MOST_SAMPLES = 1 << 16
 """Samples of an orbit, unless more are asked for: at every step, or at every few of a longer run."""
@@ -123,6 +124,7 @@ def frequencies(
     >>> float(frequencies(system, "kahan_li8", (0, 200), [0.01, 0.0], dt=0.1).frequencies[0, 0].round(6))
     0.999994
     """
+    system = given_system(system)
     orbits = checked_orbits(system, method, t_span, y0, options, "frequencies are found on")
     check_counts(n=n)
     times = _sample_times(orbits, samples)

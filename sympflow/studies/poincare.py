@@ -19,6 +19,7 @@ from sympflow.metrics.crossings import Crossings, Plane, crossings, stroboscopic
 from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, text_table, title
+from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,6 +90,7 @@ def poincare_section(
     >>> section.states.shape[1]
     4
     """
+    system = given_system(system)
     plane = {"coordinate": coordinate, "level": level, "direction": direction, "sample": sample}
     T = _checked_period(system, period, [name for name, value in plane.items() if value is not None])
     if T is not None:
@@ -124,7 +126,7 @@ def _checked_period(system: HamiltonianSystem, period: float | None, plane: list
         if not (_is_number(period) and 0 < period < math.inf):
             raise ValueError(f"`period` must be positive and finite; got {period!r}.")
         return float(period)
-    if plane or not isinstance(system, HamiltonianSystem) or system.autonomous:
+    if plane or system.autonomous:
         return None
     if system.period is None:
         raise ValueError(

@@ -28,6 +28,7 @@ from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Metric, Row, candidates
 from sympflow.studies.figure_style import saved
 from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table, title
+from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -121,9 +122,9 @@ def stability(
     >>> round(1000 * report.limits[0].stable, 2)
     2.0
     """
-    family = (system,) if isinstance(system, HamiltonianSystem) else tuple(system)
-    if not family or not all(isinstance(s, HamiltonianSystem) for s in family):
-        raise TypeError("`system` must be a HamiltonianSystem or a sequence of them.")
+    family = tuple(map(given_system, system if isinstance(system, list | tuple) else (system,)))
+    if not family:
+        raise ValueError("`system` is an empty sequence: give one system, or several.")
     for one in family:
         one.check_conservative(
             "so its energy error says nothing of stability",

@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
-from sympflow.hamiltonian.local_states import LocalStates
+from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 DOMAINS: dict[str, tuple[str, ...]] = {
@@ -204,7 +204,7 @@ def _numbers(key: str, value: Any) -> list[Any]:
     return [entry for row in rows for entry in row]
 
 
-def _domain(table: dict[str, Any], file: Path) -> Ball | Box | EnergySublevel | LocalStates | Tube:
+def _domain(table: dict[str, Any], file: Path) -> Ball | Box | EnergySublevel | LatticeStates | Tube:
     kind = table.get("kind")
     if kind not in DOMAINS:
         raise ValueError(f"`domain` needs a kind, one of {', '.join(DOMAINS)}; got {kind!r} (in {str(file)!r}).")

@@ -1,10 +1,10 @@
-"""The fit of a flow of a lattice or of like bodies to long runs: to the energy errors of many sites or bodies.
+"""The fit of a flow of a lattice to long runs: to the energy errors of many sites.
 
 One step of the exact flow on a few sites tells little of what a large lattice does to its energy in a thousand. The
 modified energy that a flow keeps differs from H by terms that hardly change in a step, such as the actions of waves
 whose frequencies are a bit wrong; these change as waves exchange energy, and a few sites have few wave lengths. So the
-best few tables at Δt that labels find are fitted further, to the errors of H in runs from many states of a ring, or of
-a cluster: which of them is best is not seen in a step. The labels stay as a weak bound. The polynomials in t vary as
+best few tables at Δt that labels find are fitted further, to the errors of H in runs from many states of a ring: which
+of them is best is not seen in a step. The labels stay as a weak bound. The polynomials in t vary as
 little as may be, or are fitted to labels before Δt from there.
 """
 
@@ -34,14 +34,14 @@ PROBE = 1e-6
 
 
 class EnergyRuns(RunsFit):
-    """Relative energy errors in runs of a lattice or of like bodies, as a function of the frozen parameters of a flow.
+    """Relative energy errors in runs of a lattice, as a function of the frozen parameters of a flow.
 
     Parameters
     ----------
     flow : PrimedFlow
         Of the system; its numbers are changed.
     system : HamiltonianSystem
-        The lattice or the bodies.
+        The lattice.
     x : ndarray of shape (N, 2d)
         Where the runs begin.
     rest : float
@@ -84,7 +84,7 @@ class EnergyRuns(RunsFit):
             return np.full(len(self._x) * (len(self._save) - 1), np.inf)
         self.table.assign(wanted)
         kernel, n = self.flow.kernel_for(self.system), int(self._save[-1])
-        H = self.system.hamiltonian(kernel.run_batch(self.flow.dt, self._x, n, self._save)[0])
+        H = self.system.hamiltonian(kernel.run(self.flow.dt, self._x, n, self._save)[0])
         return ((H[:, 1:] - self._H[:, None]) / self._scale[:, None]).ravel()
 
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
@@ -101,9 +101,7 @@ def check_runs(system: HamiltonianSystem, asked: NewFit) -> None:
     """Raise ValueError unless a flow of the system can be fitted to the `runs` that are asked for."""
     check_counts(runs=asked.runs)
     if not (system.local is not None and system.local.has_piece and system.conservative):
-        raise ValueError(
-            f"`runs` are of lattices and like bodies that keep their energy, and {system.name!r} is none: leave it out."
-        )
+        raise ValueError(f"`runs` are of lattices that keep their energy, and {system.name!r} is none: leave it out.")
     if asked.data is not None:
         raise ValueError(
             "`runs` begin in states of a larger piece of the system, and `data` are of itself: leave out one of them."

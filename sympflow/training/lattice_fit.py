@@ -1,8 +1,8 @@
-"""Flows of lattices and of like bodies: fitted on a few of them, judged on many.
+"""Flows of lattices: fitted on a few sites, judged on many.
 
 The numbers of a primed flow know the potential and Δt, not the size. So they are fitted to the exact flow of a ring of
-a few sites, written out by its coordinates, or of a small cluster, at states of the energy density of the large system.
-Held-out states and the certificate are those of the large one: a lattice with its own ends, 13 bodies of more.
+a few sites, written out by its coordinates, at states of the energy density of the large lattice. Held-out states and
+the certificate are those of the large one, with its own ends.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import torch
 
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
-from sympflow.hamiltonian.domain import Domain, states_of
+from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.lattice import BOUNDARIES
-from sympflow.hamiltonian.local_states import DRAWN, LocalStates
+from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors
 
@@ -36,7 +36,7 @@ STEPS, SEEN, COPIES, ENDS_STATES = 200, 5, 4, 16
 
 
 def on_piece(system: HamiltonianSystem) -> bool:
-    """Return True for a lattice or like bodies, which a flow is fitted to by a piece."""
+    """Return True for a lattice, which a flow is fitted to by a piece."""
     return system.local is not None and system.local.has_piece and (system.damping is None or not system.damping.ndim)
 
 
@@ -52,7 +52,7 @@ class Piece:
         The piece as a lattice, the lattice itself where that is small.
     system, domain : HamiltonianSystem, Domain
         The piece by its coordinates, and the states to fit on.
-    states : LocalStates
+    states : LatticeStates
         Those of the same density, of any size.
     """
 
@@ -60,12 +60,12 @@ class Piece:
     few: HamiltonianSystem
     system: HamiltonianSystem
     domain: Domain
-    states: LocalStates
+    states: LatticeStates
 
     @classmethod
     def of(cls, lattice: HamiltonianSystem, domain: Domain) -> Piece:
         """The piece of a lattice, for states of a domain of it."""
-        found = domain if isinstance(domain, LocalStates) else states_of(lattice, domain.sample(DRAWN))
+        found = domain if isinstance(domain, LatticeStates) else LatticeStates.of_states(lattice, domain.sample(DRAWN))
         small = lattice.ndof <= MOST_FITTED
         few = lattice if small else lattice.piece()
         local = few.local

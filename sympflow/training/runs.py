@@ -173,7 +173,6 @@ class Run(ABC):
             "stages": [*flow.recipe.get("stages", []), stage],
             **({} if self.scaling is None else {"scaling": self.scaling.to_dict()}),
             "torch": torch.__version__,
-            **{name: value for name, value in flow.recipe.items() if name == "timed"},
         }
         flow.figures = {name: value for name, value in figures.items() if name not in ("step", "loss", "iterations")}
         flow.figures["training_seconds"] = round(earlier + self.seconds, 3)

@@ -17,13 +17,14 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import plain
 from sympflow.arrays import is_tensor
-from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Domain, domain_of, remedy_for
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.systems.given import given_system
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.energy_runs import check_runs, runs_of
@@ -154,8 +155,8 @@ def train(
         Of "gauss-newton" on a primed flow: how much an error in the energy counts beside those of the coordinates. 10
         by default; 1000 for runs of which only the energy matters, 0 for none.
     runs : int, optional
-        Of a primed flow of a lattice or of like bodies: after the search its numbers are fitted further to the energy
-        errors of so many long runs of a larger ring or cluster; 48 is usual. Large systems lose several times less
+        Of a primed flow of a lattice: after the search its numbers are fitted further to the energy
+        errors of so many long runs of a larger ring; 48 is usual. Large systems lose several times less
         energy then, and the fit takes about twice as long. The default is none.
     checkpoint : path, optional
         Write the state of the run there every `checkpoint_every` steps, atomically; of a primed flow after each start
@@ -336,15 +337,14 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
 
 def _known_system(system: Any, data: Any) -> HamiltonianSystem:
     """Return H, of which data alone tell nothing."""
-    if not isinstance(system, HamiltonianSystem) and (data is not None or system is None or _is_data(system)):
+    if not isinstance(system, HamiltonianSystem | str) and (data is not None or system is None or _is_data(system)):
         raise TypeError(
             f"`system` must be a HamiltonianSystem, the H of the flow; got {type(system).__name__}: train() fits a "
             "flow to an H that is known, and `data` adds labels to that; it finds no H in data. Define H by "
             "HamiltonianSystem.from_sympy, or where you have its vector field by "
             "sympflow.interop.systems.from_module, and pass data=(t, x, y) beside it."
         )
-    check_system(system)
-    return system
+    return given_system(system)
 
 
 def _is_data(value: Any) -> bool:
@@ -454,8 +454,6 @@ def _new_primed(
     elif can_try and _fit_is_untold(asked, session):
         trial = trials.chosen_trial(system, domain, session)
         flow = trial.start.flow(system)
-        if trial.timed:
-            flow.recipe = {"timed": trial.timed}
         return flow, trial.flow
     if system.separable and (dt is None or stages is None or processor is None):
         default = default_primed(system, domain, dt)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Collection
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from sympflow.training.points import USELESS, Stream, shares_missed, start_times
 from sympflow.training.session import Deadline, OutOfTime, Session
 from sympflow.training.starts import PHASE, SEED, Primed, default_primed
 from sympflow.training.table_fit import TableRun
-from sympflow.training.timing import kick_seconds, long_errors
 
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
 STARTS, STEPS, FINAL_STEPS, POINTS = 6, 40, 160, 80  # of a trial's search, and what follows the best start
@@ -57,25 +55,20 @@ LARGER = 1.05  # times the work of a flow with a larger processor, which outputs
 MOST_NDOF = 3  # beyond which trials take too long
 SHARE = 0.65  # of a time budget
 DEAREST = 2.0  # times the cycles of a kick without them, beyond which curvature terms are not tried
-BEHIND = 1.25  # times the estimated work of the best, beyond which kicks of another kind are not compiled and timed
-NEAR, NEAREST = 1.2, 3  # times the estimated work of the best up to which flows are timed, and how many
-CLEAR = 1.03  # times the measured work, by which another flow must be better than the best by estimate
-SURE = 1.05  # times the measured work, by which kicks with more terms must be better
+NEAR, NEAREST = 1.2, 3  # times the estimated work of the best up to which flows make long runs, and how many
+CLEAR = 1.03  # times the work in long runs, by which another flow must be better than the best by its trial
+LONG, SAVED = 2048, 100  # steps of the longest Δt in a long run, and states that are looked at
 GOAL = 1e-5  # the energy error of a trial that a default flow shall not exceed, if one of those tried does not
 ALIKE = 2.0  # energy errors above that which differ by no more are the same
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The flow of a short fit, None if it leads nowhere, and its energy error.
-
-    Of the chosen one also those that were timed, with their measured work, for `flow.recipe["timed"]`.
-    """
+    """The flow of a short fit, None if it leads nowhere, and its energy error."""
 
     start: Primed
     error: float
     flow: PrimedFlow | None = None
-    timed: list[dict[str, Any]] = field(default_factory=list)
 
 
 def can_try(system: HamiltonianSystem) -> bool:
@@ -89,29 +82,12 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     Of each the table at Δt is fitted in less than a second, and followed along held-out orbits. Where its energy error
     (of a system with friction: the difference from the energy along the exact orbit) is e, the work of a classical
     scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take the least time in a unit of
-    time, times e^(1/p), p = 6. Curvature terms are tried with the best Δt, unless they make kicks twice as dear. What
-    kicks with and without them take is estimated in cycles, and where that does not decide, by a
-    quarter, measured: the loops of both flows are compiled and run, as they will be by `solve`. Then `SHAPES` are tried
-    with kicks of the better kind, some of which have fewer terms or none: about as many in a unit of time as at that Δt
-    and at the next shorter one; a larger processor must gain a twentieth. Where all errors are above 1e-5 it is the
-    flow with the smallest, or of those with up to twice that the one that gains most. At last up to three that are
-    within a fifth of the least work are run as compiled loops, and it is the one with the least measured time at equal
-    energy error in longer runs, outputs not counted, if it gains 3 % on the best by estimate. So the choice may differ
-    from machine to machine; `timed` says what was measured. Time has a say else only if two thirds of that of the
-    session are not enough for the trials.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        Separable, symbolic, T = ½ pᵀM⁻¹p.
-    domain : Domain
-    session : Session, optional
-        It shows the trials, and may end them: then it is the best so far.
-
-    Warns
-    -----
-    RuntimeWarning
-        If the time that the session has for trials ended them.
+    time, times e^(1/p), p = 6. What kicks take is estimated in cycles of the processor: the choice is the same on every
+    machine. Curvature terms are tried with the best Δt, unless they make kicks twice as dear; then `SHAPES` with kicks
+    of the better kind, about as many in a unit of time as at that Δt and at the next shorter one. Where all errors are
+    above `GOAL` the flow with the smallest counts, and those with up to twice that. At last up to three whose work is
+    nearly the least are compared by their energy errors in longer runs. If the time of the `session` for trials is
+    over, it is the best so far, with a RuntimeWarning.
     """
     from sympflow.kernels.approximations import position_ranges
     from sympflow.kernels.splitting_loops import splitting_loops
@@ -174,26 +150,15 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         if bends:
             attempt([bent])
         both = [straight, bent]
-        work = good(both) if bent in found else {}
-        if len(work) == 2 and max(work.values()) <= BEHIND * min(work.values()) and not deadline.over():
-            flows = [flow for start in both if (flow := found[start].flow) is not None]
-            seconds = kick_seconds(flows, system, domain)
-            if len(seconds) == 2 and all(seconds):
-                costs = [seconds[0] * costs[0] / costs[FORCE_GRADIENT], seconds[0], SURE * seconds[1]]
         chosen = best(both) if bent in found else straight
         shorter = replace(starts[max(0, starts.index(straight) - 1)], curvature=chosen.curvature)
         others = list(dict.fromkeys([*shaped(chosen), *shaped(shorter)]))
         attempt(others)
         _warn_if_cut(session, len(found), {*starts, *others, *([bent] if bends else [])})
         work = good([chosen, *(start for start in others if start in found)])
-        measured = {} if deadline.over() else _measured(work, found, system, domain)
+        long = {} if deadline.over() else _long_work(work, found, system, domain)
         first = min(work, key=work.__getitem__)
-        trial = found[
-            min(measured, key=lambda start: measured[start] * (1.0 if start == first else CLEAR), default=first)
-        ]
-        kept = ("dt", "first", "levels", "processor")
-        timed = [{**{name: getattr(start, name) for name in kept}, "work": measured[start]} for start in measured]
-        return replace(trial, timed=timed)
+        return found[min(long, key=lambda start: long[start] * (1.0 if start == first else CLEAR), default=first)]
 
 
 def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[Primed]) -> None:
@@ -208,25 +173,39 @@ def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[Primed]) -> 
         )
 
 
-def _measured(
+def _long_work(
     work: dict[Primed, float], found: dict[Primed, Trial], system: HamiltonianSystem, domain: Domain
 ) -> dict[Primed, float]:
-    """The measured work of those that are nearly as good as the best by estimate; none where that stands alone.
-
-    It is the time that a unit of time takes, times e^(1/6), e the energy error in long runs, where energy is kept.
-    """
+    """The estimated work of those that are nearly as good as the best, by their energy errors in long runs."""
     near = [start for start in sorted(work, key=work.__getitem__) if work[start] <= NEAR * min(work.values())][:NEAREST]
     flows = [flow for start in near if (flow := found[start].flow) is not None]
-    if len(near) < 2 or len(flows) < len(near):
+    if len(near) < 2 or len(flows) < len(near) or not (system.autonomous and system.conservative):
         return {}
-    seconds = kick_seconds(flows, system, domain)
-    long = system.autonomous and system.conservative
-    errors = long_errors(flows, system, domain) if long else [found[start].error for start in near]
+    errors = long_errors(flows, system, domain)
     return {
-        start: a_kick * len(start.levels) / start.dt * error ** (1 / ORDER)
-        for start, a_kick, error in zip(near, seconds, errors, strict=True)
-        if a_kick and math.isfinite(error)
+        start: work[start] * (error / found[start].error) ** (1 / ORDER)
+        for start, error in zip(near, errors, strict=True)
+        if math.isfinite(error)
     }
+
+
+def long_errors(flows: Sequence[PrimedFlow], system: HamiltonianSystem, domain: Domain) -> list[float]:
+    """The relative energy error of each flow in long runs, the median over held-out orbits; ∞ where one ends early.
+
+    All runs are of one length, 2048 times the longest Δt.
+    """
+    orbits, errors = states(domain, ORBITS, SEED, Stream.REFERENCE), []
+    H = system.hamiltonian(orbits)
+    scale = np.abs(H) if system.energy_scale is None else system.energy_scale
+    for flow in flows:
+        n = round(LONG * max(other.dt for other in flows) / flow.dt)
+        save = np.linspace(0, n, SAVED + 1).astype(int)[1:]
+        kernel = flow.kernel_for(system)
+        with np.errstate(all="ignore"):
+            energies = [system.hamiltonian(kernel.run(flow.dt, y, n, save).states) for y in orbits]
+            worst = np.abs(np.array(energies) - H[:, None]).max(1) / scale
+        errors.append(float(np.median(np.where(np.isnan(worst), np.inf, worst))))
+    return errors
 
 
 def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:

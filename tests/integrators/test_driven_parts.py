@@ -88,9 +88,9 @@ def test_a_run_that_is_cut_goes_on_at_its_time():
     method = get("tao4")()
     composition = method.composed(COPIES)
     kernel, start = composition.kernel(False), composition.lift(np.stack([COPIES.y0, 1.1 * COPIES.y0]))
-    whole = kernel.run_batch(0.05, start, 9, np.array([4, 9]), t0=0.3).states
+    whole = kernel.run(0.05, start, 9, np.array([4, 9]), t0=0.3).states
     carry = Carry()
-    pieces = [kernel.run_batch(0.05, start, n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]
+    pieces = [kernel.run(0.05, start, n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]
     np.testing.assert_array_equal(np.concatenate(pieces, axis=1), whole)
     one, carry = kernel.run(0.05, start[0], 9, np.array([4, 9]), t0=0.3).states, Carry()
     pieces = [kernel.run(0.05, start[0], n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]

@@ -285,7 +285,7 @@ def test_compiled_clocks_agree_with_the_layers(clocked):
         two = clocked.psi(0.5, clocked.psi(0.5, torch.from_numpy(x))).numpy()
     np.testing.assert_allclose(kernel.step(s, x).states, there, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(kernel.step(-s, x).states, back, rtol=1e-13, atol=1e-13)
-    np.testing.assert_allclose(kernel.run_batch(0.5, x, 2, np.array([2]))[0][:, 0], two, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(kernel.run(0.5, x, 2, np.array([2]))[0][:, 0], two, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(kernel.run(0.5, x[0], 2, np.array([2]))[0][0], two[0], rtol=1e-13, atol=1e-13)
 
 

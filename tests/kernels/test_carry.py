@@ -39,13 +39,13 @@ def test_pieces_of_a_run_are_the_run(system, method, options):
     y0 = np.tile(system.y0, 2) if method == "tao4" else system.y0
     many = y0 + 0.02 * np.random.default_rng(0).standard_normal((70, len(y0)))
     kernel, h = integrator.own_stepper(Problem(system, 0.0, 1.0, y0)).kernel, integrator.step_length(system)
-    for run, start, save in (
-        (kernel.run, y0, np.arange(0, N_STEPS + 1, 7)),
-        (kernel.run_batch, many, np.array([0, 1, 3, 900, N_STEPS])),
-        (kernel.run_batch, many[:1], np.array([N_STEPS])),
+    for start, save in (
+        (y0, np.arange(0, N_STEPS + 1, 7)),
+        (many, np.array([0, 1, 3, 900, N_STEPS])),
+        (many[:1], np.array([N_STEPS])),
     ):
-        whole = run(h, start, N_STEPS, save)
-        states, n_finite = in_pieces(run, h, start, save)
+        whole = kernel.run(h, start, N_STEPS, save)
+        states, n_finite = in_pieces(kernel.run, h, start, save)
         np.testing.assert_array_equal(states, whole.states)
         np.testing.assert_array_equal(n_finite, whole.n_finite)
 
@@ -55,9 +55,9 @@ def test_what_has_ended_stays_ended():
     system = HamiltonianSystem.from_sympy("p**2/2 - q**4/4")
     kernel = build("verlet", {"dt": 0.1}).own_stepper(Problem(system, 0.0, 1.0, np.ones(2))).kernel
     y0, save = np.array([[1.0, 1.0], [1e-3, 0.0]]), np.array([200])
-    for run, start in ((kernel.run, y0[0]), (kernel.run_batch, y0)):
-        whole, carry = run(0.1, start, 200, save), Carry()
-        first = run(0.1, start, 100, save[:0], carry=carry)
-        then = run(0.1, start, 200, save, carry=carry)
+    for start in (y0[0], y0):
+        whole, carry = kernel.run(0.1, start, 200, save), Carry()
+        first = kernel.run(0.1, start, 100, save[:0], carry=carry)
+        then = kernel.run(0.1, start, 200, save, carry=carry)
         np.testing.assert_array_equal(np.where(np.less(first.n_finite, 100), first.n_finite, 200), whole.n_finite)
         np.testing.assert_array_equal(then.states, whole.states)

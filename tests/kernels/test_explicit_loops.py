@@ -56,9 +56,9 @@ def test_rows_pieces_and_single_steps_give_the_same_bits(name):
     system, rng, save = SYSTEMS[name], np.random.default_rng(0), np.array([0, 1, 7, 30])
     kernel, t = explicit_kernel(system, FIXED["rk4"]), {} if system.autonomous else {"t0": 0.5}
     y0 = system.y0 * (1 + 0.1 * rng.random((11, 2 * system.ndof)))
-    batch, carry = kernel.run_batch(0.02, y0, 30, save, **t).states, Carry()
+    batch, carry = kernel.run(0.02, y0, 30, save, **t).states, Carry()
     assert np.array_equal(batch, [kernel.run(0.02, y, 30, save, **t).states for y in y0])
-    pieces = [kernel.run_batch(0.02, y0, n, s, carry=carry, **t).states for n, s in ((7, save[:3]), (30, save[3:]))]
+    pieces = [kernel.run(0.02, y0, n, s, carry=carry, **t).states for n, s in ((7, save[:3]), (30, save[3:]))]
     assert np.array_equal(batch, np.concatenate(pieces, axis=1))
     times = (np.full(11, 0.5),) if t else ()
     assert np.array_equal(kernel.step(np.full(11, 0.02), y0, *times).states, batch[:, 1])

@@ -63,7 +63,7 @@ def test_run_agrees_with_torch(flow, h):
 @pytest.mark.parametrize("n", [1, 5, 32, 100])
 def test_batch_agrees_with_torch(flow, n):
     y0 = states(n, 2)
-    Y, n_finite, _ = flow.kernel_for(None).run_batch(0.8, y0, 5, np.arange(6), threads=2)
+    Y, n_finite, _ = flow.kernel_for(None).run(0.8, y0, 5, np.arange(6), threads=2)
     assert (n_finite == 5).all()
     assert np.array_equal(Y[:, 0], y0)
     assert step_errors(flow, 0.8, Y.swapaxes(0, 1)).max() < ROUNDING
@@ -97,11 +97,11 @@ def test_every_activation_and_its_slope(name):
 def test_any_depth_and_widths(hidden, activation):
     flow = lively(SympFlow(2, pairs=1, hidden=hidden, activation=activation))
     y0 = states(3, 2)
-    Y, *_ = flow.kernel_for(None).run_batch(1.0, y0, 2, np.array([2]))
+    Y, *_ = flow.kernel_for(None).run(1.0, y0, 2, np.array([2]))
     assert np.abs(Y[:, 0] - torch_steps(flow, 1.0, y0, 2)[-1]).max() < ROUNDING
     single, *_ = flow.kernel_for(None).run(1.0, y0[0], 2, np.array([2]))
     assert np.array_equal(single[0], Y[0, 0])
-    rows, *_ = flow.kernel_for(None).run_batch(1.0, states(40, 2), 2, np.array([2]))
+    rows, *_ = flow.kernel_for(None).run(1.0, states(40, 2), 2, np.array([2]))
     assert np.array_equal(rows[:3, 0], Y[:, 0])  # features or trajectories in lanes
 
 
@@ -134,7 +134,7 @@ def test_new_weights_are_noticed():
 def test_states_that_are_not_finite(flow):
     y0 = states(40, 2)
     y0[3], y0[7, 0], y0[8, 2] = np.nan, np.inf, 1e308
-    Y, n_finite, _ = flow.kernel_for(None).run_batch(0.8, y0, 4, np.arange(5))
+    Y, n_finite, _ = flow.kernel_for(None).run(0.8, y0, 4, np.arange(5))
     harmed = np.isin(np.arange(40), [3, 7])
     assert (n_finite[harmed] == 0).all()
     assert np.array_equal(Y[:, 0], y0, equal_nan=True)

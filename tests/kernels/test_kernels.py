@@ -164,7 +164,7 @@ def test_other_values_of_parameters_need_no_other_code(texts, compensated):
         system = with_parameters(**params)
         kernel, save = splitting_loops(system).kernel(VERLET, compensated), np.array([0, 3, 40])
         y0 = system.y0 + 0.01 * np.arange(9)[:, None]
-        found = kernel.run(0.1, y0[1], 40, save).states, kernel.run_batch(0.1, y0, 40, save).states
+        found = kernel.run(0.1, y0[1], 40, save).states, kernel.run(0.1, y0, 40, save).states
         step = kernel.step(np.linspace(0.05, 0.1, 9), y0).states if not compensated else None
         assert bool(texts) == (i == 0)
         texts.clear()
@@ -179,7 +179,7 @@ def test_other_values_of_parameters_need_no_other_code(texts, compensated):
 @pytest.mark.parametrize("compensated", [False, True])
 def test_code_depends_on_which_parameters_there_are_alone(texts, level, monomials, compensated):
     for params in (*PARAMETERS, {**PARAMETERS[0], "n": 4}, {**PARAMETERS[0], "lam": 0}):
-        code = splitting_loops(with_parameters(**params)).functions(level, compensated, monomials).rollout.__self__
+        code = splitting_loops(with_parameters(**params)).functions(level, compensated, monomials)
         code.function("run", 1)
     assert len(texts) == len({*texts}) == 3  # an exponent, and a term that is left out, are other code
 
@@ -201,7 +201,7 @@ def test_batch_agrees_with_single_runs(systems, scheme, n_states, compensated):
     system = systems["henon_heiles"]
     loops, save = splitting_loops(system), np.array([0, 3, 300, 600])
     y0 = system.y0 + np.random.default_rng(0).uniform(-0.02, 0.02, (n_states, 4))
-    Y, n_finite, _ = loops.kernel(scheme, compensated).run_batch(0.1, y0, 600, save, threads=2)
+    Y, n_finite, _ = loops.kernel(scheme, compensated).run(0.1, y0, 600, save, threads=2)
     assert Y.shape == (n_states, 4, 4)
     assert (n_finite == 600).all()
     for i in {0, n_states // 2, n_states - 1}:
@@ -220,7 +220,7 @@ def test_loops_around_functions_are_pickled_by_these(systems):
 def test_batch_of_a_numba_system(systems):
     system = systems["numba_chain"]
     y0 = system.y0 * np.array([[1.0], [0.5]])
-    Y, *_ = splitting_loops(system).kernel(VERLET).run_batch(0.1, y0, 10, np.array([10]))
+    Y, *_ = splitting_loops(system).kernel(VERLET).run(0.1, y0, 10, np.array([10]))
     assert np.abs(Y[:, 0] - plain_run(system, VERLET, 0.1, y0, 10)[-1]).max() < 1e-14
 
 
@@ -296,7 +296,7 @@ def test_the_last_finite_step_is_exact(runaway, scheme, stride):
 def test_a_lane_that_overflows_leaves_the_others_unharmed(runaway):
     loops, save = splitting_loops(runaway), np.array([0, 100, 400])
     y0 = np.array([[1.0, 0.0], [1e-3, 0.0], [1e308, 0.0], [5e-324, 5e-324], [0.1, 0.0]])
-    Y, n_finite, _ = loops.kernel(VERLET).run_batch(0.01, y0, 400, save)
+    Y, n_finite, _ = loops.kernel(VERLET).run(0.01, y0, 400, save)
     singles = [loops.kernel(VERLET).run(0.01, y, 400, save) for y in y0]
     assert n_finite.tolist() == [run.n_finite for run in singles]
     assert n_finite[0] < 400

@@ -215,7 +215,7 @@ def test_pieces_and_threads_change_nothing(method, shape, boundary, pieces):
     for threads in (1, 2, 3):
         with at_most(threads):
             runs.append(solve(system, method, y0=y0, backend="compiled", **options).y)
-    assert splitting_loops(system).functions(SCHEMES[method].level, False).rollout.__self__.pieces > 1
+    assert splitting_loops(system).functions(SCHEMES[method].level, False).pieces > 1
     batch = solve(system, method, y0=np.stack([y0, y0]), backend="compiled", **options).y
     for other in (*runs[1:], batch[1]):
         np.testing.assert_array_equal(other, runs[0])
@@ -287,7 +287,7 @@ def test_compensated_sums_lower_the_rounding(shape):
 
 
 def test_the_code_does_not_depend_on_the_size():
-    few, many = (splitting_loops(ring(n)).functions(0, False).rollout.__self__ for n in (64, 6400))
+    few, many = (splitting_loops(ring(n)).functions(0, False) for n in (64, 6400))
     assert few.function("run", 1) is many.function("run", 1)
 
 

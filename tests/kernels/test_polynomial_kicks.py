@@ -133,7 +133,7 @@ def test_compiled_runs_are_the_steps_of_arrays(last, compensated):
         expected.append(stepper.step(HH, 0.0, expected[-1], 0.2))
     save = np.array([0, 1, 3])
     expected = np.stack([expected[n] for n in save], axis=1)
-    many = loops.kernel(table, compensated).run_batch(0.2, y, 3, save).states
+    many = loops.kernel(table, compensated).run(0.2, y, 3, save).states
     one = loops.kernel(table, compensated).run(0.2, y[4], 3, save).states
     np.testing.assert_allclose(many, expected, atol=16 * EPS)
     np.testing.assert_allclose(one, expected[4], atol=16 * EPS)

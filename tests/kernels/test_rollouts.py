@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from sympflow import systems
-from sympflow.kernels.protocol import Carry, run_state, run_states
+from sympflow.kernels.protocol import Carry, Task, run_states
 from sympflow.kernels.splittings import Splitting, SplittingCode
 from sympflow.kernels.stages import run_table, single_table, step_table
 from sympflow.schemes import scheme_named
@@ -41,16 +43,15 @@ def test_states_in_memory_run_as_those_in_registers(name, compensated):
     for code in (SplittingCode(splitting), InMemory(splitting)):
         carry, pieces = Carry(), []
         for some, end in ((save[:2], 40), (save[2:], 2000)):
-            run = run_states(
-                lambda _, *rest, code=code: code.rollout_batch(table, *rest), y0, end, some, 1, carry, code.n_values, 1
-            )
+            task = Task(0.1, y0, end, some, carry, threads=1)
+            run = run_states(partial(code.run, table), task, code.n_values, 1)
             pieces += [run.states.copy(), run.n_finite.copy()]
-        one = run_state(lambda *rest, code=code: code.rollout(table, *rest), y0[5], 2000, save, None, 4, 1)
+        one = run_states(partial(code.run, table), Task(0.1, y0[5:6], 2000, save), 4, 1)
         mapped = np.empty_like(y0)
         code.mapped(single_table(scheme, 0.1).rows(values), y0, mapped)
         stepped, h = np.empty_like(y0), np.full(len(y0), 0.1)
         code.step_rows(step_table(scheme).rows(values), h, h, h, y0, stepped)
-        found.append([*pieces, one.states, one.n_finite, mapped, stepped])
+        found.append([*pieces, one.states[0], one.n_finite[0], mapped, stepped])
     for a, b in zip(*found, strict=True):
         assert np.array_equal(a, b, equal_nan=True)
     assert found[0][1][5] == found[0][5] < 40
@@ -61,6 +62,6 @@ def test_runs_without_outputs_reach_their_end():
     values = systems.henon_heiles().symbols.parametric.values
     table, y0 = run_table(scheme_named("verlet"), 0.1).rows(values), np.full((37, 4), 0.1)
     carry = Carry()
-    run = run_states(lambda _, *rest: code.rollout_batch(table, *rest), y0, 50, np.zeros(0, int), 1, carry, 4, 1)
+    run = run_states(partial(code.run, table), Task(0.1, y0, 50, np.zeros(0, int), carry, threads=1), 4, 1)
     assert (run.n_finite == 50).all()
     assert np.isfinite(carry.running).all()

@@ -1,6 +1,7 @@
 """Systems of many terms: loops over the terms of each kind, against the functions of arrays."""
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from sympflow.hamiltonian.parts import linear_and_rest
 from sympflow.kernels import terms
 from sympflow.kernels.array_splittings import ArrayCode, term_code
 from sympflow.kernels.parts_loops import parts_loops
-from sympflow.kernels.protocol import run_state, run_states
+from sympflow.kernels.protocol import Task, run_states
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import Splitting, SplittingCode
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
@@ -70,9 +71,11 @@ def test_loops_over_terms_are_the_stages_that_are_written_out(kind, compensated,
     table[-1, 1] = 0.0  # a kick with fewer terms
     y0, found = system.y0 + 0.1 * rng.standard_normal((11, 6)), []
     for code in (SplittingCode(splitting), term_code(splitting)):
-        run = run_states(lambda _, *r, code=code: code.rollout_batch(table, *r), y0, 7, save, 1, None, code.n_values, 1)
-        one = run_state(lambda *r, code=code: code.rollout(table, *r), y0[3], 7, save, None, code.n_values, 1)
-        assert np.array_equal(one.states, run.states[3])
+        run, one = (
+            run_states(partial(code.run, table), Task(0.1, y, 7, save, threads=1), code.n_values, 1)
+            for y in (y0, y0[3:4])
+        )
+        assert np.array_equal(one.states[0], run.states[3])
         found.append(run.states)
     assert np.abs(found[0]).max() < 1e3
     assert np.abs(found[0] - found[1]).max() < 1e-12 * np.abs(found[0]).max()

@@ -339,7 +339,7 @@ def test_a_map_of_a_family(tmp_path):
 def test_bad_arguments(arguments, message):
     with pytest.raises((ValueError, TypeError), match=message):
         stability(systems.pendulum(), ["verlet"], **arguments)
-    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem or a sequence"):
+    with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem; got int"):
         stability([1], ["verlet"])
 
 

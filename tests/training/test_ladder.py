@@ -186,7 +186,7 @@ def test_the_list(three):
     assert "1.0e-03 (T = 1000)" in table[2]
     assert repr(rows) == rows.table()
     with pytest.raises(TypeError, match=r"^`system` must be a HamiltonianSystem"):
-        shipped_flows("pendulum")
+        shipped_flows(3)
     with pytest.raises(ValueError, match=r"^`kind` 'gan' is unknown"):
         shipped_flows(kind="gan")
 

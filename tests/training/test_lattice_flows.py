@@ -142,10 +142,10 @@ def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
     lattice = ring(domain=LatticeStates(0.2))
     with pytest.raises(ValueError, match=r"^`runs` must be a positive integer; got 0"):
         train(lattice, flow=flow, runs=0, **FIT)
-    with pytest.raises(ValueError, match=r"^`runs` are of lattices and like bodies that keep their energy, and"):
+    with pytest.raises(ValueError, match=r"^`runs` are of lattices that keep their energy, and"):
         train(ring(damping=0.1, domain=LatticeStates(0.2)), dt=0.2, runs=4, **FIT)
     pendulum = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", domain=Box([-1, -1], [1, 1]))
-    with pytest.raises(ValueError, match=r"^`runs` are of lattices and like bodies that keep their energy, and"):
+    with pytest.raises(ValueError, match=r"^`runs` are of lattices that keep their energy, and"):
         train(pendulum, dt=0.5, runs=4, **FIT)
     with pytest.raises(ValueError, match=r"^`runs` begin in states of a larger piece of the system, and `data`"):
         train(lattice, runs=4, data=([0.1], np.zeros((1, 512)), np.zeros((1, 512))))
