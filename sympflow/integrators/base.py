@@ -311,7 +311,6 @@ class KernelStepper(Stepper):
     """A run in compiled loops."""
 
     compiled = True
-    takes_carry = True
 
     def __init__(self, integrator: FixedStep, problem: Problem, kernel: Kernel) -> None:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
@@ -319,9 +318,18 @@ class KernelStepper(Stepper):
         self.driven = self.system is not None and not self.system.autonomous  # a flow alone steps without a system
         self.iterations = 0
 
+    @property
+    def takes_carry(self) -> bool:
+        """False where torch follows the run, which it cannot from piece to piece."""
+        return not is_tensor(self.problem.y0) or not differentiable(self.problem.y0, *self.problem.followed)
+
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
     ) -> tuple[Array, np.ndarray]:
+        if is_tensor(y0):
+            from sympflow.integrators.tensors import rolled_out
+
+            return rolled_out(self, y0, h, n_steps, save, t0, carry)
         if y0.ndim == 1:
             states, last, iterations = self.kernel.run(h, y0, n_steps, save, carry, t0)
             self.iterations += iterations

@@ -387,7 +387,12 @@ class Splitting(OwnStepper):
         told: list[str] = []
         compensated = bool(self.compensated)
         kernel = compiled_loops(
-            lambda: composition.kernel(compensated), problem.y0, problem.backend, compensated, told=told
+            lambda: composition.kernel(compensated),
+            problem.y0,
+            problem.backend,
+            compensated,
+            told=told,
+            system=problem.system,
         )
         if kernel is None:
             return ArrayComposition(self, problem, composition, told)
@@ -440,6 +445,9 @@ class CompiledComposition(KernelStepper):
     def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition, kernel: Kernel) -> None:
         super().__init__(integrator, problem, kernel)
         self.composition = composition
+
+    def by_arrays(self, y: Array, h: Any, t: Any, *followed: Any) -> Array:
+        return self.composition.step(y, h, t)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         return self.composition.evaluations(n_steps, n_saved, n_extra, "compiled")
