@@ -120,6 +120,8 @@ def values(x: Any) -> np.ndarray | None:
     plain, order = _behind(x)
     if plain is None:
         return None
+    if plain.ndim == x.ndim and plain.device.type == "cpu":
+        return plain.numpy()
     import torch
 
     with torch._C._DisableFuncTorch():
@@ -202,6 +204,8 @@ def _behind(x: Any) -> tuple[Any, list[int]]:
     if torch.compiler.is_dynamo_compiling():
         return None, []
     functorch, axes = torch._C._functorch, list(range(x.ndim))
+    if type(x) is torch.Tensor and not functorch.is_functorch_wrapped_tensor(x):
+        return x.detach(), axes
     with torch._C._DisableFuncTorch():
         while functorch.is_functorch_wrapped_tensor(x):
             if functorch.is_batchedtensor(x):
@@ -246,6 +250,8 @@ def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
     """
     if not is_tensor(y):
         return np.isfinite(y).all(-1)
+    if y.device.type == "cpu" and (found := values(y)) is not None and found.ndim == y.ndim:
+        return np.isfinite(found).all(-1)
     finite = values(all_finite(y))
     if finite is None:
         return np.ones(y.shape[:-1], dtype=bool)

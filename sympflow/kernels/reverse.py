@@ -111,25 +111,22 @@ class Recorded:
         code, table = self._code, self._table
         of_states = np.zeros((len(self._y0), code.n_values))
         good = self.n_finite >= self._n_steps
-        pieces: dict[int, np.ndarray] = {}
+        found = np.zeros((table.shape[1], code.size, len(good) if slopes else 0))
 
         def piece(i: slice, stop: np.ndarray) -> None:
-            pieces[i.start] = self._pulled(i, of_states, cotangents[i], slopes, stop)
+            of_states[i], lanes = self._pulled(i, cotangents[i], slopes, stop)
+            found[..., i] = lanes
 
         if self._n_steps and good.any():
             self._each(piece)
-        n = int(self._save.searchsorted(0, "right"))
-        of_states[:, : code.n_out] += cotangents[:, :n].sum(1)
         of_states = of_states[:, : code.n_out]
-        found = np.zeros((table.shape[1], code.size, len(good)))
-        for start, part in pieces.items():
-            found[..., start : start + part.shape[-1]] = part
-        found[..., ~good] = 0.0
-        of_columns = found if self._own else found.sum(-1)
-        of_table = np.zeros((len(table), *np.delete(of_columns.shape, 1)))
+        if n := int(self._save.searchsorted(0, "right")):
+            of_states += cotangents[:, :n].sum(1)
+        of_table = np.zeros((len(table), table.shape[1], *[len(good)] * self._own))
         if slopes:
-            of_table += code.pulled(self._full_table(), of_columns)
-        for k in np.flatnonzero(~good).tolist():  # up to the last output that is finite
+            found[..., ~good] = 0.0
+            of_table += code.pulled(self._full_table(), found if self._own else found.sum(-1))
+        for k in () if good.all() else np.flatnonzero(~good).tolist():  # up to the last output that is finite
             m = int(self._save.searchsorted(self.n_finite[k], "right"))
             end = int(self._save[m - 1]) if m else 0
             alone = Recorded(code, table, self._y0[k : k + 1], end, self._save[:m], self._work)
@@ -149,7 +146,7 @@ class Recorded:
         table[len(table) - len(values) :] = values[:, None]
         return table
 
-    def _pulled(self, i: slice, of_states: np.ndarray, given: np.ndarray, slopes: bool, stop: np.ndarray) -> np.ndarray:
+    def _pulled(self, i: slice, given: np.ndarray, slopes: bool, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pull cotangents of the outputs of some rows back to their first states, and those of columns (m, size, n)."""
         code, table, n = self._code, self._table, i.stop - i.start
         width, y0 = self._width(n), self._y0[i]
@@ -172,8 +169,7 @@ class Recorded:
                 later = outputs = NEVER
             arguments = entries, kinds, len(kinds) - 2, kept, rows, n, first, to, later, count, outputs, found
             code.call(name, width, *arguments)
-        of_states[i] = rows
         if not slopes:
-            return np.zeros((len(kinds), code.size, n))
+            return rows, np.zeros(0)
         lanes = found.reshape(groups, len(kinds), code.size, width)
-        return lanes.transpose(1, 2, 0, 3).reshape(len(kinds), code.size, groups * width)[..., :n]
+        return rows, lanes.transpose(1, 2, 0, 3).reshape(len(kinds), code.size, groups * width)[..., :n]
