@@ -26,6 +26,13 @@ def is_tensor(x: object) -> bool:
     return torch is not None and isinstance(x, torch.Tensor)
 
 
+def as_tensor(x: Array) -> Array:
+    """Return a tensor of the same numbers."""
+    import torch
+
+    return torch.as_tensor(x)
+
+
 def library(x: Array) -> Any:
     """Return the module of the functions for `x`: NumPy or torch."""
     if is_tensor(x):
@@ -120,8 +127,6 @@ def values(x: Any) -> np.ndarray | None:
     plain, order = _behind(x)
     if plain is None:
         return None
-    if plain.ndim == x.ndim and plain.device.type == "cpu":
-        return plain.numpy()
     import torch
 
     with torch._C._DisableFuncTorch():
@@ -205,7 +210,7 @@ def _behind(x: Any) -> tuple[Any, list[int]]:
         return None, []
     functorch, axes = torch._C._functorch, list(range(x.ndim))
     if type(x) is torch.Tensor and not functorch.is_functorch_wrapped_tensor(x):
-        return x.detach(), axes
+        return x.detach(), axes  # nearly always
     with torch._C._DisableFuncTorch():
         while functorch.is_functorch_wrapped_tensor(x):
             if functorch.is_batchedtensor(x):

@@ -16,7 +16,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt, check_not_followed
-from sympflow.arrays import Array, differentiable, finite_states, full_of_nan, is_tensor, join, lanes, stack, transformed
+from sympflow.arrays import (
+    Array,
+    differentiable,
+    finite_states,
+    full_of_nan,
+    is_tensor,
+    join,
+    lanes,
+    stack,
+    transformed,
+)
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem, counting_view
 from sympflow.integrators.contract import (
@@ -321,7 +331,7 @@ class KernelStepper(Stepper):
     @property
     def takes_carry(self) -> bool:
         """False where torch follows the run, which it cannot from piece to piece."""
-        return not is_tensor(self.problem.y0) or not differentiable(self.problem.y0, *self.problem.followed)
+        return not is_tensor(self.problem.y0) or not differentiable(self.problem.y0, *self.problem.followed.values())
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None

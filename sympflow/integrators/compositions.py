@@ -122,6 +122,10 @@ class Composition(ABC):
     def kernel(self, compensated: bool) -> Kernel:
         """The compiled loops; a ValueError says why there are none."""
 
+    def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
+        """The same with the parameters of these names as numbers by which runs are differentiated."""
+        raise ValueError(f"`method` {self.method!r} has no compiled derivatives by parameters.")
+
     @abstractmethod
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Evaluations of forces and their derivatives, as `FixedStep.evaluations`."""
@@ -264,6 +268,16 @@ class KineticPotential(Composition):
                 p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
         return np.concatenate([q, p], axis=-1), np.concatenate([U, P], axis=-2)
 
+    def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
+        system = self.system
+        if system.symbols is None:
+            raise ValueError(f"`system` {system.name!r} is no symbolic one.")
+        if system.kinetic_timed:
+            raise ValueError(f"`system` {system.name!r} has a kinetic energy that depends on t.")
+        kernel = _splitting_loops()(system, names).kernel(self.scheme, compensated)
+        kernel.check_reverse()
+        return kernel
+
     def kernel(self, compensated: bool) -> Kernel:
         loops = _splitting_loops()(self.system)
         if self.system.friction is None:
@@ -275,7 +289,7 @@ class KineticPotential(Composition):
 
 
 @cache
-def _splitting_loops() -> Callable[[HamiltonianSystem], SplittingLoops]:
+def _splitting_loops() -> Callable[..., SplittingLoops]:
     """The maker of compiled loops, imported once."""
     from sympflow.kernels.splitting_loops import splitting_loops
 

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -129,8 +129,8 @@ class Problem:
     events: EventSearch | None = None
     letters: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
-    followed: tuple[Any, ...] = ()
-    """The same as tensors (N,), of those whose gradients are wanted: of one form of H, which has them by their names."""
+    followed: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters whose gradients are wanted, tensors (N,), by their names: then `letters` are the values of these."""
     progress: Progress | None = None
     """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None
@@ -215,6 +215,13 @@ class Integrator:
     def takes_letters(self, problem: Problem) -> bool:
         """True if a run takes values of parameters for each trajectory, as numbers of one compiled run."""
         return False
+
+    def check_followed(self, problem: Problem) -> None:
+        """Raise a ValueError where gradients do not flow to parameters."""
+        raise ValueError(
+            f"`params` has {', '.join(problem.followed)}, to which no gradient flows through method {self.name!r}: use "
+            "a splitting method on the splitting 'kinetic', such as 'kahan_li8', or detach them."
+        )
 
     @property
     def takes_driving(self) -> bool:

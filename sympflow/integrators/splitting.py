@@ -294,6 +294,17 @@ class Splitting(OwnStepper):
         )
         return kernel is not None and bool(kernel.loops.values)
 
+    def check_followed(self, problem: Problem) -> None:
+        if self.clock != "physical" or self.overrides("step"):
+            super().check_followed(problem)
+        try:
+            if problem.backend == "array":
+                raise ValueError("`backend` is 'array'.")
+            self.composed(problem.system).kernel_by(bool(self.compensated), tuple(problem.followed))
+        except ValueError as error:
+            names = ", ".join(problem.followed)
+            raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
+
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock != "physical":
             self.on_clock(system)
@@ -386,8 +397,9 @@ class Splitting(OwnStepper):
         composition = self.composed(problem.system)
         told: list[str] = []
         compensated = bool(self.compensated)
+        names = tuple(problem.followed)
         kernel = compiled_loops(
-            lambda: composition.kernel(compensated),
+            lambda: composition.kernel_by(compensated, names) if names else composition.kernel(compensated),
             problem.y0,
             problem.backend,
             compensated,
@@ -447,7 +459,15 @@ class CompiledComposition(KernelStepper):
         self.composition = composition
 
     def by_arrays(self, y: Array, h: Any, t: Any, *followed: Any) -> Array:
-        return self.composition.step(y, h, t)
+        if not followed:
+            return self.composition.step(y, h, t)
+        if self.system.friction is not None:
+            raise ValueError(
+                "`params` with gradients of a system with friction have no second derivatives, and none at times "
+                "between two steps: choose times on the grid, or detach them."
+            )
+        batch = self.problem.y0.shape[:-1]
+        return self.kernel.stepped(y, h, t, [x.reshape(batch) for x in followed])
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         return self.composition.evaluations(n_steps, n_saved, n_extra, "compiled")

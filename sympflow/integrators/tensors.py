@@ -26,7 +26,7 @@ def rolled_out(
     if y0.dtype != torch.float64:
         states, finite = rolled_out(stepper, y0.double(), h, n_steps, save, t0, carry)
         return states.to(y0.dtype), finite
-    followed = stepper.problem.followed
+    followed = stepper.problem.followed.values()
     if not differentiable(y0, *followed):
         found, finite = stepper.rollout(to_numpy(y0), h, n_steps, save, t0, carry)
         return torch.from_numpy(found), finite
@@ -40,7 +40,7 @@ def stepped(stepper: KernelStepper, y: Tensor, h: Any, t: Any) -> Tensor:
         h = h.double() if isinstance(h, Tensor) else h
         return stepped(stepper, y.double(), h, t).to(y.dtype)
     h = torch.as_tensor(h, dtype=y.dtype).expand(y.shape[:-1])
-    return _Step.apply(stepper, t, y, h, *stepper.problem.followed)
+    return _Step.apply(stepper, t, y, h, *stepper.problem.followed.values())
 
 
 class _Rolled:

@@ -164,7 +164,11 @@ class Recorded:
                 batch = Batch(y0, to, self._save[:0], *nothing, first, running, stop=stop, kept=kept)
                 code.run(table, batch, False)
             chosen = slice(*self._save.searchsorted((first, to), "right").tolist())
-            later, outputs, count = self._save[chosen], np.ascontiguousarray(given[:, chosen]), chosen.stop - chosen.start
+            later, outputs, count = (
+                self._save[chosen],
+                np.ascontiguousarray(given[:, chosen]),
+                chosen.stop - chosen.start,
+            )
             if not count:
                 later = outputs = NEVER
             arguments = entries, kinds, len(kinds) - 2, kept, rows, n, first, to, later, count, outputs, found

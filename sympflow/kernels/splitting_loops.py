@@ -27,21 +27,25 @@ if TYPE_CHECKING:
     from sympflow.kernels.stage_times import Driving
 
 
-def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
+def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> SplittingLoops:
     """The compiled loops of splitting schemes on a separable system, made once per system.
+
+    With `names` the values of `SplittingLoops` are those of these parameters.
 
     Raises
     ------
     ValueError
         If the system cannot be compiled, with the reason.
     """
-    loops = _LOOPS.get(system)
-    if loops is None:
-        loops = _LOOPS[system] = SplittingLoops(system)
-    return loops
+    known = _LOOPS.get(system)
+    if known is None:
+        known = _LOOPS[system] = {}
+    if names not in known:
+        known[names] = SplittingLoops(system, names)
+    return known[names]
 
 
-_LOOPS: WeakKeyDictionary[HamiltonianSystem, SplittingLoops] = WeakKeyDictionary()
+_LOOPS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[str, ...], SplittingLoops]] = WeakKeyDictionary()
 
 LANES_OF_SUMS, LANES = 16.0, 2.0
 """By how much less a kick takes in a batch than `SplittingLoops.work`: of sums and products alone, and of functions."""
@@ -71,13 +75,13 @@ class SplittingLoops:
         True if H depends on t.
     """
 
-    def __init__(self, system: HamiltonianSystem) -> None:
+    def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
+        symbols = system.symbols.named(names) if names and system.symbols is not None else system.symbols
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.traced = self._large = False
-        self._symbols: Any = system.symbols
-        self._form: Any = system.symbols
+        self._form: Any = symbols
         self._driving: Driving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Rollouts]
@@ -85,19 +89,19 @@ class SplittingLoops:
         self._longs: dict[int, bool] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
-        if not system.separable:
+        if not (system.separable if symbols is None else symbols.separable):
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
-        if system.symbols is not None:
+        if symbols is not None:
             from sympflow.hamiltonian.recorded import check_recorded  # SymPy, which Numba functions do without
             from sympflow.kernels.terms import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
-            self._large = is_large(system.symbols)
+            self._large = is_large(symbols)
             check_damping(system, self._large)
             if self.driven:
                 from sympflow.kernels.stage_times import driven_form
 
-                self._driving = driven_form(system.symbols if self._large else system.symbols.parametric)
+                self._driving = driven_form(symbols if self._large else symbols.parametric)
                 if self._large and self._driving.means:
                     raise ValueError(
                         "`system` has many terms and a kinetic energy that depends on t: use backend='array'."
@@ -107,12 +111,12 @@ class SplittingLoops:
                 self.values, self.traced = self._form.values, True
                 self.abreast = LANES
             else:
-                V = system.symbols.V
+                V = symbols.V
                 check_recorded(V)
-                check_recorded(system.symbols.T)
-                self.values = system.symbols.parametric.values
+                check_recorded(symbols.T)
+                self.values = symbols.parametric.values
                 self._has_ranges, self.traced = not self._large, True
-                sums = V is not None and not self._large and V.is_polynomial(*system.symbols.q)
+                sums = V is not None and not self._large and V.is_polynomial(*symbols.q)
                 self.abreast = LANES_OF_SUMS if sums else LANES
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
@@ -146,7 +150,7 @@ class SplittingLoops:
                 "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
             )
         self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops
-        self._has_curvature = system.symbols is not None or system.local is not None
+        self._has_curvature = symbols is not None or system.local is not None
         self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], Rollouts] = {}
 
     def __getstate__(self) -> dict[str, Any]:

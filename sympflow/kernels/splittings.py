@@ -162,7 +162,7 @@ class Shape:
         else:
             positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
-        arranged = made.finish(outputs, self.plain and [*self.plain, *momenta, *errors])
+        arranged = made.finish(outputs, [*self.plain, *momenta, *errors] if self.plain else None)
         return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
 
     def _kicked(self) -> list[Any]:
@@ -491,7 +491,8 @@ class SplittingCode(Rollouts):
     def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
         if self.timed:
             return slopes.swapaxes(0, 1)
-        found, kinds = np.zeros((len(table), *np.delete(slopes.shape, 1))), self._kinds_of(table)
+        found = np.zeros((len(table), *np.delete(slopes.shape, 1)))
+        kinds = self._kinds_of(table if table.ndim == 2 else table[..., 0])
         for k, program in enumerate(self._of_tables):
             columns = kinds == k
             n = len(program.inputs) - len(table)
@@ -518,7 +519,9 @@ class SplittingCode(Rollouts):
         for k, column in zip(kinds, numbers.T.tolist(), strict=True):
             given = [c * h**power for c, power in zip(column, powers, strict=False)]
             if self.timed:
-                given = self._lettered(t + column[len(powers)] * h, [*given, 0.0, 0.0, 0.0, *values])
+                given = self._lettered(
+                    torch.as_tensor(t, dtype=y.dtype) + column[len(powers)] * h, [*given, 0.0, 0.0, 0.0, *values]
+                )
             else:
                 given += values
             state = self._kinds[k].plain(*state, *self._kinds[k].table(*given))
