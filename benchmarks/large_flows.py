@@ -43,7 +43,7 @@ from measuring.race import SHORTEST, Runner, fewest_steps, schemes
 import sympflow
 from sympflow import HamiltonianSystem, LatticeStates, train
 from sympflow.flow.primed import PrimedFlow
-from sympflow.training.starts import Primed
+from sympflow.training.fits import PrimedFit
 
 TARGETS = (1e-4, 1e-6, 1e-8)
 SITES = 1024
@@ -77,7 +77,7 @@ def lattice(name: str, sites: int) -> HamiltonianSystem:
 
 
 def flows_of(
-    system: HamiltonianSystem, folder: Path, ladder: Sequence[Primed] = (), fit: Mapping[str, Any] = FIT
+    system: HamiltonianSystem, folder: Path, ladder: Sequence[PrimedFit] = (), fit: Mapping[str, Any] = FIT
 ) -> list[PrimedFlow]:
     """The flows of a system that ship or are in a folder, where those of a ladder are fitted first if they are not."""
     for start in ladder:

@@ -42,7 +42,7 @@ from sympflow import HamiltonianSystem, SympFlow, systems, time_transformed, tra
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.fingerprint import same_system
-from sympflow.training.starts import Primed
+from sympflow.training.fits import PrimedFit
 
 TARGETS = (1e-4, 1e-6, 1e-8)
 SHIPPED = Path(sympflow.__file__).parent / "pretrained"
@@ -55,31 +55,51 @@ class Scene:
     Attributes
     ----------
     make : callable
-    starts : tuple of (Primed, int)
+    starts : tuple of (PrimedFit, int)
         Starts of trainings, and how many tables their searches begin from.
     """
 
     make: Callable[[], HamiltonianSystem]
-    starts: tuple[tuple[Primed, int], ...]
+    starts: tuple[tuple[PrimedFit, int], ...]
 
 
-def driven_starts(*steps: float) -> tuple[tuple[Primed, int], ...]:
+def primed(dt: float, stages: int, processor: int = 6) -> PrimedFit:
+    return PrimedFit(dt, stages=stages, processor=processor)
+
+
+def driven_starts(*steps: float) -> tuple[tuple[PrimedFit, int], ...]:
     """Starts of a driven system at these Δt."""
-    return tuple((Primed(dt, 6, 8, curvature=True, first="kick"), 8) for dt in steps)
+    return tuple((PrimedFit(dt, stages=6, processor=8, curvature=True, first="kick"), 8) for dt in steps)
 
 
 MEASURES = {"energy": 1000.0, "state": 100.0}
 FLOWS = {
     "henon_heiles": Scene(
         systems.henon_heiles,
-        ((Primed(1.1, 2), 24), (Primed(0.65, 2), 24), (Primed(0.9, 3), 24), (Primed(0.55, 3), 48)),
+        (
+            (primed(1.1, 2), 24),
+            (primed(0.65, 2), 24),
+            (primed(0.9, 3), 24),
+            (primed(0.55, 3), 48),
+        ),
     ),
     "pendulum": Scene(
         systems.pendulum,
-        ((Primed(0.8, 1), 24), (Primed(1.2, 2, 4), 24), (Primed(0.5, 2), 24), (Primed(0.5, 3), 48)),
+        (
+            (primed(0.8, 1), 24),
+            (primed(1.2, 2, 4), 24),
+            (primed(0.5, 2), 24),
+            (primed(0.5, 3), 48),
+        ),
     ),
-    "quartic": Scene(systems.quartic, ((Primed(0.8, 2), 24), (Primed(0.5, 3), 24), (Primed(0.3, 3), 48))),
-    "kepler": Scene(systems.kepler, ((Primed(0.15, 2), 24), (Primed(0.1, 3), 24), (Primed(0.045, 3), 48))),
+    "quartic": Scene(
+        systems.quartic,
+        ((primed(0.8, 2), 24), (primed(0.5, 3), 24), (primed(0.3, 3), 48)),
+    ),
+    "kepler": Scene(
+        systems.kepler,
+        ((primed(0.15, 2), 24), (primed(0.1, 3), 24), (primed(0.045, 3), 48)),
+    ),
 }
 DRIVEN = {
     "driven_pendulum": Scene(systems.driven_pendulum, driven_starts(2.0, 1.5, 1.0, 0.8, 0.5, 0.4)),
@@ -90,7 +110,7 @@ DRIVEN = {
 }
 
 
-def fitted(system: HamiltonianSystem, start: Primed, tables: int, folder: Path, **options: Any) -> PrimedFlow:
+def fitted(system: HamiltonianSystem, start: PrimedFit, tables: int, folder: Path, **options: Any) -> PrimedFlow:
     """The flow that comes of a start, from the folder if it is there."""
     path = folder / f"{system.name}-{start.dt:g}-{start.stages}-{start.processor}.safetensors"
     if path.exists():

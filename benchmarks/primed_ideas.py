@@ -48,8 +48,8 @@ from sympflow import HamiltonianSystem, LatticeStates, SympFlow, Tube, max_energ
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.primed import PrimedFlow
+from sympflow.training.fits import PrimedFit
 from sympflow.training.shipped.judges import one_step_errors
-from sympflow.training.starts import Primed
 
 IDEAS = ("curvature", "polynomial", "energy", "tube", "network", "spacing")
 DT, STAGES, PROCESSOR = 1.0, 3, 6
@@ -126,7 +126,7 @@ def polynomial(t_end: float, scenes: Any, **options: Any) -> str:
         stages, processor, dt, first, degree = POLYNOMIALS[name]
         system = getattr(systems, name.partition(",")[0])()
         shape = f"{dt:g}, {stages} + {processor}"
-        start = Primed(dt, stages, processor, first=first)
+        start = PrimedFit(dt, stages=stages, processor=processor, first=first)
         fit: dict[str, Any] = {"restarts": 12, "progress": False, **options}
         plain = train(system, flow=start.flow(system), **fit)
         bent = replace(start, polynomial=degree)

@@ -442,7 +442,7 @@ def round_off(figures: Path) -> Fragments:
 
 
 def _round_off_figure(curves: list[tuple[str, Any]], path: Path) -> None:
-    from sympflow.studies.figure_style import dress, method_styles, new_figure, save
+    from sympflow.show.style import dress, method_styles, new_figure, save
 
     figure = new_figure(6.4, 4.2)
     ax = figure.subplots()

@@ -32,10 +32,10 @@ import torch
 from measuring import fragments
 
 from sympflow import train
+from sympflow.training.fits import NetworkFit
 from sympflow.training.shipped import rows
 from sympflow.training.shipped.judges import AsPublished, one_step_errors
 from sympflow.training.shipped.recipe import Recipe
-from sympflow.training.starts import Network
 
 PUBLISHED = {
     ("harmonic_oscillator", "sympflow"): 3.5e-4,
@@ -69,14 +69,14 @@ def recipe_of(scene: str, kind: str) -> Recipe:
 
 def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
     """A flow that was trained for so many seconds of processor time, and what it achieves."""
-    system, start, judge = recipe.system(), recipe.start, recipe.judge
-    assert isinstance(start, Network)
+    system, start, judge = recipe.system(), recipe.fit, recipe.judge
+    assert isinstance(start, NetworkFit)
     assert isinstance(judge, AsPublished)
-    points = [fit.points for fit in recipe.fits]
+    points = [start.points, *(fit.points for fit, _ in recipe.further)]
     options: dict[str, Any] = {"optimizer": optimizer, "domain": recipe.domain_of(system), "matching_weight": 0.0}
     options["steps"] = MANY
     options |= {"progress": False, "validate_every": 1}
-    new: dict[str, Any] = {"dt": start.dt, "kind": start.kind}
+    new: dict[str, Any] = {"dt": start.dt, "kind": recipe.kind}
     if optimizer == "adam":
         for _ in range(2):  # the first sets up what later steps find
             begin = time.process_time()

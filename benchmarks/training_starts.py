@@ -29,9 +29,9 @@ pin_to_one_thread()
 from measuring import fragments
 from own_systems import SYSTEMS
 
-from sympflow.training.options import TableOptions
+from sympflow.training.fits import PrimedFit
 from sympflow.training.session import Session
-from sympflow.training.starts import Primed, scaling_of
+from sympflow.training.starts import scaling_of
 from sympflow.training.table_fit import SEARCH_STEPS, TableRun
 
 STEPS = {"duffing": 0.6, "morse": 0.5, "mass": 0.6, "singular": 0.12, "three": 0.5}
@@ -41,9 +41,9 @@ def measured(name: str, curvature: bool, starts: int) -> dict[str, float]:
     """Seconds and iterations of so many starts, and their median cost."""
     system = SYSTEMS[name]
     assert system.domain is not None
-    flow = Primed(STEPS[name], curvature=curvature).flow(system)
+    flow = PrimedFit(STEPS[name], curvature=curvature).flow(system)
     scaling = scaling_of(system.domain, flow.dt, 0)
-    run = TableRun.start(flow, system, system.domain, scaling, TableOptions(reference_states=5))
+    run = TableRun.start(flow, system, system.domain, scaling, PrimedFit(reference_states=5))
     fit, deadline = run.frozen, Session().deadline
     assert fit is not None
     fit.minimize(run.start_of(0), 2, deadline)  # what is compiled

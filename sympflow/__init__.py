@@ -34,6 +34,15 @@ _HOME = {
     "load": "flow.files",
     "shipped_flows": "flow.shipped",
     "train": "training.trainer",
+    "PrimedFit": "training.fits",
+    "SplitFit": "training.fits",
+    "NetworkFit": "training.fits",
+    "LossFit": "training.fits",
+    "ClockedFit": "training.fits",
+    "GaussNewton": "training.fits",
+    "Adam": "training.fits",
+    "BFGS": "training.fits",
+    "LBFGS": "training.fits",
     "discover": "learning.discovery",
     "learn": "learning.learner",
     "Trajectories": "learning.trajectories",
@@ -73,6 +82,7 @@ _ROOMS = (
     "storage",
     "studies",
     "testing",
+    "training",
 )
 
 __all__ = ["__version__", *_HOME, *_MODULES]  # noqa: PLE0604
@@ -127,6 +137,15 @@ if TYPE_CHECKING:
     from sympflow.studies.poincare import poincare_section as poincare_section
     from sympflow.studies.precision import work_precision as work_precision
     from sympflow.studies.step_stability import stability as stability
+    from sympflow.training.fits import BFGS as BFGS
+    from sympflow.training.fits import LBFGS as LBFGS
+    from sympflow.training.fits import Adam as Adam
+    from sympflow.training.fits import ClockedFit as ClockedFit
+    from sympflow.training.fits import GaussNewton as GaussNewton
+    from sympflow.training.fits import LossFit as LossFit
+    from sympflow.training.fits import NetworkFit as NetworkFit
+    from sympflow.training.fits import PrimedFit as PrimedFit
+    from sympflow.training.fits import SplitFit as SplitFit
     from sympflow.training.trainer import train as train
 
 

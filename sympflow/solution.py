@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,12 +14,17 @@ import numpy as np
 from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, weights
+from sympflow.integrators.contract import method_text
+from sympflow.show.cards import Card, Shown
+from sympflow.show.pictures import KINDS, trajectory_figure
+from sympflow.show.style import saved
 
 if TYPE_CHECKING:
     import os
 
     import pandas
     import xarray
+    from matplotlib.figure import Figure
     from scipy.optimize import OptimizeResult
 
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -26,8 +33,12 @@ if TYPE_CHECKING:
     from sympflow.storage.runs import RunStore
 
 
-@dataclass
-class Solution:
+LARGE = 2_000_000
+"""Numbers of a solution beyond which its card has no energy error."""
+
+
+@dataclass(repr=False)
+class Solution(Shown):
     """The solution of an initial value problem, with SciPy's fields.
 
     Attributes
@@ -60,19 +71,19 @@ class Solution:
         is then the one that was given, unless they were given as numbers.
     """
 
-    t: np.ndarray = field(repr=False)
-    y: Array = field(repr=False)
+    t: np.ndarray
+    y: Array
     status: int | np.ndarray
     message: str
     stats: dict[str, Any]
-    system: HamiltonianSystem = field(repr=False)
+    system: HamiltonianSystem
     integrator: Integrator
     t_span: tuple[float, float]
-    y0: Array = field(repr=False)
-    sol: Callable[[Any], Array] | None = field(default=None, repr=False)
-    t_events: list[np.ndarray] | None = field(default=None, repr=False)
-    y_events: list[np.ndarray] | None = field(default=None, repr=False)
-    rows: ParameterRows | None = field(default=None, repr=False)
+    y0: Array
+    sol: Callable[[Any], Array] | None = None
+    t_events: list[np.ndarray] | None = None
+    y_events: list[np.ndarray] | None = None
+    rows: ParameterRows | None = None
 
     @property
     def nfev(self) -> int:
@@ -176,6 +187,59 @@ class Solution:
         if self.varied and not self.system.autonomous:
             return gathered(self, lambda part: part.energy_scale())
         return known_scale(self.system, to_numpy(self.y0), self.t_span[0], _energy(self, self.y0, self.t_span[0]))
+
+    def card(self) -> Card:
+        t, stats = self.t, self.stats
+        counts = f"{stats.get('n_steps', 0):,} steps, {self.nfev:,} force evaluations, {stats.get('backend', '')}"
+        facts = {
+            "method": method_text(self.integrator, stats.get("dt")),
+            "t": f"{len(t):,} times" + (f", {t[0]:.6g} … {t[-1]:.6g}" if len(t) else ""),
+            "y": f"shape {tuple(self.y.shape)}, {self.y.dtype}",
+            "largest energy error": self._energy_text(),
+            "run": f"{counts}, {stats.get('wall_time', 0):.3g} s",
+            "events": ", ".join(map(str, map(len, self.t_events or ()))),
+        }
+        return Card(f"Solution of {self.system.title}", facts, self.message)
+
+    def _energy_text(self) -> str:
+        """The largest relative energy error in words; empty where there is none, or it takes long."""
+        large = isinstance(self, StoredSolution) or math.prod(self.y.shape) > LARGE or not len(self.t)
+        if large or not (self.system.conservative and self.system.autonomous):
+            return ""
+        with warnings.catch_warnings(action="ignore"), suppress(ArithmeticError, ValueError, TypeError, RuntimeError):
+            return f"{np.abs(energy_change(self)).max():.1e}, relative"
+        return ""
+
+    def preview(self) -> Figure | None:
+        return self.plot() if len(self.t) and not isinstance(self, StoredSolution) else None
+
+    def plot(self, kinds: Sequence[str] = KINDS, path: str | os.PathLike[str] | None = None) -> Figure:
+        """Draw the orbit, the phase plane and the energy error over time, of 16 trajectories of a batch at most.
+
+        Parameters
+        ----------
+        kinds : sequence of str
+            Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
+            p₁, and "energy", which is left out where energy is not kept.
+        path : path, optional
+            File to save it to: .png, .pdf or .svg.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ImportError
+            Without matplotlib.
+        """
+        y = to_numpy(self.y)
+        error = None
+        if self.system.conservative and self.system.autonomous:
+            with warnings.catch_warnings(action="ignore"):
+                error = energy_change(self).reshape(-1, len(self.t))
+        heading = f"{self.system.title}, {method_text(self.integrator, self.stats.get('dt'))}"
+        return saved(trajectory_figure(self.t, y.reshape(-1, *y.shape[-2:]), error, heading, kinds), path)
 
     def to_scipy(self) -> OptimizeResult:
         """The `OdeResult` that `scipy.integrate.solve_ivp` would have returned; of a single trajectory.

@@ -26,12 +26,11 @@ from sympflow.arguments import (
 )
 from sympflow.arrays import Array, as_tensor, finite_states, full_of_nan, is_tensor, lanes, readable, to_numpy
 from sympflow.events import EventSearch, parse
-from sympflow.hamiltonian.scales import default_step
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, report_lanes, run_and_search
-from sympflow.integrators.choosing import check_tolerance, choose_method, step_for
+from sympflow.integrators.base import report_lanes, run_and_search
+from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling
+from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling, warn_of_long_steps
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
@@ -238,8 +237,8 @@ def solve(
     steps_chosen = tol is not None and "tol" not in integrator.options()
     if tol is not None and steps_chosen:
         integrator = replace(integrator, dt=step_for(integrator, problem, tol, tol_of))  # type: ignore[type-var]
-    elif system.step_is_open and isinstance(integrator, FixedStep) and not integrator.trained and readable(y_start):
-        integrator = replace(integrator, dt=integrator.dt or default_step(system, to_numpy(y_start)))
+    elif system.step_is_open and readable(y_start):
+        integrator = with_step(integrator, system, to_numpy(y_start))
     sol = _shown(integrator, problem, action, rows, progress)
     if (
         tol is not None
@@ -361,6 +360,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         check_domain(outcome, integrator, between, action)
         if problem.store is None and not failed and between is system:
             warn_of_loss(outcome, integrator, system, y_start, stacklevel=4)
+    if problem.diagnosed and rows is None and not failed and problem.store is None and readable(outcome.y):
+        warn_of_long_steps(outcome, integrator, problem, stacklevel=4)
     y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
     sol = (Solution if problem.store is None else StoredSolution)(
         t=outcome.t,

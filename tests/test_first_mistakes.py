@@ -1,5 +1,7 @@
 """Natural first calls: what is meant is done, or the error names the remedy."""
 
+import warnings
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -10,6 +12,7 @@ from sympflow import HamiltonianSystem, solve, systems
 
 H = HamiltonianSystem.from_sympy
 SPRING = "p**2/2 + q**2/2"
+UNSUITED = H("p**2*(1 + q**2)/2 + q**2/2")
 x, y, px, py, k = sp.symbols("x y px py k")
 
 
@@ -94,6 +97,7 @@ ANSWERED = {
     "kinds": (lambda: sympflow.get("nothing"), ValueError, r"(?s)unknown.*separable H +'verlet'.*Runge–Kutta .*'rk45'"),
     "args": (lambda: solve(H(SPRING), "verlet", y0=[1, 0], args=(1,)), TypeError, "`args` .* `params`"),
     "q0=": (lambda: solve(H(SPRING), "verlet", q0=[1], p0=[0], y0=[1, 0]), TypeError, r"`q0` .*`y0`, \[q, p\]"),
+    "tao8": (lambda: solve(UNSUITED, "tao8", y0=[1, 0]), ValueError, "coupling .*give `omega`"),
     "rtol": (
         lambda: solve(H(SPRING), "verlet", y0=[1, 0], rtol=1e-9),
         TypeError,
@@ -117,3 +121,32 @@ def test_the_answer_names_the_remedy(call, kind, answer):
 
 def test_rooms_are_attributes():
     assert sympflow.metrics.__name__ == "sympflow.metrics"
+
+
+STIFF = "p**2/2 + {k}*q**2/2"
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize(("method", "z", "told"), [("verlet", 0.2, False), ("verlet", 1.2, True), ("euler", 0.1, True)])
+def test_a_step_that_is_too_long_is_told_in_any_units(method, z, told, scale):
+    system = H(STIFF.format(k=scale**2))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        solve(system, method, (0, 50 / scale), [[1, 0], [2, 0]], dt=z / scale)
+    assert [str(w.message).startswith("`dt`") for w in caught] == [True] * told
+
+
+@pytest.mark.parametrize(
+    "call", [sympflow.ensemble, sympflow.lyapunov, sympflow.sali, sympflow.frequencies, sympflow.poincare_section]
+)
+@pytest.mark.parametrize("system", [H("p**2/2 + q**2/2 + q**4/7"), UNSUITED], ids=["separable", "not separable"])
+def test_functions_of_orbits_choose_a_method(call, system):
+    found = call(system, None, (0, 5), [1.0, 0.3])
+    if call in (sympflow.ensemble, sympflow.poincare_section):
+        assert found.integrator.name == ("srkn11b" if system.separable else "gauss_legendre6")
+    assert found.success
+
+
+def test_a_tolerance_chooses_the_step_of_orbits():
+    found = sympflow.poincare_section(H(SPRING), "verlet", (0, 50), [1.0, 0.3], tol=1e-6)
+    assert found.integrator.dt == pytest.approx(1.4e-3, rel=0.5)

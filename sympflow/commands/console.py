@@ -153,7 +153,7 @@ def ready_folder(folder: Path) -> None:
     ImportError
         Without matplotlib, which draws the figures.
     """
-    from sympflow.studies.figure_style import new_figure
+    from sympflow.show.style import new_figure
 
     new_figure(1, 1)
     _ready(folder, folder, "a folder")
@@ -199,7 +199,7 @@ def write_comparisons(
     comparisons: list[Any], found: list[Scene], folder: Path, say: Callable[[str], None]
 ) -> list[Path]:
     """For each system its CSV, JSON and figures; for several also one CSV and one figure of all."""
-    from sympflow.studies.figure_style import save
+    from sympflow.show.style import save
     from sympflow.studies.figures import overview, save_comparison
     from sympflow.studies.reports import write_csv
 

@@ -144,7 +144,7 @@ def bench(
       sympflow bench pendulum --methods verlet,kahan_li8,dop853 --batch 0 --t-end 50
     """
     with reporting(ctx):
-        from sympflow.studies.figure_style import save
+        from sympflow.show.style import save
         from sympflow.studies.precision import work_precision
 
         chosen, found, start = methods(method_names), scenes(systems, own), state(y0)
@@ -250,6 +250,9 @@ def section(
         list[str] | None,
         typer.Option("--y0", help="Initial state q,p; several times for several orbits. Default: the system's."),
     ] = None,
+    energy: Annotated[
+        float | None, typer.Option(help="Instead: states of this energy on the plane, 16 or as many as --orbits.")
+    ] = None,
     orbits: Annotated[int | None, typer.Option(help="Instead: so many initial states drawn from the domain.")] = None,
     seed: Annotated[int, typer.Option(help="Of the states that are drawn.")] = 0,
     dt: Step = None,
@@ -288,18 +291,19 @@ def section(
 
       sympflow section henon-heiles --method kahan_li8 --t-end 1000 --out out/
 
-      sympflow section henon-heiles --orbits 20 --coordinate q1 --direction up --t-end 2000 --out out/
+      sympflow section henon-heiles --energy 0.125 --orbits 20 --t-end 2000 --out out/
 
       sympflow section own.py:spring --y0 0.1,0,0,0.4 --y0 0.2,0,0,0.3 --axes q2,p2 --out out/
 
       sympflow section duffing --method kahan_li8 --orbits 100 --t-end 2000 --since 200 --out out/
     """
     with reporting(ctx):
-        from sympflow.studies.figure_style import save
+        from sympflow.show.style import save
         from sympflow.studies.poincare import names, poincare_section
 
         scene, chosen = one_scene(system, own), configured(method_name)
-        span, start = interval(scene, t_end), _starts(scene, y0, orbits, seed)
+        span = interval(scene, t_end)
+        start = None if energy is not None and not y0 else _starts(scene, y0, orbits, seed)
         if direction is not None and direction not in DIRECTIONS:
             raise ValueError(f"`--direction` must be one of {', '.join(DIRECTIONS)}; got {direction!r}.")
         pair = [word.strip() for word in axes.split(",")] if axes is not None else [None, None]
@@ -311,7 +315,9 @@ def section(
             ready_folder(to)
         way = None if direction is None else DIRECTIONS[direction]
         asked = {"dt": dt, "tol": tol, "coordinate": coordinate, "level": level, "direction": way, "sample": sample}
-        asked |= {"period": period}
+        asked |= {"period": period, "energy": energy}
+        if energy is not None:
+            asked |= {"n": orbits, "seed": seed}
         options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         with progress() as say:
             say(f"{scene.key}: {method_name}")

@@ -1,13 +1,14 @@
 """Elementary functions by arithmetic alone: the same operations in a scalar as in every lane of a register.
 
 Each function reduces its argument by an identity, which a comment states, and evaluates a polynomial by Estrin's rule.
-What few arguments need stands in a function of its own behind a branch that others never take. float32 is computed in
-double precision. Errors in units in the last place: below 1 for exp and log, 3 for tanh, 2 for the others; on machines
-without fused operations 3 for sin, cos and tan. Of what C gives, constant powers differ in this: a half power of −∞ is
-NaN, x^(−3/2) is 0 where it would be subnormal.
+What few arguments need, very large ones for instance, is given by the C library, one lane after the other, behind a
+branch that others never take. float32 is computed in double precision. Errors in units in the last place: below 1 for
+exp and log, 3 for tanh, 2 for the others; on machines without fused operations 3 for sin, cos and tan; of angles beyond
+`FAR` those of the C library. Of what C gives, constant powers differ in this: a half power of −∞ is NaN, x^(−3/2) is 0
+where it would be subnormal.
 
 Polynomials of sin, cos and log are those of fdlibm (Sun Microsystems, 1993, free to use with this notice); the others
-interpolate at Chebyshev's points. Tables of 2/π after Payne and Hanek (1983), products after Dekker (1971).
+interpolate at Chebyshev's points. Products after Dekker (1971).
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-from sympflow.compiler.control import DOUBLE, INT, LOWERED, POINTER, Type, Value
+from sympflow.compiler.control import DOUBLE, LOWERED, Type, Value
 from sympflow.compiler.functions import fma, where
 
 __all__ = ["LOWERED"]
@@ -72,12 +74,18 @@ def _signed(x: Value, sign: Value) -> Value:
     return x.code.intrinsic("llvm.copysign", x, sign)
 
 
-def _guarded(name: str, far: Value, fast: Value, slow: Callable[..., Value], *args: Value) -> Value:
-    """The fast value, or where it does not hold that of a function of its own."""
+def _by_library(*args: Value, name: str) -> Value:
+    """The value that the C library gives, lane by lane."""
+    code, type = args[0].code, args[0].type
+    return code.lanes(lambda *lane: code.external(name, lane, DOUBLE), args, type)
+
+
+def _guarded(name: str, far: Value, fast: Value, *args: Value, slow: Callable[..., Value] | None = None) -> Value:
+    """The fast value, or where it does not hold that of a function of its own, by default of the C library."""
     code, type = fast.code, fast.type
 
     def then() -> list[Value]:
-        y = code.outlined(f"{name}.far.{type.suffix}", args, slow, type, rare=True)
+        y = code.outlined(f"{name}.far.{type.suffix}", args, slow or partial(_by_library, name=name), type, rare=True)
         return [code.select(far, y, fast)]
 
     return code.when(code.any(far), then, lambda: [fast], rare=True)[0]
@@ -156,7 +164,7 @@ def _exp_far(x: Value, n: Value, e: Value) -> Value:
 def _exp(x: Value) -> Value:
     n, e = _exponential(x, exact=False)
     p = _power_of_two(n)
-    return _guarded("exp", _compare("ugt", abs(x), 708.0), fma(p, e, p), _exp_far, x, n, e)
+    return _guarded("exp", _compare("ugt", abs(x), 708.0), fma(p, e, p), x, n, e, slow=_exp_far)
 
 
 @_lowered("expm1")
@@ -164,7 +172,7 @@ def _expm1(x: Value) -> Value:
     n, e = _exponential(x)
     p = _power_of_two(n)
     far = _compare("ugt", abs(x), 708.0)
-    y = _guarded("expm1", far, fma(p, e, p - 1.0), lambda *args: _exp_far(*args) - 1.0, x, n, e)
+    y = _guarded("expm1", far, fma(p, e, p - 1.0), x, n, e, slow=lambda *args: _exp_far(*args) - 1.0)
     return _signed(y, x)
 
 
@@ -202,18 +210,10 @@ def _logarithm(k: Value, f: Value) -> Value:
     return fma(k, LN2[0], -((square - t) - f))
 
 
-def _log_far(x: Value) -> Value:
-    small = x < TINY
-    k, _, m = _binary(where(small, x * 2.0**54, x))
-    y = _logarithm(k - where(small, 54.0, 0.0), m - 1.0)
-    y = where(_compare("uge", x, INFINITY), x, y)
-    return where(x < 0.0, math.nan, where(_compare("oeq", x, 0.0), -INFINITY, y))
-
-
 @_lowered("log")
 def _log(x: Value) -> Value:
     k, _, m = _binary(x)
-    return _guarded("log", abs(k) > 1021.5, _logarithm(k, m - 1.0), _log_far, x)
+    return _guarded("log", abs(k) > 1021.5, _logarithm(k, m - 1.0), x)
 
 
 @_lowered("log1p")
@@ -224,8 +224,7 @@ def _log1p(x: Value) -> Value:
     left = (1.0 - (u - b)) + (x - b)
     k, i, m = _binary(u)
     f = fma(left, ((2046 - i) << 52).real, m - 1.0)
-    y = _guarded("log1p", abs(k) > 1021.5, _logarithm(k, f), lambda x: _log_far(x + 1.0), x)
-    return _signed(y, x)
+    return _signed(_guarded("log1p", abs(k) > 1021.5, _logarithm(k, f), x), x)
 
 
 ARTANH = (  # ((2 artanh s / s − 2)/s² − 2/3)/s², of s²
@@ -272,31 +271,7 @@ def _pow(x: Value, y: Value) -> Value:
     n, e = _exponential(p, fma(y, low, left))
     scale = _power_of_two(n)
     far = (abs(k) > 1021.5) | _compare("ugt", abs(p), 708.0)
-    return _guarded("pow", far, fma(scale, e, scale), _pow_far, x, y)
-
-
-def _pow_far(x: Value, y: Value) -> Value:
-    """The rest: subnormal, negative, zero, infinite; in the order in which C's standard lists them."""
-    a = abs(x)
-    small = a < TINY
-    _, high, low = _long_logarithm(where(small, a * 2.0**54, a))
-    shift = where(small, -54.0, 0.0)
-    first = high + shift * LN2[0]
-    low = (((shift * LN2[0] - first) + high) + low) + shift * LN2[1]
-    p, left = _product(y, first)
-    inside = abs(p) < 1000.0
-    n, e = _exponential(where(inside, p, 0.0), where(inside, fma(y, low, left), 0.0))
-    z = where(inside, _exp_far(p, n, e), where(p > 0.0, INFINITY, 0.0))
-    up = y > 0.0
-    z = where(_compare("oeq", a, INFINITY), where(up, INFINITY, 0.0), z)
-    z = where(_compare("oeq", a, 0.0), where(up, 0.0, INFINITY), z)
-    z = where(_compare("oeq", abs(y), INFINITY) & _compare("oeq", a, 1.0), 1.0, z)
-    whole = _compare("oeq", _floor(y), y)
-    odd = whole & _compare("une", _floor(y * 0.5), y * 0.5)
-    z = where(odd, _signed(z, x), z)
-    z = where((x < 0.0) & (a < INFINITY) & _compare("une", _floor(y), y), math.nan, z)
-    z = where(_compare("uno", x, y), math.nan, z)
-    return where(_compare("oeq", y, 0.0) | _compare("oeq", x, 1.0), 1.0, z)
+    return _guarded("pow", far, fma(scale, e, scale), x, y)
 
 
 def _floor(x: Value) -> Value:
@@ -365,20 +340,13 @@ HALF_PI = {  # π/2 in parts, subtracted with one rounding each; without fused o
     False: (1.5707963267341256, 6.077100506303966e-11, 2.0222662487111665e-21, 8.4784276603689e-32),
 }
 FAR = {True: 1e9, False: 1.6e6}
-TWO_OVER_PI = (  # 64 bits each, the first before the point
-    0x0, 0xA2F9836E4E441529, 0xFC2757D1F534DDC0, 0xDB6295993C439041, 0xFE5163ABDEBBC561,
-    0xB7246E3A424DD2E0, 0x06492EEA09D1921C, 0xFE1DEB1CB129A73E, 0xE88235F52EBB4484, 0xE99C7026B45F7E41,
-    0x3991D639835339F4, 0x9C845F8BBDF9283B, 0x1FF897FFDE05980F, 0xEF2F118B5A0A6D1F, 0x6D367ECF27CB09B7,
-    0x4F463F669E5FEA2D, 0x7527BAC7EBE5F17B, 0x3D0739F78A5292EA, 0x6BFB5FB11F8D5D08, 0x56033046FC7B6BAB,
-)  # fmt: skip
 
 
-def _quarters(x: Value, exact: bool = False) -> list[Value]:
+def _quarters(x: Value, exact: bool = False) -> tuple[Value, Value, Value]:
     """n in the last bits of a number, r and, if it is wanted, what rounding r left; x ≥ 0."""
-    code, type = x.code, x.type
     s = fma(x, 2.0 / math.pi, ROUND)
     n = s - ROUND
-    first, *parts = HALF_PI[code.module.fused]
+    first, *parts = HALF_PI[x.code.module.fused]
     r = fma(n, -first, x)
     low = _constant(x, 0.0)
     for part in parts:
@@ -389,70 +357,11 @@ def _quarters(x: Value, exact: bool = False) -> list[Value]:
             low = low + (((before - r) - product) - left)
         else:
             r = fma(n, -part, before)
-    bits = s.bits
-
-    def far() -> list[Value]:
-        memory = [code.memory(1, type), code.memory(1, type), code.memory(1, bits.type)]
-        for value, place in zip((x, r, bits), memory, strict=True):
-            code.store(value, place)
-        code.outlined("quarters.far", [*memory, code.constant(type.width, INT)], _quarters_far, rare=True)
-        return [
-            code.load(memory[2], 0, bits.type),
-            code.load(memory[1], 0, type),
-            *([where(large, 0.0, low)] if exact else []),
-        ]
-
-    large = x > FAR[code.module.fused]
-    return code.when(code.any(large), far, lambda: [bits, r, *([low] if exact else [])], rare=True)
+    return s.bits, r, low
 
 
-def _quarters_far(x: Value, r: Value, n: Value, count: Value) -> None:
-    """Write r and n of the large ones of so many x in place of theirs.
-
-    Of 2/π are taken the 192 bits that give x·2/π modulo 4, and 126 bits behind its point.
-    """
-    code = x.code
-    fused = code.module.fused
-    words = ", ".join(f"i64 {w - 2**64 if w >> 63 else w}" for w in TWO_OVER_PI)
-    code.module.declare("two_over_pi", f"@two_over_pi = internal constant [{len(TWO_OVER_PI)} x i64] [{words}]")
-    table = Value(code, POINTER, "@two_over_pi")
-
-    def wide(v: Value) -> Value:
-        return code.convert("zext", v, "i128")
-
-    def narrow(v: Value) -> Value:
-        return code.convert("trunc", v, "i64")
-
-    def one(k: Value, _: Any) -> list[Value]:
-        a = code.load(x, k)
-
-        def large() -> list[Value]:
-            i = a.bits
-            fraction = (i & FRACTION) | 2**52
-            place = (i >> 52) - (1075 - 62)
-            word, shift = place >> 6, place & 63
-            taken = [code.load(table, word + j, INT) for j in range(4)]
-            part = [code.intrinsic("llvm.fshl", taken[j], taken[j + 1], shift) for j in range(3)]
-            m = wide(fraction)
-            third = m * wide(part[2])
-            second = m * wide(part[1]) + (third >> 64)
-            top = fraction * part[0] + narrow(second >> 64)
-            code.store((top + 2**61) >> 62, n, k)
-            turn = ((wide(top) << 64) | wide(narrow(second))) << 2
-            below = turn < 0
-            turn = where(below, -turn, turn)
-            high, low = narrow(turn >> 64), narrow(turn)
-            rest = ((high & 2047) << 53) | (low >> 11)
-            y = code.convert("uitofp", high & -2048, "double") * 2.0**-64
-            y_low = code.convert("uitofp", rest, "double") * 2.0**-117
-            y = fma(y, HALF_PI[True][0], fma(y_low, HALF_PI[True][0], y * HALF_PI[True][1]))
-            code.store(where(a < INFINITY, where(below, -y, y), math.nan), r, k)
-            return []
-
-        code.when(a > FAR[fused], large)
-        return []
-
-    code.loop(count, [], one)
+def _is_far(x: Value) -> Value:
+    return abs(x) > FAR[x.code.module.fused]
 
 
 def _odd(n: Value) -> Value:
@@ -461,27 +370,35 @@ def _odd(n: Value) -> Value:
 
 def _circle(x: Value) -> list[Value]:
     """sin x and cos x: of r, exchanged and negated as the quarter asks."""
-    n, r = _quarters(abs(x))
+    n, r, _ = _quarters(abs(x))
     z = r * r
     s, c = fma(r * z, _estrin(SIN, z), r), fma(z, _estrin(COS, z), 1.0)
     odd = _odd(n)
     sine, cosine = where(odd, c, s), where(odd, s, c)
-    return [
-        (sine.bits ^ (((n << 62) ^ x.bits) & SIGN)).real,
-        (cosine.bits ^ (((n + 1) << 62) & SIGN)).real,
-    ]
+    return [(sine.bits ^ (((n << 62) ^ x.bits) & SIGN)).real, (cosine.bits ^ (((n + 1) << 62) & SIGN)).real]
+
+
+def _circle_far(x: Value) -> Value:
+    """Both packed, of angles of which some are large."""
+    far, pairs = _is_far(x), zip(("sin", "cos"), _circle(x), strict=True)
+    return x.code.pack([where(far, _by_library(x, name=name), y) for name, y in pairs])
 
 
 def _circle_once(x: Value) -> list[Value]:
     """Both from one calculation, since a force and its slope want both."""
     code, name = x.code, f"circle.{x.type.suffix}"
+    types, both = [x.type, x.type], Type(f"{{ {x.type}, {x.type} }}")
+
+    def far(x: Value) -> list[Value]:
+        return x.code.unpack(x.code.outlined(f"{name}.far", [x], _circle_far, both, rare=True), types)
+
+    def any_size(x: Value) -> list[Value]:
+        return x.code.when(x.code.any(_is_far(x)), lambda: far(x), lambda: _circle(x), rare=True)
 
     def make() -> list[Value]:
         if code.module.used(name) <= INLINE:
-            return _circle(x)
-        types = [x.type, x.type]
-        both = Type(f"{{ {x.type}, {x.type} }}")
-        return code.unpack(code.outlined(name, [x], lambda x: x.code.pack(_circle(x)), both), types)
+            return any_size(x)
+        return code.unpack(code.outlined(name, [x], lambda x: x.code.pack(any_size(x)), both), types)
 
     return code.once(("circle", x.name), make)
 
@@ -513,7 +430,7 @@ def _tan(x: Value) -> Value:
     inverse = 1.0 / b
     y = a * inverse
     y = fma((_rest(y, b, a) + a_low) - y * b_low, inverse, y)
-    return (y.bits ^ (x.bits & SIGN)).real
+    return _guarded("tan", _is_far(x), (y.bits ^ (x.bits & SIGN)).real, x)
 
 
 # atan -----------------------------------------------------------------------------------------------------------------
@@ -560,7 +477,7 @@ def _mod(x: Value, y: Value) -> Value:
     """x − ⌊x/y⌋ y, of the sign of y, as in Python."""
     q = _floor(x / y)
     far = _compare("uge", abs(q), 2.0**52) | _compare("oeq", abs(y), INFINITY)
-    return _guarded("mod", far, _mod_of(_rest(q, y, x), y), _mod_far, x, y)
+    return _guarded("mod", far, _mod_of(_rest(q, y, x), y), x, y, slow=_mod_far)
 
 
 def _mod_of(r: Value, y: Value) -> Value:
@@ -570,35 +487,14 @@ def _mod_of(r: Value, y: Value) -> Value:
 
 
 def _mod_far(x: Value, y: Value) -> Value:
-    """Subtract multiples of |y| 2¹⁴⁰⁰, |y| 2⁷⁰⁰ and |y|, exactly, until less than |y| is left."""
-    code, b = x.code, abs(y)
-    more = b * 2.0**700
-    most = more * 2.0**700
-
-    def less(values: Sequence[Value]) -> tuple[Value, list[Value]]:
-        a = abs(values[0])
-        unit = where(a >= most, most, where(a >= more, more, b))
-        r = _rest(code.intrinsic("llvm.trunc", values[0] / unit), unit, values[0])
-        return code.any(abs(r) >= b), [r]
-
-    (r,) = code.repeat([x], less)
-    r = where(_compare("oeq", b, INFINITY) & (abs(x) < INFINITY), x, r)
-    return _mod_of(r, y)
+    return _mod_of(_by_library(x, y, name="fmod"), y)
 
 
 # the C library, lane by lane ------------------------------------------------------------------------------------------
 
 
-def _library(name: str, c_name: str) -> None:
-    def build(*args: Value) -> Value:
-        code, type = args[0].code, args[0].type
-        return code.lanes(lambda *lane: code.external(c_name, lane, DOUBLE), args, type)
-
-    _lowered(name, inline=0)(build)
-
-
 for _name in ("asin", "acos", "atan2", "sinh", "cosh", "asinh", "acosh", "atanh", "erf", "erfc", "lgamma"):
-    _library(_name, _name)
+    _lowered(_name, inline=0)(partial(_by_library, name=_name))
 
 
 # the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.12 from 16 on, below by

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from sympflow.ensembles.orbits import Drawn, Given
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.contract import Integrator
+from sympflow.integrators.contract import Integrator, method_text
+from sympflow.show.cards import Card, Shown, numbers
+from sympflow.show.pictures import histogram_figure, points_figure
+from sympflow.show.style import saved
 from sympflow.storage.layout import (
     DOF,
     NAMED,
@@ -31,6 +35,7 @@ from sympflow.storage.store import STORABLE, Field, is_name
 if TYPE_CHECKING:
     import pandas
     import xarray
+    from matplotlib.figure import Figure
 
     from sympflow.ensembles.reductions import Fields
 
@@ -188,6 +193,8 @@ class Layout:
         }
 
 
+MOST_SHOWN = 10_000_000
+"""Numbers of an ensemble beyond which a notebook shows no figure of it."""
 NOT_RUN = 2
 """The status of orbits of a store that have not been run yet."""
 
@@ -250,8 +257,8 @@ class Memory:
         return xr.Dataset(described(data), coords=described(coords), attrs=dict(self.attributes()))
 
 
-@dataclass
-class Ensemble:
+@dataclass(repr=False)
+class Ensemble(Shown):
     """The result of `ensemble`.
 
     Every field that was kept of the orbits is an attribute: `y` where nothing was reduced, else what `reduce` says. An
@@ -272,13 +279,13 @@ class Ensemble:
         Seconds of this call.
     """
 
-    t: np.ndarray | None = field(repr=False)
+    t: np.ndarray | None
     params: dict[str, np.ndarray]
     system: HamiltonianSystem
     integrator: Integrator
     t_span: tuple[float, float]
-    orbits: Given | Drawn = field(repr=False)
-    keeper: Keeper = field(repr=False)
+    orbits: Given | Drawn
+    keeper: Keeper
     wall_time: float = 0.0
 
     @property
@@ -327,6 +334,45 @@ class Ensemble:
             index, text = min(self.messages.items())
             parts.append(f"{failed:,} of {status.size:,} orbits failed, the first of them {list(index)}: {text}")
         return " ".join(parts) or f"All {status.size:,} orbits reached the end."
+
+    def card(self) -> Card:
+        facts = {
+            "method": method_text(self.integrator, self.integrator.step_length(self.system)),
+            "t_span": f"{self.t_span[0]:g} … {self.t_span[1]:g}",
+            "orbits": " × ".join(f"{n:,}" for n in self.status.shape),
+            "parameters": ", ".join(f"{name} = {numbers(values)}" for name, values in self.params.items()),
+            "kept": ", ".join(f"{name} {values.shape}" for name, values in self.fields.items()),
+            "run": f"{self.wall_time:.3g} s",
+        }
+        return Card(f"Ensemble of {self.system.title}", facts, self.message)
+
+    def preview(self) -> Figure | None:
+        return self.plot() if sum(x.size for x in self.fields.values()) <= MOST_SHOWN else None
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
+        """Draw what was kept: states in the plane of q₁ and p₁, the last ones where there are several; else histograms.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ImportError
+            Without matplotlib.
+        ValueError
+            If nothing was kept that is a number for each orbit.
+        """
+        d, kept = self.system.ndof, self.fields
+        state = next((x for name, x in kept.items() if name in ("y", "final")), None)
+        if state is not None:
+            last = state[..., -1] if state.ndim == self.status.ndim + 2 else state
+            q, p = last[..., 0].reshape(-1), last[..., d].reshape(-1)
+            return saved(points_figure(q, p, ("q", "p") if d == 1 else ("q₁", "p₁"), self.system.title), path)
+        values = {name: np.ravel(x).astype(float) for name, x in kept.items() if x.shape == self.status.shape}
+        if not values:
+            raise ValueError(f"`reduce` kept no number for each orbit, but {', '.join(kept)}: draw these yourself.")
+        return saved(histogram_figure(values, self.system.title), path)
 
     def to_xarray(self) -> xarray.Dataset:
         """The fields as an `xarray.Dataset`; of a store it reads what is used of it, when it is used.

@@ -21,9 +21,10 @@ from sympflow.ensembles.orbits import Drawn, Given, initial_states
 from sympflow.ensembles.reductions import Fields, Reduction, reduction
 from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Memory, blocks, chunk_shape
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.choosing import integrator_for
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.provenance import provenance
-from sympflow.integrators.registry import build, check_applies
+from sympflow.integrators.registry import check_applies
 from sympflow.kernels.threads import at_most
 from sympflow.solver import check_backend, check_own_parameters
 from sympflow.systems.given import given_system
@@ -42,7 +43,7 @@ _preparing = threading.Lock()
 
 def ensemble(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: Any = None,
     *,
@@ -67,8 +68,8 @@ def ensemble(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator, or trained flow
-        As for `solve`.
+    method : str, Integrator, or trained flow, optional
+        As for `solve`: by default one that suits the system.
     t_span : (float, float), optional
         The default is the system's.
     y0 : array_like of shape (N, 2d) or (2d,), Domain, or callable, optional
@@ -133,10 +134,8 @@ def ensemble(
     (100, 4)
     """
     system = given_system(system)
-    integrator = build(method, options)
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
-    check_backend(backend, integrator)
     workers = checked_workers(workers)
     check_flag("resume", resume)
     check_flag("same", same)
@@ -145,10 +144,12 @@ def ensemble(
     kept = reduction(reduce)
     orbits = initial_states(system, y0, n, seed)
     fixed, axes = _axes(system, params)
+    first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
+    integrator = integrator_for(system, method, options, (t0, t1), first, flows=not (fixed or axes))
+    check_backend(backend, integrator)
     check_own_parameters(system, {**fixed, **axes}, integrator)
     if fixed:
         system = system.with_params(**fixed)
-    first = orbits.states(0, min(len(orbits), SHORTEST_CHUNK))
     integrator = integrator.resolved(system, first, abs(t1 - t0), 0 if times is None else len(times))
     check_applies(integrator, system if kept.own_loops else system.between_impulses, first)
     for system_of in _telling(system, axes):

@@ -19,13 +19,12 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arrays import to_numpy
-from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import Potential, Time
-from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, Binding, PrimedPotential
+from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, PrimedPotential
 from sympflow.flow.records import MAX_DEGREE, Refused, checked_integer
-from sympflow.flow.sympflow import UNCOMPENSATED, SympFlow
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.flow.sympflow import SystemFlow
+from sympflow.flow.weights import Kept, checked_device, checked_dtype
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
@@ -102,7 +101,7 @@ class Share:
         return self.c + 0 * t
 
 
-class ClockedFlow(SympFlow):
+class ClockedFlow(SystemFlow):
     """A symmetric splitting scheme on a logarithmic Hamiltonian, and after it the trained clock.
 
     Both are odd in the flow's time s, and commute: ψ̄_{−s} = (ψ̄_s)⁻¹, continued to negative s by its formulas. What is
@@ -140,7 +139,7 @@ class ClockedFlow(SympFlow):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        FlowMap.__init__(self, ndof, dt)
+        super().__init__(ndof, dt, system)
         table = SCHEMES.get(scheme)
         if table is None or not table.symmetric or any(table.gradients) or table.nystrom:
             raise ValueError(f"`scheme` {scheme!r} is not a symmetric one without force gradients: take 'leapfrog'.")
@@ -148,8 +147,6 @@ class ClockedFlow(SympFlow):
             raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
         self.scheme = table
         self.clock = ClockPotential(ndof, terms, checked_dtype(dtype), checked_device(device))
-        self._binding = Binding(system)
-        self._loops: ClockedFlowKernel | None = None  # compiled, of the system that was asked for last
         self._numbers: Kept[tuple[float, ...]] = Kept([self.clock._parameters])
         maps: list[Layer] = []
         for kind, c, *_ in table.substeps:
@@ -157,13 +154,10 @@ class ClockedFlow(SympFlow):
             potential = PrimedPotential(ndof, self._binding, [(term, Share(float(c)))])
             maps.append(Drift(potential) if kind == "drift" else Kick(potential))
         # A tuple, not a ModuleList: the clock is the only one with parameters, and they are the flow's.
-        self.layers = (*maps, Drift(self.clock))  # type: ignore[assignment]
+        self.layers = (*maps, Drift(self.clock))
         if system is not None:
             self._check(system)
             self.identify(system)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_loops": None}  # copies and pickles make their own
 
     @staticmethod
     def _check(system: HamiltonianSystem) -> None:
@@ -191,39 +185,17 @@ class ClockedFlow(SympFlow):
         """Return the c_k that the clock has now, the last one first."""
         return self._numbers.current(lambda: tuple(to_numpy(self.clock.numbers).astype(float)[::-1].tolist()))
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> ClockedFlowKernel:
-        if compensated:
-            raise ValueError(UNCOMPENSATED)
-        check_compilable(self.dtype, self.device)
-        if self._loops is None or self._loops.system is not system:
-            from sympflow.kernels.flow_loops import ClockedFlowKernel
+    def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
+        from sympflow.kernels.flow_loops import ClockedFlowKernel
 
-            self._loops = ClockedFlowKernel(self.scheme, system, self.advance, self.clock_numbers)
-        return self._loops
+        return ClockedFlowKernel(self.scheme, system, self.advance, self.clock_numbers)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
 
-    @property
-    def system(self) -> HamiltonianSystem | None:
-        """The transformed system whose V and T the flow uses, None for one loaded without it."""
-        return self._binding.system if self._binding.known else None
-
-    def bind(self, system: HamiltonianSystem) -> Self:
-        """Give a flow that was loaded from a file its transformed system; itself.
-
-        Raises
-        ------
-        ValueError
-            If it is not the system that the flow was made for.
-        """
-        self.check_system(system)
+    def _take(self, system: HamiltonianSystem) -> None:
         self._check(system)
-        self._binding.bind(system)
-        return self
-
-    def bound(self, system: HamiltonianSystem) -> Self:
-        return self if self._binding.known else self.bind(system)
+        super()._take(system)
 
     def architecture(self) -> dict[str, Any]:
         return {"ndof": self.ndof, "clocked": {"scheme": self.scheme.name, "terms": len(self.clock.numbers)}}

@@ -15,28 +15,7 @@ from sympflow.flow.tables import free_numbers
 
 
 class FreeTable(nn.Module):
-    """Numbers c_ik, i = 1 … n, k = 0 … K−1, of which only the free ones are a parameter.
-
-    Parameters
-    ----------
-    n, terms : int
-        n and K.
-    palindromic : bool
-        True for c_ik = c_(n+1−i)k.
-    bound : int
-        For how many k, from 0, the sum over i is fixed, whatever the parameters: Σ_i c_i0 = total, the others 0. The
-        middle (or else the last) c_ik is what the others leave.
-    total : float, optional
-    present : sequence of int, optional
-        The i of the c_ik that are not always 0; the default is all.
-
-    Attributes
-    ----------
-    free : (f,)
-        The free c_ik, i slowest.
-    basis, offset : (n, K, f), (n, K)
-        c = offset + basis · free.
-    """
+    """Numbers c_ik, i = 1 … n, k = 0 … K−1, of which only the free ones are a parameter."""
 
     basis: Tensor
     offset: Tensor
@@ -147,19 +126,6 @@ class Column(FreeTable):
     They are for ranges of t in which fast modes turn often. As even polynomials in τ they make a palindrome of such
     maps time-reversible; Chebyshev's T_k keep them well conditioned at the degrees that a filter needs whose argument
     runs over several periods.
-
-    Parameters
-    ----------
-    n : int
-        Number of maps.
-    terms : int
-        Number of basis functions, at least 1.
-    dt : float
-        Δt.
-    power : int
-        m.
-    total : {"always", "start", None}
-        "always" for Σ c_i(τ) = 1 at every τ, "start" for Σ c_i(0) = 1, whatever the parameters.
     """
 
     def __init__(

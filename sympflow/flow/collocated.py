@@ -21,15 +21,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from sympflow.arguments import floats, plain
-from sympflow.arrays import jvp, per_state
-from sympflow.flow.flow_map import FlowMap, check_system
-from sympflow.flow.known import UNCOMPENSATED
+from sympflow.arrays import per_state
+from sympflow.flow.flow_map import check_system
 from sympflow.flow.layers import Layer
 from sympflow.flow.potentials import Time
-from sympflow.flow.primed_potentials import Binding
 from sympflow.flow.records import Refused, checked_integer
-from sympflow.flow.sympflow import SympFlow
-from sympflow.flow.weights import check_compilable, checked_device, checked_dtype
+from sympflow.flow.sympflow import SystemFlow
+from sympflow.flow.weights import checked_device, checked_dtype
 from sympflow.hamiltonian import collocation
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -65,13 +63,6 @@ class CollocationLayer(Layer):
     def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         return self._step(-t / self.flow.steps, q, p)
 
-    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        def along(s: Tensor) -> Tensor:
-            return torch.cat(self(t + s, q + s * dq, p + s * dp))
-
-        x, dx = jvp(along, q.new_zeros(()), q.new_ones(()))
-        return (*_halves(x), *_halves(dx))
-
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         flow, y, h = self.flow, torch.cat([q, p]).T, -t / self.flow.steps
         flow.bound_system.check_conservative("so that `flow` is that of no Hamiltonian", "ask its system for H")
@@ -94,7 +85,7 @@ def _halves(y: Tensor) -> tuple[Tensor, Tensor]:
     return q, p
 
 
-class CollocatedFlow(SympFlow):
+class CollocatedFlow(SystemFlow):
     """The SympFlow of m equal steps of a Gauss method, for any H; made by `SympFlow.collocated`.
 
     Nothing in it is trained: its error is that of the method, which more steps make as small as one likes. It is
@@ -127,6 +118,7 @@ class CollocatedFlow(SympFlow):
     """
 
     takes_friction = True
+    MADE = "made of steps with the H of a system"
 
     def __init__(
         self,
@@ -138,17 +130,15 @@ class CollocatedFlow(SympFlow):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        FlowMap.__init__(self, ndof, dt)
+        super().__init__(ndof, dt, system)
         self.stages, self.steps = _count("stages", stages, MOST_STAGES), _count("steps", steps, MOST_STEPS)
         self.tableau = collocation.gauss_legendre(self.stages)
         _, B, scale = self.tableau
         weights = [b * unit for b, unit in zip(B, scale, strict=True)] if self.stages > 2 else list(B)
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         self.register_buffer("weights", torch.tensor(weights, **like), persistent=False)
-        self._binding = Binding(system, "made of steps with the H of a system")
-        self._loops: tuple[HamiltonianSystem, CollocatedFlowKernel] | None = None
         # A tuple, not a ModuleList: the layers own nothing.
-        self.layers = tuple(CollocationLayer(self) for _ in range(self.steps))  # type: ignore[assignment]
+        self.layers = tuple(CollocationLayer(self) for _ in range(self.steps))
         if system is not None:
             self.identify(system)
 
@@ -183,9 +173,6 @@ class CollocatedFlow(SympFlow):
             made.identify(system, system.domain)
         return made
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_loops": None}  # copies and pickles make their own
-
     @classmethod
     def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
         """Return a flow that has no system yet: `bind` will give it one."""
@@ -209,15 +196,10 @@ class CollocatedFlow(SympFlow):
         """The states (N, 2d) at the end of that step."""
         return collocation.advanced(self.bound_system, self.tableau, y, K, per_state(h, y))
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> CollocatedFlowKernel:
-        if compensated:
-            raise ValueError(UNCOMPENSATED)
-        check_compilable(self.dtype, self.device)
-        if self._loops is None or self._loops[0] is not system:
-            from sympflow.kernels.flow_loops import CollocatedFlowKernel
+    def _compiled_for(self, system: HamiltonianSystem) -> CollocatedFlowKernel:
+        from sympflow.kernels.flow_loops import CollocatedFlowKernel
 
-            self._loops = system, CollocatedFlowKernel(system, self.tableau, self.steps)
-        return self._loops[1]
+        return CollocatedFlowKernel(system, self.tableau, self.steps)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count those of one iteration of Newton's method in each step, the least that there can be."""
@@ -232,34 +214,8 @@ class CollocatedFlow(SympFlow):
 
     @property
     def bound_system(self) -> HamiltonianSystem:
-        """The system whose H the flow uses.
-
-        Raises
-        ------
-        ValueError
-            If it was loaded without it.
-        """
+        """The system whose H the flow uses."""
         return self._binding.system
-
-    @property
-    def system(self) -> HamiltonianSystem | None:
-        """The system whose H the flow uses, None for one loaded without it."""
-        return self._binding.system if self._binding.known else None
-
-    def bind(self, system: HamiltonianSystem) -> Self:
-        """Give a flow that was loaded from a file its system; itself.
-
-        Raises
-        ------
-        ValueError
-            If it is not the system that the flow was made for.
-        """
-        self.check_system(system)
-        self._binding.bind(system)
-        return self
-
-    def bound(self, system: HamiltonianSystem) -> Self:
-        return self if self._binding.known else self.bind(system)
 
 
 def _count(name: str, value: Any, most: int) -> int:
@@ -278,13 +234,7 @@ def _checked_states(states: ArrayLike, ndof: int) -> np.ndarray:
 
 @np.errstate(all="ignore")  # of steps that are too long
 def enough_steps(system: HamiltonianSystem, tableau: collocation.Tableau, dt: float, x: np.ndarray) -> int:
-    """The number of equal steps of a Gauss method with which ψ̄_Δt of states (n, 2d) errs by less than `TOLERANCE`.
-
-    Raises
-    ------
-    ValueError
-        If more steps are needed than a flow may have.
-    """
+    """The number of equal steps of a Gauss method with which ψ̄_Δt of states (n, 2d) errs by less than `TOLERANCE`."""
     spread, order = x.std(axis=0), 2 * len(tableau[1])
     unit = np.where(spread > 0, spread, 1.0)
 

@@ -15,7 +15,6 @@ FAMILIES = {
     "sympflow": "sympflow.flow.sympflow:SympFlow",
     "primed": "sympflow.flow.primed:PrimedFlow",
     "split": "sympflow.flow.split:SplitFlow",
-    "timed": "sympflow.flow.timed:TimedSympFlow",
     "clocked": "sympflow.flow.clocked:ClockedFlow",
     "collocated": "sympflow.flow.collocated:CollocatedFlow",
     "mlp": "sympflow.flow.mlp:MLPFlow",
@@ -25,7 +24,7 @@ FAMILIES = {
 KINDS = ("sympflow", "mlp")
 """The kinds that files name, which are the methods that run the flows: SympFlows, and their baseline."""
 
-_OF_SYMPFLOW = ("split", "clocked", "collocated", "primed", "timed")
+_OF_SYMPFLOW = ("split", "clocked", "collocated", "primed")
 
 
 def family(name: str) -> Any:

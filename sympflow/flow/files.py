@@ -38,7 +38,7 @@ from sympflow.flow.records import (
     MAX_WIDTH,
     MIN_DT,
     SUM,
-    Description,
+    Provenance,
     Refused,
     checked_integer,
     checked_path,
@@ -60,7 +60,7 @@ def write(
     architecture: dict[str, Any],
     dt: float,
     weights: Mapping[str, Tensor],
-    description: Description,
+    provenance: Provenance,
 ) -> None:
     """Write a flow to a safetensors file, atomically: see `FlowMap.save`."""
     file = checked_path(path)
@@ -74,24 +74,12 @@ def write(
         "kind": kind,
         "architecture": architecture,
         "dt": dt,
-        "domain": None if description.domain is None else description.domain.to_dict(),
-        "system": description.system,
-        "fingerprint": description.fingerprint,
-        "recipe": description.recipe,
-        "figures": description.figures,
         "checksum": checksum(tensors),
+        **provenance.to_record(),
     }
-    if description.unfitted:
-        record["unfitted"] = description.unfitted
-    if description.drive_times is not None:
-        record["drive_times"] = [description.drive_times]
-    if description.lattice_terms:
-        record["lattice_terms"] = dict(description.lattice_terms)
-    if description.identity is not None:
-        record["identity"] = description.identity.to_dict()
-    if description.certificate is not None:
-        if description.certificate.weights == record["checksum"]:
-            record["certificate"] = description.certificate.to_dict()
+    if provenance.certified is not None:
+        if provenance.certified.weights == record["checksum"]:
+            record["certificate"] = provenance.certified.to_dict()
         else:
             warnings.warn(
                 "`flow` was changed, or converted to another precision, after its certificate was computed, which is "
@@ -101,7 +89,7 @@ def write(
             )
     record = _finite(record)
     try:
-        Description.of_record(record, architecture["ndof"])
+        Provenance.of_record(record, architecture["ndof"])
     except Refused as reason:
         raise ValueError(f"`flow` cannot be saved as it is: {reason}. Set it right first.") from None
     text = json.dumps(record, allow_nan=False, separators=(",", ":"))
@@ -172,10 +160,10 @@ def load(
         content, header, record, altered = read(file)
         flow = _build(record, _dtype_of(header))
         _fill(flow, content, header, record)
-        description = Description.of_record(record, flow.ndof)
+        provenance = Provenance.of_record(record, flow.ndof)
         if altered:
             raise Refused("its record is not the one that was saved: its checksum differs, the file was altered")
-        flow.describe(description)
+        flow.provenance = provenance
     except Refused as reason:
         raise _refusal(file, str(reason), reason.remedy) from None
     except OverflowError:

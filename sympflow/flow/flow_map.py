@@ -15,18 +15,24 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arguments import plain
-from sympflow.arrays import differentiable, finite_states, has_values, readable, values, values_of_times
+from sympflow.arrays import differentiable, finite_states, has_values, readable, to_numpy, values, values_of_times
 from sympflow.flow.certificate import Certificate
 from sympflow.flow.certification import certify
 from sympflow.flow.files import write
 from sympflow.flow.known import KnownFlow
-from sympflow.flow.records import MAX_DT, MIN_DT, Description
+from sympflow.flow.records import MAX_DT, MIN_DT, Provenance
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.show.cards import Card
+from sympflow.show.pictures import trajectory_figure
+from sympflow.show.style import saved
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
+    from matplotlib.figure import Figure
+
     from sympflow.kernels.network_tangents import NetworkTangents
 
+DRAWN, DRAWN_STEPS = 4, 400  # orbits of a figure, and their steps
 MAX_STEPS = 10_000_000  # of one call
 MEAN_TIMES = (0.5 - 0.75**0.5 / 3, 0.5 + 0.75**0.5 / 3)  # in Δt, at which 𝓗 is averaged: Gauss's
 
@@ -72,7 +78,8 @@ class FlowMap(KnownFlow, nn.Module):
     dt : float
         Δt, the longest time of the bare map.
     history : list of dict
-        Held-out figures over its training in this session; not saved. What else is known of it: see `KnownFlow`.
+        Held-out figures over its training in this session; not saved. What else is known of it, as `domain`, `recipe`,
+        `figures` and `certified`, is its `provenance`: see `sympflow.flow.records.Provenance`.
     """
 
     learned: HamiltonianSystem | None = None
@@ -92,7 +99,7 @@ class FlowMap(KnownFlow, nn.Module):
                 f"`dt` must lie between {MIN_DT:g} and {MAX_DT:g}; got {dt!r}: choose another unit of time."
             )
         self.ndof, self.dt = ndof, float(dt)
-        self.describe(Description())
+        self.provenance = Provenance()
         self.history: list[dict[str, float]] = []
 
     def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
@@ -455,7 +462,7 @@ class FlowMap(KnownFlow, nn.Module):
         RuntimeWarning
             If the flow's certificate is one of other weights: it is left out.
         """
-        write(path, self.kind, self.architecture(), self.dt, self.state_dict(), self.description)
+        write(path, self.kind, self.architecture(), self.dt, self.state_dict(), self.provenance)
 
     # arguments ----------------------------------------------------------------------------------------------
 
@@ -520,6 +527,60 @@ class FlowMap(KnownFlow, nn.Module):
         if low < 0 or high > self.dt * (1 + slack):
             raise ValueError(f"`t` must lie in [0, dt] = [0, {self.dt:g}]; got {low} to {high}: reduce it modulo dt.")
         return t.to(x.dtype) if isinstance(t, Tensor) else t
+
+    def card(self) -> Card:
+        told = {name.replace("_", " "): value for name, value in self.figures.items() if isinstance(value, int | float)}
+        facts = {
+            "Δt": f"{self.dt:g}",
+            "degrees of freedom": f"{self.ndof:,}",
+            "parameters": f"{self.n_parameters:,}",
+            "domain": "" if self.domain is None else repr(self.domain),
+            **{name: f"{value:.3g}" for name, value in told.items()},
+        }
+        certificate = "" if self.certified is None else str(self.certified)
+        return Card(repr(self).split(":")[0].strip("<>"), facts, certificate)
+
+    def preview(self) -> Figure | None:
+        return self.plot() if self.domain is not None or self.system is not None else None
+
+    def plot(self, system: HamiltonianSystem | None = None, path: str | os.PathLike[str] | None = None) -> Figure:
+        """Draw orbits of the flow from four states of its domain, and their energy error.
+
+        Parameters
+        ----------
+        system : HamiltonianSystem, optional
+            The system that it was trained for; by default the one that it knows. Without one there is no energy.
+        path : path, optional
+            File to save it to: .png, .pdf or .svg.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ImportError
+            Without matplotlib.
+        ValueError
+            If it has neither a domain nor a system with a `y0`.
+        """
+        system = self.system if system is None else system
+        domain = self.domain if system is None else self.domain_for(system) or system.domain
+        if domain is None and (system is None or system.y0 is None):
+            raise ValueError("`system` is needed, for the flow has no domain to start in: pass one with a `y0`.")
+        y0 = np.atleast_2d(system.y0) if domain is None else domain.sample(DRAWN, 0)  # type: ignore[union-attr, arg-type]
+        driven = system is not None and not system.autonomous
+        states = [torch.as_tensor(y0, dtype=self.dtype, device=self.device)]
+        with torch.no_grad():
+            for k in range(DRAWN_STEPS):
+                states.append(self(self.dt, states[-1], **({"t0": k * self.dt} if driven else {})))
+        y = to_numpy(torch.stack(states, dim=-1)).astype(float)
+        error = None
+        if system is not None and system.autonomous and system.conservative:
+            H = np.asarray(system.hamiltonian(np.moveaxis(y, -1, 0))).T
+            error = (H - H[:, :1]) / (system.energy_scale or np.abs(H[:, :1]))
+        heading = f"{repr(self).split(':')[0].strip('<>')}, Δt = {self.dt:g}"
+        return saved(trajectory_figure(self.dt * np.arange(len(states)), y, error, heading, marker="."), path)
 
     def __repr__(self) -> str:
         system = f" of {self.system_name}" if self.system_name else ""

@@ -12,7 +12,7 @@ import numpy as np
 
 from sympflow.arrays import untransformed
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
-from sympflow.flow.records import Description, numbers_checksum, read
+from sympflow.flow.records import Provenance, numbers_checksum, read
 from sympflow.flow.tables import PrimedShape, Tables, free_numbers, substeps_of
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.monomials import Monomials
@@ -29,12 +29,7 @@ WORSE = 2.0
 
 
 class PrimedKnown(KnownFlow):
-    """A primed flow, as far as it is known without its map: its table, and its system.
-
-    Attributes
-    ----------
-    shape : PrimedShape
-    """
+    """A primed flow, as far as it is known without its map: its table, and its system."""
 
     symplectic = takes_friction = takes_driving = True
     shape: PrimedShape
@@ -94,15 +89,15 @@ class PrimedKnown(KnownFlow):
         """This flow, of another size of its system, with what is known of it."""
         raise NotImplementedError
 
-    def description_for(self, system: HamiltonianSystem) -> Description:
-        """Return the description of the flow for another size of its system."""
+    def provenance_for(self, system: HamiltonianSystem) -> Provenance:
+        """Return the provenance of the flow for another size of its system."""
         domain = self.domain
         if isinstance(domain, LatticeStates):
             domain = domain.of(system)
         elif domain is not None:
             assert self.system is not None
             domain = LatticeStates.of_states(self.system, domain.sample(DRAWN)).of(system)
-        return replace(self.description, domain=domain)
+        return replace(self.provenance, domain=domain)
 
     def check_ends(self, system: HamiltonianSystem) -> None:
         if system.local is None:
@@ -140,26 +135,20 @@ class FrozenFlow(PrimedKnown):
     kind = "sympflow"
 
     def __init__(
-        self, path: Path, shape: PrimedShape, tables: Tables, system: HamiltonianSystem, description: Description
+        self, path: Path, shape: PrimedShape, tables: Tables, system: HamiltonianSystem, provenance: Provenance
     ) -> None:
         self.ndof, self.shape, self.dt, self.path = system.ndof, shape, tables.dt, path
         self._tables, self._system = tables, system
-        self.describe(description)
+        self.provenance = provenance
 
     @classmethod
     def of_file(cls, path: Path, system: HamiltonianSystem) -> Self:
-        """Read a flow that ships, of that system.
-
-        Raises
-        ------
-        ValueError
-            If the file is damaged, or the system is not that of the flow.
-        """
+        """Read a flow that ships, of that system."""
         record, arrays = _read(path)
         plan, ndof = record["architecture"]["primed"], record["architecture"]["ndof"]
         shape = PrimedShape.from_dict(plan, ndof)
         tables = _tables(shape, record["dt"], arrays)
-        flow = cls(path, shape, tables, system, Description.of_record(record, ndof))
+        flow = cls(path, shape, tables, system, Provenance.of_record(record, ndof))
         flow.check_system(system)
         if isinstance(flow.domain, LatticeStates):
             flow.domain = flow.domain.of(system)
@@ -186,7 +175,7 @@ class FrozenFlow(PrimedKnown):
 
     def carried(self, system: HamiltonianSystem) -> Self:
         tables = Tables(self._tables.substeps, len(self.shape.outer), self.dt, self.monomials)
-        return type(self)(self.path, self.shape, tables, system, self.description_for(system))
+        return type(self)(self.path, self.shape, tables, system, self.provenance_for(system))
 
 
 class FrozenNetwork(KnownFlow):
@@ -195,19 +184,13 @@ class FrozenNetwork(KnownFlow):
     kind = "sympflow"
     symplectic = True
 
-    def __init__(self, path: Path, dt: float, layers: Sequence[NetworkLayer], description: Description) -> None:
+    def __init__(self, path: Path, dt: float, layers: Sequence[NetworkLayer], provenance: Provenance) -> None:
         self.ndof, self.dt, self.path, self._layers = layers[0].K.shape[1], dt, path, layers
-        self.describe(description)
+        self.provenance = provenance
 
     @classmethod
     def of_file(cls, path: Path, system: HamiltonianSystem) -> Self | None:
-        """Read a flow that ships, of that system; None if it is none of networks.
-
-        Raises
-        ------
-        ValueError
-            If the file is damaged, or the system is not that of the flow.
-        """
+        """Read a flow that ships, of that system; None if it is none of networks."""
         from sympflow.kernels.networks import NetworkLayer
 
         record, arrays = _read(path)
@@ -223,7 +206,7 @@ class FrozenNetwork(KnownFlow):
             K, k = of["weight_x"] / of["scale"], of["weight_t"] / of["tau"]
             biases, weights = ([of[f"{name}.{j}"] for j in range(m)] for name, m in (("biases", n), ("weights", n - 1)))
             layers.append(NetworkLayer(*first, K, k, biases, weights, of["gain"] * of["weight_out"]))
-        flow = cls(path, record["dt"], layers, Description.of_record(record, record["architecture"]["ndof"]))
+        flow = cls(path, record["dt"], layers, Provenance.of_record(record, record["architecture"]["ndof"]))
         flow.check_system(system)
         return flow
 

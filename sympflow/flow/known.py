@@ -5,18 +5,18 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from sympflow.arrays import is_tensor, values
-from sympflow.flow.records import Description
+from sympflow.flow.records import Provenance
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, same_system, without_friction
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
+from sympflow.show.cards import Shown
 
 UNCOMPENSATED = (
     "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
@@ -40,32 +40,21 @@ class Origin:
         return self.identity is None or self.identity.agrees(system)
 
 
-class KnownFlow:
-    """A flow of a system, as far as it is known without its map.
+class _Told:
+    """An attribute of a flow that its provenance holds."""
 
-    Attributes
-    ----------
-    ndof : int
-    dt : float
-        Δt, the longest time of the bare map.
-    domain : Domain or None
-        Ω, where it was trained.
-    fingerprint, system_name : tuple of float or None, str or None
-        The system it was trained for.
-    identity : Identity or None
-        H of that system, all over Ω; None for a flow without a system, or from a file that was written before.
-    unfitted : tuple of (float, float)
-        Open intervals of t in which it was never compared with anything: those between the times of labels, if these
-        were few and it was fitted to nothing else. Results there come with a warning.
-    lattice_terms : mapping of str to str
-        The terms of a lattice, for messages; {} of another system.
-    drive_times : (float, float) or None
-        The interval of t0 + t that the flow of a drive without a period was fitted in: beyond it there is a warning.
-    recipe, figures : dict
-        How it was trained, and what it achieved.
-    certified : Certificate or None
-        What `certificate` found, or the file held that the flow was loaded from.
-    """
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, flow: Any, owner: type | None = None) -> Any:
+        return self if flow is None else getattr(flow.provenance, self.name)
+
+    def __set__(self, flow: Any, value: Any) -> None:
+        setattr(flow.provenance, self.name, value)
+
+
+class KnownFlow(Shown):
+    """A flow of a system, as far as it is known without its map."""
 
     kind: ClassVar[str]
     """The method of `solve` that runs it."""
@@ -73,44 +62,19 @@ class KnownFlow:
     """True if ψ_t is the flow of a Hamiltonian, with an exact inverse; with friction conformally symplectic."""
     takes_friction: ClassVar[bool] = False
     """True if the maps of the family hold the friction of a damped system that they are made for."""
-    takes_driving: ClassVar[bool] = False
+    takes_driving: bool = False
     """True if the maps of the family take the time, of a driven system that they are made for."""
     iterated: int = 0
     """Evaluations of ∇H and ∇²H in each of Newton's iterations, of a flow whose steps are found by these."""
     ndof: int
     dt: float
-    identity: Identity | None = None  # these of flows in pickles of earlier versions, which did not have them
-    lattice_terms: Mapping[str, str] = MappingProxyType({})
-    unfitted: tuple[tuple[float, float], ...] = ()
-    drive_times: tuple[float, float] | None = None
+    provenance: Provenance
     _origin: tuple[dict[str, Any], Origin] | None = None
 
-    # what a file tells ----------------------------------------------------------------------------------------
+    domain, system_name, fingerprint, identity, lattice_terms = _Told(), _Told(), _Told(), _Told(), _Told()
+    recipe, figures, certified, unfitted, drive_times = _Told(), _Told(), _Told(), _Told(), _Told()
 
-    @property
-    def description(self) -> Description:
-        """All that a file tells of it beside architecture and weights."""
-        return Description(
-            self.domain,
-            self.system_name,
-            self.fingerprint,
-            self.recipe,
-            self.figures,
-            certificate=self.certified,
-            identity=self.identity,
-            unfitted=self.unfitted,
-            drive_times=self.drive_times,
-            lattice_terms=self.lattice_terms,
-        )
-
-    def describe(self, description: Description) -> None:
-        """Take the description that a file holds."""
-        self.domain, self.system_name, self.fingerprint = (
-            description.domain, description.system, description.fingerprint,
-        )  # fmt: skip
-        self.recipe, self.figures, self.certified = description.recipe, description.figures, description.certificate
-        self.identity, self.unfitted = description.identity, description.unfitted
-        self.drive_times, self.lattice_terms = description.drive_times, dict(description.lattice_terms)
+    # its system -----------------------------------------------------------------------------------------------
 
     @property
     def origin(self) -> Origin | None:
@@ -125,13 +89,7 @@ class KnownFlow:
         return self._origin[1]
 
     def identify(self, system: HamiltonianSystem, domain: Domain | None = None) -> None:
-        """Make this the flow of a system, which it will know again: by its fingerprint, and by its H over a domain.
-
-        Raises
-        ------
-        ValueError
-            If the system has friction, and the family of the flow has not.
-        """
+        """Make this the flow of a system, which it will know again: by its fingerprint, and by its H over a domain."""
         check_for_flows(system, self.takes_friction, self.takes_driving)
         self.lattice_terms = {} if system.local is None else dict(system.local.terms)
         small = self.known_by(system)
@@ -158,12 +116,7 @@ class KnownFlow:
         return same_system(mine, small.fingerprint) and (self.identity is None or self.identity.agrees(small))
 
     def check_ends(self, system: HamiltonianSystem) -> None:
-        """Refuse a lattice with ends of a kind at which the numbers of the flow do not hold.
-
-        Raises
-        ------
-        ValueError
-        """
+        """Refuse a lattice with ends of a kind at which the numbers of the flow do not hold."""
 
     def check_system(self, system: HamiltonianSystem) -> None:
         """Raise ValueError if `system` is not the one this flow was trained for (a bare flow fits any)."""
@@ -248,12 +201,7 @@ class KnownFlow:
         return None
 
     def warn_of_times(self, t: Any) -> None:
-        """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing.
-
-        Warns
-        -----
-        UserWarning
-        """
+        """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing."""
         if not self.unfitted:
             return
         seen = values(t) if is_tensor(t) else np.asarray(t)
@@ -275,12 +223,7 @@ class KnownFlow:
                 return
 
     def warn_of_drive(self, t0: Any, passed: Any) -> None:
-        """Warn where a run over `passed` from t0 leaves the times for which a drive without a period was fitted.
-
-        Warns
-        -----
-        UserWarning
-        """
+        """Warn where a run over `passed` from t0 leaves the times for which a drive without a period was fitted."""
         if self.drive_times is None or t0 is None:
             return
         start, length = (values(each) if is_tensor(each) else np.asarray(each) for each in (t0, passed))
@@ -308,31 +251,11 @@ class KnownFlow:
     # its runs -------------------------------------------------------------------------------------------------
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
-        """Return the compiled loops of the flow with its present weights, the same while these do not change.
-
-        Parameters
-        ----------
-        system : HamiltonianSystem
-            The one of the flow.
-        compensated : bool
-            True for runs that sum with Kahan's compensation.
-
-        Raises
-        ------
-        ValueError
-            If there are none, with the reason.
-        """
+        """Return the compiled loops of the flow with its present weights, the same while these do not change."""
         raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count the evaluations of the system's own functions in a run; a network has none.
-
-        Parameters
-        ----------
-        n_steps, n_saved, n_extra : int
-            Steps, outputs at their ends, and shorter steps to other outputs.
-        backend : {"compiled", "numpy", "torch", "array"}
-        """
+        """Count the evaluations of the system's own functions in a run; a network has none."""
         return {"force_evaluations": 0, "hessian_evaluations": 0}
 
     @property

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
+from sympflow.arrays import jvp
 from sympflow.flow.potentials import NO_NETWORK, Potential, Time
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
+    from sympflow.hamiltonian.system import HamiltonianSystem
     from sympflow.kernels.network_tangents import TrainedNetwork
     from sympflow.kernels.networks import NetworkLayer
 
@@ -24,9 +27,8 @@ class Layer(nn.Module):
     Duties
     ------
     1. `forward(t, q, p)`: φ_t(q, p).
-    2. `tangent(t, q, p, dq, dp)`: φ_t(x) and d/dt φ_t(x(t)) along a curve with velocity (dq, dp).
-    3. `pull_back(t, q, p)`: φ_t⁻¹(q, p), and H_t(q, p) of shape (N,).
-    4. `to_dict()`: the architecture, JSON-able.
+    2. `pull_back(t, q, p)`: φ_t⁻¹(q, p), and H_t(q, p) of shape (N,).
+    3. `to_dict()`: the architecture, JSON-able.
     """
 
     kind: ClassVar[str]
@@ -41,7 +43,13 @@ class Layer(nn.Module):
         return q, p
 
     def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        raise NotImplementedError
+        """φ_t(x) and d/dt φ_t(x(t)) along a curve with velocity (dq, dp), here by forward-mode differentiation."""
+
+        def along(s: Tensor) -> Tensor:
+            return torch.cat(self(t + s, q + s * dq, p + s * dp))
+
+        x, dx = jvp(along, q.new_zeros(()), q.new_ones(()))
+        return (*x.chunk(2), *dx.chunk(2))
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         raise NotImplementedError
@@ -62,6 +70,39 @@ class Layer(nn.Module):
     def trained(self) -> TrainedNetwork | None:
         """Return its network for compiled derivatives by the parameters; None if there are none."""
         return None
+
+
+class Binding:
+    """The system whose functions a flow evaluates; shared by copies of the flow, stored in no file.
+
+    `made` tells the use of them, for messages; `parts` are those that the flow is split into.
+    """
+
+    def __init__(self, system: HamiltonianSystem | None, made: str, parts: Any = None) -> None:
+        self._system, self._made, self._parts = system, made, parts
+
+    @property
+    def known(self) -> bool:
+        return self._system is not None
+
+    @property
+    def system(self) -> HamiltonianSystem:
+        if self._system is None:
+            raise ValueError(
+                f"`flow` is {self._made}, which its file does not hold: give it by "
+                "sympflow.load(path, system=system) or flow.bind(system)."
+            )
+        return self._system
+
+    @property
+    def parts(self) -> Any:
+        return self._parts if self.known else self.system
+
+    def bind(self, system: HamiltonianSystem, parts: Any = None) -> None:
+        self._system, self._parts = system, parts
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Binding:
+        return Binding(self._system, self._made, self._parts)
 
 
 class _PotentialLayer(Layer):

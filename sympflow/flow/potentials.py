@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache
+from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.kernels.networks import NetworkLayer
 
 Time = float | Tensor
+T = TypeVar("T")
 
 ACTIVATION_GROUP, POTENTIAL_GROUP = "sympflow.activations", "sympflow.potentials"
 """The entry-point groups in which a distribution announces its activations and potentials: files name them."""
@@ -73,82 +74,25 @@ class Activation:
         raise NotImplementedError
 
 
-class Tanh(Activation):
-    """tanh a."""
+class _Closed(Activation):
+    """σ in closed form: σ(a), σ'(a) by a and σ(a), and σ''(a) by these."""
+
+    def __init__(self, name: str, value: Any, slope: Any, bend: Any) -> None:
+        self.name, self._value, self._slope, self._bend = name, value, slope, bend
 
     def value(self, a: Tensor) -> Tensor:
-        return torch.tanh(a)
+        return self._value(a)
 
     def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
-        h = torch.tanh(a)
-        return h, 1 - h * h
+        h = self._value(a)
+        return h, self._slope(a, h)
 
     def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         h, slope = self.slope(a)
-        dh = slope * da
-        return h, slope, dh, -2 * h * dh
+        return h, slope, slope * da, self._bend(a, h, slope) * da
 
-
-class Sin(Activation):
-    """sin a."""
-
-    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.sin(a), torch.cos(a)
-
-    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        h, slope = self.slope(a)
-        return h, slope, slope * da, -h * da
-
-
-class Sigmoid(Activation):
-    """1 / (1 + exp(−a))."""
-
-    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
-        h = torch.sigmoid(a)
-        return h, h * (1 - h)
-
-    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        h, slope = self.slope(a)
-        dh = slope * da
-        return h, slope, dh, (1 - 2 * h) * dh
-
-
-class Softplus(Activation):
-    """log(1 + exp a)."""
-
-    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.logaddexp(a, torch.zeros_like(a)), torch.sigmoid(a)
-
-    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        h, slope = self.slope(a)
-        dh = slope * da
-        return h, slope, dh, (1 - slope) * dh
-
-
-class LogCosh(Activation):
-    """log cosh a, whose derivative is tanh a."""
-
-    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.logaddexp(a, -a) - math.log(2), torch.tanh(a)
-
-    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        h, slope = self.slope(a)
-        return h, slope, slope * da, (1 - slope * slope) * da
-
-
-class Swish(Activation):
-    """a / (1 + exp(−a)), which is also called SiLU."""
-
-    def slope(self, a: Tensor) -> tuple[Tensor, Tensor]:
-        s = torch.sigmoid(a)
-        h = a * s
-        return h, s + h * (1 - s)
-
-    def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        s = torch.sigmoid(a)
-        h, rest = a * s, 1 - s
-        slope = s + h * rest
-        return h, slope, slope * da, s * rest * (2 + a * (1 - 2 * s)) * da
+    def __reduce__(self) -> Any:
+        return activation_named, (self.name,)
 
 
 class FunctionActivation(Activation):
@@ -181,17 +125,70 @@ class FunctionActivation(Activation):
         return activation_named, (self.name,)
 
 
-ACTIVATIONS: dict[str, Activation] = {
-    "tanh": Tanh(),
-    "sin": Sin(),
-    "sigmoid": Sigmoid(),
-    "softplus": Softplus(),
-    "logcosh": LogCosh(),
-    "swish": Swish(),
-}
-"""The built-in activations."""
+def _swish_bend(a: Tensor, h: Tensor, slope: Tensor) -> Tensor:
+    s = torch.sigmoid(a)
+    return s * (1 - s) * (2 + a * (1 - 2 * s))
 
-_activations: dict[str, Activation] = {}
+
+_FORMS: dict[str, tuple[Any, Any, Any]] = {
+    "tanh": (torch.tanh, lambda a, h: 1 - h * h, lambda a, h, s: -2 * h * s),
+    "sin": (torch.sin, lambda a, h: torch.cos(a), lambda a, h, s: -h),
+    "sigmoid": (torch.sigmoid, lambda a, h: h * (1 - h), lambda a, h, s: (1 - 2 * h) * s),
+    "softplus": (
+        lambda a: torch.logaddexp(a, torch.zeros_like(a)),
+        lambda a, h: torch.sigmoid(a),
+        lambda a, h, s: (1 - s) * s,
+    ),
+    "logcosh": (
+        lambda a: torch.logaddexp(a, -a) - math.log(2),
+        lambda a, h: torch.tanh(a),
+        lambda a, h, s: 1 - s * s,
+    ),
+    "swish": (lambda a: a * torch.sigmoid(a), lambda a, h: torch.sigmoid(a) * (1 + a - h), _swish_bend),
+}
+
+ACTIVATIONS: dict[str, Activation] = {name: _Closed(name, *forms) for name, forms in _FORMS.items()}
+"""The built-in activations: tanh a, sin a, 1/(1 + exp(−a)), log(1 + exp a), log cosh a, and a/(1 + exp(−a))."""
+
+
+class Register(Generic[T]):
+    """What files call by name: built-in, registered in this process, or announced by a plug-in."""
+
+    def __init__(self, kind: str, group: str, built_in: Mapping[str, T], checked: Callable[[str, Any], T]) -> None:
+        self.kind, self.group, self.built_in, self.checked = kind, group, dict(built_in), checked
+        self.added: dict[str, T] = {}
+
+    @property
+    def known(self) -> dict[str, T]:
+        return self.built_in | self.added
+
+    @cached_property
+    def announced(self) -> dict[str, EntryPoint]:
+        return announced(self.group, self.kind, self.built_in)
+
+    def named(self, name: Any) -> T:
+        """The thing of that name; a ValueError says that there is none, an ImportError that a plug-in is broken."""
+        if isinstance(name, str) and name in self.known:
+            return self.known[name]
+        if not isinstance(name, str) or name not in self.announced:
+            raise Unregistered(self.kind, name, [*self.known, *self.announced])
+        point = self.announced[name]
+        try:
+            self.added[name] = self.checked(name, load_announced(point, self.kind))
+        except (TypeError, ValueError) as error:
+            raise ImportError(
+                f"`{self.kind}` {name!r} of the plug-in {distribution(point)} is none ({error}): report it there."
+            ) from error
+        return self.added[name]
+
+    def check_name(self, name: Any) -> None:
+        """Raise TypeError or ValueError unless something may be registered under a name."""
+        mine = f"'my_{self.kind}'"
+        if not isinstance(name, str):
+            raise TypeError(f"`name` must be a string, such as {mine}; got {type(name).__name__}.")
+        if not name.strip() or name in self.built_in:
+            taken = "is empty" if not name.strip() else f"is a built-in {self.kind}, which cannot be replaced"
+            raise ValueError(f"`name` {name!r} {taken}: choose another one, such as {mine}.")
 
 
 def activation_named(name: str) -> Activation:
@@ -204,19 +201,7 @@ def activation_named(name: str) -> Activation:
     ImportError
         If the plug-in that announces it cannot be loaded.
     """
-    known = ACTIVATIONS | _activations
-    if isinstance(name, str) and name in known:
-        return known[name]
-    if not isinstance(name, str) or name not in _announced(ACTIVATION_GROUP):
-        raise Unregistered("activation", name, [*known, *_announced(ACTIVATION_GROUP)])
-    point = _announced(ACTIVATION_GROUP)[name]
-    try:
-        _activations[name] = _checked_activation(name, load_announced(point, "activation"), None)
-    except (TypeError, ValueError) as error:
-        raise ImportError(
-            f"`activation` {name!r} of the plug-in {distribution(point)} is none ({error}): report it there."
-        ) from error
-    return _activations[name]
+    return activations.named(name)
 
 
 def register_activation(
@@ -247,15 +232,11 @@ def register_activation(
     ...     return a**3, 3 * a**2
     >>> register_activation("cube", lambda a: a**3, and_slope)
     """
-    if not isinstance(name, str):
-        raise TypeError(f"`name` must be a string, such as 'my_activation'; got {type(name).__name__}.")
-    if not name.strip() or name in ACTIVATIONS:
-        taken = "is a built-in activation, which cannot be replaced" if name in ACTIVATIONS else "is empty"
-        raise ValueError(f"`name` {name!r} {taken}: choose another one, such as 'my_activation'.")
-    _activations[name] = _checked_activation(name, activation, compiled)
+    activations.check_name(name)
+    activations.added[name] = _checked_activation(name, activation, compiled)
 
 
-def _checked_activation(name: str, activation: Any, compiled: Any) -> Activation:
+def _checked_activation(name: str, activation: Any, compiled: Any = None) -> Activation:
     """Return an activation whose values and derivatives agree at samples."""
     if not isinstance(activation, Activation):
         if not callable(activation):
@@ -289,10 +270,7 @@ def _checked_activation(name: str, activation: Any, compiled: Any) -> Activation
     return activation
 
 
-@cache
-def _announced(group: str) -> dict[str, EntryPoint]:
-    what, taken = ("activation", ACTIVATIONS) if group == ACTIVATION_GROUP else ("potential", {"mlp": None})
-    return announced(group, what, taken)
+activations = Register("activation", ACTIVATION_GROUP, ACTIVATIONS, _checked_activation)
 
 
 def _short(name: Any) -> str:
@@ -362,6 +340,9 @@ class MLPPotential(Potential):
         s, and the mean of x that the initial biases allow for.
     tau, gain : float
         τ and c.
+    features : int
+        m, of further inputs that a step keeps as they are, the last rows of x (d + m, N), as the time of a drive; the
+        gradients by them are left out, as 0.
     generator : torch.Generator, optional
         Source of the initial weights, uniform in ±1/√(fan in).
 
@@ -395,14 +376,16 @@ class MLPPotential(Potential):
         center: Sequence[float] | None = None,
         tau: float = 1.0,
         gain: float = 1.0,
+        features: int = 0,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         hidden, dtype, device = hidden_widths(hidden), checked_dtype(dtype), checked_device(device)
-        check_memory(f"`hidden` {hidden!r}", count_weights(ndof, hidden), "take narrower layers")
-        self.ndof, self.hidden, self.activation = int(ndof), hidden, activation
+        inputs = int(ndof) + features
+        check_memory(f"`hidden` {hidden!r}", count_weights(inputs, hidden), "take narrower layers")
+        self.ndof, self.features, self.hidden, self.activation = int(ndof), features, hidden, activation
         self._sigma = activation_named(activation)
 
         def uniform(*shape: int, fan_in: int) -> nn.Parameter:
@@ -410,9 +393,9 @@ class MLPPotential(Potential):
             w = (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1) / fan_in**0.5
             return nn.Parameter(w.to(dtype=dtype, device=device))
 
-        self.weight_x = uniform(hidden[0], ndof, fan_in=ndof + 1)
-        self.weight_t = uniform(hidden[0], fan_in=ndof + 1)
-        fans = (ndof + 1, *hidden[:-1])
+        self.weight_x = uniform(hidden[0], inputs, fan_in=inputs + 1)
+        self.weight_t = uniform(hidden[0], fan_in=inputs + 1)
+        fans = (inputs + 1, *hidden[:-1])
         self.biases = nn.ParameterList(uniform(h, fan_in=fan) for h, fan in zip(hidden, fans, strict=True))
         self.weights = nn.ParameterList(uniform(h, fan, fan_in=fan) for fan, h in pairwise(hidden))
         self.weight_out = uniform(hidden[-1], fan_in=hidden[-1])
@@ -420,19 +403,20 @@ class MLPPotential(Potential):
         def constant(value: Any) -> Tensor:
             return torch.as_tensor(value, dtype=dtype, device=device)
 
-        self.register_buffer("scale", constant([1.0] * ndof if scale is None else list(scale)))
+        self.register_buffer("scale", constant([*([1.0] * ndof if scale is None else scale), *[1.0] * features]))
         self.register_buffer("tau", constant(tau))
         self.register_buffer("gain", constant(gain))
         if center is not None:
             with torch.no_grad():
-                self.biases[0] -= self.weight_x @ (constant(list(center)) / self.scale)
+                self.biases[0] -= self.weight_x @ (constant([*center, *[0.0] * features]) / self.scale)
 
     def to_dict(self) -> dict[str, Any]:
-        return {"type": "mlp", "hidden": list(self.hidden), "activation": self.activation}
+        plan = {"type": "mlp", "hidden": list(self.hidden), "activation": self.activation}
+        return plan | ({"features": self.features} if self.features else {})
 
     @classmethod
     def from_dict(cls, ndof: int, plan: Mapping[str, Any], dtype: torch.dtype) -> Self:
-        return cls(ndof, plan["hidden"], plan.get("activation"), dtype=dtype)  # type: ignore[arg-type]
+        return cls(ndof, plan["hidden"], plan.get("activation"), features=plan.get("features", 0), dtype=dtype)  # type: ignore[arg-type]
 
     @classmethod
     def from_weights(
@@ -520,6 +504,11 @@ class MLPPotential(Potential):
     def network(self, is_kick: bool) -> NetworkLayer:
         from sympflow.kernels.networks import NetworkLayer
 
+        if self.features:
+            raise ValueError(
+                "`flow` has networks that take the time of the state, and these have no compiled form: use "
+                "backend='array'."
+            )
         K, k, b, W, w = self.folded()
 
         def array(weight: Tensor) -> np.ndarray:
@@ -539,7 +528,7 @@ class MLPPotential(Potential):
         units = [1 / self.scale.expand_as(self.weight_x), 1 / self.tau.expand_as(self.weight_t)]
         units += [self.gain.expand_as(self.weight_out), *(torch.ones_like(w) for w in inner)]
         flat = torch.cat([u.detach().reshape(-1) for u in units]).numpy()
-        return TrainedNetwork(self.ndof, self.hidden, self.activation, flat)
+        return TrainedNetwork(self.ndof + self.features, self.hidden, self.activation, flat)
 
     # V and its derivatives at one time ---------------------------------------------------------------
 
@@ -575,17 +564,22 @@ class MLPPotential(Potential):
 
     # the combinations that the layers use: t and 0 in one sweep -------------------------------------------
 
+    def _by_x(self, gradient: Tensor) -> Tensor:
+        """The gradient with 0 in the rows of the features."""
+        d = self.ndof
+        return torch.cat([gradient[:d], torch.zeros_like(gradient[d:])]) if self.features else gradient
+
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         K, k, b, W, w = self.folded()
         r = self._sweeps(self._both_times(t, K @ x + b[0][:, None], k), b, W, w)
         r_t, r_0 = r.chunk(2, 1)
-        return K.T @ (r_t - r_0)
+        return self._by_x(K.T @ (r_t - r_0))
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
         K, k, b, W, w = self.folded()
         r = self._sweeps(self._both_times(t, K @ x + b[0][:, None], k), b, W, w)
         r_t, r_0 = r.chunk(2, 1)
-        return K.T @ (r_t - r_0), k @ r_t
+        return self._by_x(K.T @ (r_t - r_0)), k @ r_t
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
         K, k, b, W, w = self.folded()
@@ -593,7 +587,7 @@ class MLPPotential(Potential):
         da = K @ dx
         r, dr = self._sweeps_tangent(a, torch.cat([da + k[:, None], da], 1), b, W, w)
         (r_t, r_0), (dr_t, dr_0) = r.chunk(2, 1), dr.chunk(2, 1)
-        return K.T @ (r_t - r_0), K.T @ (dr_t - dr_0)
+        return self._by_x(K.T @ (r_t - r_0)), self._by_x(K.T @ (dr_t - dr_0))
 
     # sweeps ---------------------------------------------------------------------------------------------
 
@@ -694,7 +688,7 @@ def module_weights(module: nn.Module) -> dict[str, Any]:
 def _activation_of(module: nn.Module) -> str:
     """Return the name of the known activation that has the values of a module."""
     a = torch.linspace(-4.0, 4.0, 41, dtype=torch.float64)
-    known = ACTIVATIONS | _activations
+    known = activations.known
     with torch.no_grad():
         for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
             try:
@@ -730,7 +724,19 @@ def _tensors(name: str, arrays: Any, dtype: torch.dtype | None) -> list[Tensor]:
 
 # potentials by name -------------------------------------------------------------------------------------
 
-_potentials: dict[str, type[Potential]] = {"mlp": MLPPotential}
+
+def _checked_potential(name: str, potential: Any) -> type[Potential]:
+    """Return a class of potentials that files can name."""
+    if not (isinstance(potential, type) and issubclass(potential, Potential)):
+        raise TypeError(f"`potential` must be a subclass of Potential; got {potential!r}.")
+    if potential.from_dict.__func__ is Potential.from_dict.__func__:  # type: ignore[attr-defined]
+        raise TypeError(f"`potential` {potential.__name__} has no from_dict(), by which files are read: define it.")
+    return potential
+
+
+potentials: Register[type[Potential]] = Register(
+    "potential", POTENTIAL_GROUP, {"mlp": MLPPotential}, _checked_potential
+)
 
 
 def potential_named(name: str) -> type[Potential]:
@@ -743,18 +749,7 @@ def potential_named(name: str) -> type[Potential]:
     ImportError
         If the plug-in that announces it cannot be loaded.
     """
-    if isinstance(name, str) and name in _potentials:
-        return _potentials[name]
-    if not isinstance(name, str) or name not in _announced(POTENTIAL_GROUP):
-        raise Unregistered("potential", name, [*_potentials, *_announced(POTENTIAL_GROUP)])
-    point = _announced(POTENTIAL_GROUP)[name]
-    cls = load_announced(point, "potential")
-    if not (isinstance(cls, type) and issubclass(cls, Potential)):
-        raise ImportError(
-            f"`potential` {name!r} of the plug-in {distribution(point)} is no Potential class: report it there."
-        )
-    _potentials[name] = cls
-    return cls
+    return potentials.named(name)
 
 
 def register_potential(name: str, potential: type[Potential]) -> None:
@@ -774,14 +769,5 @@ def register_potential(name: str, potential: type[Potential]) -> None:
     TypeError
         If `name` is not a string, or `potential` no class of potentials with `from_dict`.
     """
-    if not isinstance(name, str):
-        raise TypeError(f"`name` must be a string, such as 'my_potential'; got {type(name).__name__}.")
-    if not name.strip() or name == "mlp":
-        raise ValueError(
-            f"`name` {name!r} is {'built in' if name else 'empty'}: choose another, such as 'my_potential'."
-        )
-    if not (isinstance(potential, type) and issubclass(potential, Potential)):
-        raise TypeError(f"`potential` must be a subclass of Potential; got {potential!r}.")
-    if potential.from_dict.__func__ is Potential.from_dict.__func__:  # type: ignore[attr-defined]
-        raise TypeError(f"`potential` {potential.__name__} has no from_dict(), by which files are read: define it.")
-    _potentials[name] = potential
+    potentials.check_name(name)
+    potentials.added[name] = _checked_potential(name, potential)

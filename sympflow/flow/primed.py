@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from sympflow.arguments import check_flag, plain
 from sympflow.arrays import to_numpy
 from sympflow.flow.coefficients import Coefficients
-from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.flow_map import check_system
 from sympflow.flow.frozen import PrimedKnown
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import Time
@@ -34,7 +34,6 @@ from sympflow.flow.primed_potentials import (
     CURVATURE,
     FORCE_GRADIENT,
     POTENTIAL,
-    Binding,
     PolynomialTerm,
     PrimedDrift,
     PrimedPotential,
@@ -42,17 +41,17 @@ from sympflow.flow.primed_potentials import (
     Term,
 )
 from sympflow.flow.records import MAX_LAYERS
-from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Substep, Tables, columns_of, substeps_of
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.lattice_states import LatticeStates
-from sympflow.hamiltonian.monomials import Monomials, monomials
+from sympflow.hamiltonian.monomials import Monomials, in_monomials, monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, Scheme, compose, scheme_named
 
 
-class PrimedFlow(PrimedKnown, SympFlow):
+class PrimedFlow(PrimedKnown, SystemFlow):
     """A SympFlow of kicks and drifts, in turn, that are primed with V and T; made by `SympFlow.primed`.
 
     A palindromic one has even polynomials b, γ, c, a, and its kernel reads the same backwards, which makes K
@@ -92,7 +91,7 @@ class PrimedFlow(PrimedKnown, SympFlow):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        FlowMap.__init__(self, ndof, dt)
+        super().__init__(ndof, dt, system)
         self.shape = shape
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
 
@@ -112,9 +111,8 @@ class PrimedFlow(PrimedKnown, SympFlow):
         outer = {sign: substeps_of(shape.outer, outside, sign) for sign in (1, -1)}
         self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
         self._tables: Kept[Tables] = Kept(column._parameters for column in columns_of(self.substeps))
-        self._binding = Binding(system)
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
-        self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
+        self.layers = tuple(map(self._layer, range(len(self.substeps))))
         if system is not None:
             self.identify(system)
 
@@ -321,29 +319,14 @@ class PrimedFlow(PrimedKnown, SympFlow):
 
     # its system ---------------------------------------------------------------------------------------------
 
-    @property
-    def system(self) -> HamiltonianSystem | None:
-        """The system whose V and T the flow uses, None for one loaded without it."""
-        return self._binding.system if self._binding.known else None
-
-    def bind(self, system: HamiltonianSystem) -> Self:
-        """Give a flow that was loaded from a file the V and T of its system; itself.
-
-        The flow of a lattice takes the size of the one that it is given.
-
-        Raises
-        ------
-        ValueError
-            If it is not the system that the flow was made for.
-        """
-        self.check_system(system)
-        self._binding.bind(system)
+    def _take(self, system: HamiltonianSystem) -> None:
+        """Take V and T; the flow of a lattice takes the size of the one that it is given."""
+        super()._take(system)
         if system.ndof != self.ndof:
             self.ndof = system.ndof
-            self.layers = tuple(map(self._layer, range(len(self.substeps))))  # type: ignore[assignment]
+            self.layers = tuple(map(self._layer, range(len(self.substeps))))
         if isinstance(self.domain, LatticeStates):
             self.domain = self.domain.of(system)
-        return self
 
     def transferred(self, system: HamiltonianSystem) -> Self:
         """Return an untrained flow of another system, with the numbers of this one.
@@ -394,8 +377,35 @@ class PrimedFlow(PrimedKnown, SympFlow):
     def carried(self, system: HamiltonianSystem) -> Self:
         """This flow, of another size of its system, with what is known of it."""
         other = self._of(system, self.shape).requires_grad_(False)
-        other.describe(self.description_for(system))
+        other.provenance = self.provenance_for(system)
         return other
+
+    def force_gradient_coefficients(self) -> np.ndarray:
+        """−½|∇V|²_{M⁻¹} by the monomials of the kicks (M,); 0 where it is no such polynomial."""
+        system = self.system
+        assert system is not None
+        assert system.symbols is not None
+        e = in_monomials(system.symbols.force_gradient, system.symbols, self.monomials)
+        return np.zeros(len(self.monomials)) if e is None else e
+
+    @torch.no_grad()
+    def take_over(self, other: PrimedFlow) -> None:
+        """Take the numbers of another flow with as many kicks: those of a longer Δt as they are at this one's.
+
+        Polynomials take over force gradients.
+        """
+        shorter = min(self.dt / other.dt, 1.0)
+        theirs = {
+            name: to_numpy(column.table).astype(float) * shorter ** np.array(column.exponents, float)
+            for name, column in other.columns()
+        }
+        mine = dict(self.columns())
+        for name in mine.keys() & theirs.keys():
+            mine[name].set(theirs[name])
+        if self.polynomials is not None and other.gradients is not None:
+            for m, e_m in enumerate(self.force_gradient_coefficients()):
+                for part in ("", "processor_"):
+                    mine[f"{part}polynomials.{m}"].set(e_m * theirs[f"{part}gradients"])
 
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""

@@ -14,46 +14,13 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import Array, jvp
-from sympflow.flow.layers import Drift
+from sympflow.flow.layers import Binding, Drift
 from sympflow.flow.potentials import Potential, Time
 from sympflow.hamiltonian.hamiltonian import derivative, direction, length_of_change, step
 from sympflow.hamiltonian.monomials import Monomials, gradient, value
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
-
-
-class Binding:
-    """The system whose functions a flow evaluates; shared by copies of the flow, stored in no file.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem or None
-    made : str
-        The use of them, for messages.
-    """
-
-    def __init__(self, system: HamiltonianSystem | None, made: str = "primed with the V and T of a system") -> None:
-        self._system, self._made = system, made
-
-    @property
-    def known(self) -> bool:
-        return self._system is not None
-
-    @property
-    def system(self) -> HamiltonianSystem:
-        if self._system is None:
-            raise ValueError(
-                f"`flow` is {self._made}, which its file does not hold: give it by "
-                "sympflow.load(path, system=system) or flow.bind(system)."
-            )
-        return self._system
-
-    def bind(self, system: HamiltonianSystem) -> None:
-        self._system = system
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Binding:
-        return Binding(self._system, self._made)
 
 
 class Factor(Protocol):
@@ -175,15 +142,7 @@ def _gradient_and_change(U: Term, system: HamiltonianSystem, x: Tensor, dx: Tens
 
 
 class PolynomialTerm:
-    """Σ_m e_m(t) q^m; positions are columns (d, N).
-
-    Parameters
-    ----------
-    monomials
-        The exponents m.
-    factors : sequence of Factor
-        e_m.
-    """
+    """Σ_m e_m(t) q^m; positions are columns (d, N)."""
 
     def __init__(self, monomials: Monomials, factors: Sequence[Factor]) -> None:
         self.monomials, self._factors = monomials, tuple(factors)
@@ -211,13 +170,6 @@ class PrimedDrift(Drift):
     """The drift of a system over a time s = t a(t/Δt); with friction the exact flow of q' = M⁻¹p, p' = −Γp.
 
     Of a driven system the positions are (d + 1, N), with the time as the last, which the drift moves by s.
-
-    Parameters
-    ----------
-    ndof : int
-    binding : Binding
-    time : Factor
-        s.
     """
 
     def __init__(self, ndof: int, binding: Binding, time: Factor) -> None:
@@ -288,16 +240,6 @@ class PrimedPotential(Potential):
     """V(t, x) = Σ_j c_j(t) U_j(x), with U_j functions of the system and c_j(0) = 0, and perhaps a polynomial.
 
     Of a driven system, U_j(q, t), x is (d + 1, N), the positions and the times, and gradients are those by q.
-
-    Parameters
-    ----------
-    ndof : int
-    binding : Binding
-    terms : sequence of (Term, Factor)
-        U_j, and c_j, for instance an entry of a table.
-    polynomial : PolynomialTerm, optional
-    passed : Factor, optional
-        By how much the time has moved on since the beginning of a step, in a driven system.
     """
 
     _passed: Factor | None = None  # of pickles of earlier versions, which did not have it

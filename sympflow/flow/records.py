@@ -43,50 +43,67 @@ STAGE: dict[str, Any] = {
 
 
 class Refused(Exception):
-    """The reason for which a file is refused, and what to do.
-
-    Parameters
-    ----------
-    reason : str
-    remedy : str
-    """
+    """The reason for which a file is refused, and what to do."""
 
     def __init__(self, reason: str, remedy: str = "Save it again with flow.save(path)") -> None:
         super().__init__(reason)
         self.remedy = remedy
 
 
-@dataclass(frozen=True)
-class Description:
-    """All that a file tells of its flow beside architecture and weights.
+@dataclass
+class Provenance:
+    """What is known of a flow beside its map: its system, its domain, its figures, and where these hold.
 
     Attributes
     ----------
-    domain, system, fingerprint, recipe, figures, certificate
-        `FlowMap`'s domain, system_name, fingerprint, recipe, figures, certified.
-    identity, unfitted, drive_times, lattice_terms
-        `FlowMap`'s own.
+    domain : Domain or None
+        Ω, where it was trained.
+    system_name, fingerprint : str or None, tuple of float or None
+        The system it was trained for.
+    recipe, figures : dict
+        How it was trained, and what it achieved.
+    certified : Certificate or None
+        What `certificate` found, or the file held that the flow was loaded from.
+    identity : Identity or None
+        H of that system, all over Ω; None for a flow without a system, or from a file that was written before.
+    unfitted : tuple of (float, float)
+        Open intervals of t in which it was never compared with anything: those between the times of labels, if these
+        were few and it was fitted to nothing else. Results there come with a warning.
+    drive_times : (float, float) or None
+        The interval of t0 + t that the flow of a drive without a period was fitted in: beyond it there is a warning.
+    lattice_terms : mapping of str to str
+        The terms of a lattice, for messages; {} of another system.
     """
 
     domain: Domain | None = None
-    system: str | None = None
+    system_name: str | None = None
     fingerprint: tuple[float, ...] | None = None
     recipe: dict[str, Any] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
-    certificate: Certificate | None = None
+    certified: Certificate | None = None
     identity: Identity | None = None
     unfitted: tuple[tuple[float, float], ...] = ()
     drive_times: tuple[float, float] | None = None
     lattice_terms: Mapping[str, str] = field(default_factory=dict)
 
+    def to_record(self) -> dict[str, Any]:
+        """The entries of the record in a file, without those that say nothing; the certificate is not among them."""
+        told: dict[str, Any] = {
+            "domain": None if self.domain is None else self.domain.to_dict(),
+            "system": self.system_name,
+            **{name: getattr(self, name) for name in ("fingerprint", "recipe", "figures")},
+        }
+        more = {
+            "unfitted": self.unfitted,
+            "drive_times": [] if self.drive_times is None else [self.drive_times],
+            "lattice_terms": dict(self.lattice_terms),
+            "identity": None if self.identity is None else self.identity.to_dict(),
+        }
+        return told | {name: value for name, value in more.items() if value}
+
     @classmethod
     def of_record(cls, record: dict[str, Any], ndof: int) -> Self:
-        """Return what the record tells, all of it checked.
-
-        Raises
-        ------
-        Refused
-        """
+        """Return what the record tells, all of it checked."""
         missing = [name for name in FIELDS if name not in record]
         if missing:
             raise Refused(f"its record has no {', '.join(missing)}")

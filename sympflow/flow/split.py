@@ -21,12 +21,12 @@ from torch import Tensor
 from sympflow.arguments import check_flag, plain
 from sympflow.arrays import jvp, to_numpy
 from sympflow.flow.coefficients import Column
-from sympflow.flow.flow_map import FlowMap, check_system
+from sympflow.flow.flow_map import check_system
 from sympflow.flow.known import UNCOMPENSATED
 from sympflow.flow.layers import Layer
 from sympflow.flow.potentials import Time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
-from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
@@ -40,31 +40,6 @@ MOST_KEPT = 64  # steps whose maps are kept
 KINDS_OF_MODES = ("oscillator", "hyperbolic", "free", "idle")
 FILTERED = ("oscillator", "hyperbolic")
 """The kinds of modes that filters act on; others pass."""
-
-
-class PartsBinding:
-    """The system whose parts a flow is made of; shared by copies of the flow, stored in no file."""
-
-    def __init__(self, system: HamiltonianSystem | None, expressions: Sequence[str] | None) -> None:
-        self.expressions = None if expressions is None else tuple(expressions)
-        self.system, self._parts = system, None if system is None else exact_parts(system, expressions)
-
-    @property
-    def parts(self) -> ExactParts:
-        if self._parts is None:
-            raise ValueError(
-                "`flow` is made of the parts of a system, which its file does not hold: give it by "
-                "sympflow.load(path, system=system) or flow.bind(system)."
-            )
-        return self._parts
-
-    def bind(self, system: HamiltonianSystem, parts: ExactParts) -> None:
-        self.system, self._parts = system, parts
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> PartsBinding:
-        copied = PartsBinding(None, self.expressions)
-        copied.system, copied._parts = self.system, self._parts
-        return copied
 
 
 class KeptMaps:
@@ -126,13 +101,6 @@ class SplitLayer(Layer):
     def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         return self._apply_map(self.flow.maps(t)[self.index].inverse(), q, p)
 
-    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        def along(s: Tensor) -> Tensor:
-            return torch.cat(self(t + s, q + s * dq, p + s * dp))
-
-        x, dx = jvp(along, q.new_zeros(()), q.new_ones(()))
-        return (*x.chunk(2), *dx.chunk(2))
-
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         q, p = self.inverse(t, q, p)
         parts = self.flow.parts
@@ -159,7 +127,7 @@ class SplitLayer(Layer):
         return {"kind": self.kind, "part": self.part}
 
 
-class SplitFlow(SympFlow):
+class SplitFlow(SystemFlow):
     """A palindromic SympFlow of the exact flows of a system's parts; made by `SympFlow.split`.
 
     Time-reversible: continued to negative t by its formulas, ψ̄_{−t} = (ψ̄_t)⁻¹.
@@ -195,6 +163,8 @@ class SplitFlow(SympFlow):
         w, φ (for each frequency) and γ of the other parts, part by part.
     """
 
+    MADE = "made of the parts of a system"
+
     def __init__(
         self,
         ndof: int,
@@ -210,7 +180,8 @@ class SplitFlow(SympFlow):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        FlowMap.__init__(self, ndof, dt)
+        super().__init__(ndof, dt)
+        self.expressions = None if expressions is None else tuple(expressions)
         self.sequence, self.kinds, self.classes = tuple(sequence), tuple(kinds), tuple(classes)
         if not self.sequence or self.sequence != self.sequence[::-1]:
             raise ValueError("`sequence` must read the same backwards: make it a palindrome.")
@@ -244,12 +215,11 @@ class SplitFlow(SympFlow):
         for c in self.columns():  # equal steps, φ = 1
             if c.power < 3:
                 c.set(np.eye(1, terms).repeat(c.n, 0) / (c.n if c.power else 1))
-        self._binding = PartsBinding(system, expressions)
         self._maps: Kept[KeptMaps] = Kept(column._parameters for column in self.columns())
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
-        self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))  # type: ignore[assignment]
+        self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))
         if system is not None:
-            self._check_parts(self._binding.parts)
+            self._take(system)
             self.identify(system)
 
     @classmethod
@@ -407,27 +377,10 @@ class SplitFlow(SympFlow):
     def parts(self) -> ExactParts:
         return self._binding.parts
 
-    @property
-    def system(self) -> HamiltonianSystem | None:
-        """The system whose parts the flow uses, None for one loaded without it."""
-        return self._binding.system
-
-    def bind(self, system: HamiltonianSystem) -> Self:
-        """Give a flow that was loaded from a file the parts of its system; itself.
-
-        Raises
-        ------
-        ValueError
-            If it is not the system that the flow was made for.
-        """
-        self.check_system(system)
-        parts = exact_parts(system, self._binding.expressions)
+    def _take(self, system: HamiltonianSystem) -> None:
+        parts = exact_parts(system, self.expressions)
         self._check_parts(parts)
         self._binding.bind(system, parts)
-        return self
-
-    def bound(self, system: HamiltonianSystem) -> Self:
-        return self if self._binding.system is not None else self.bind(system)
 
     def _check_parts(self, parts: ExactParts) -> None:
         if part_kinds(parts) != self.kinds or class_kinds(parts) != self.classes:
@@ -442,7 +395,6 @@ class SplitFlow(SympFlow):
             raise ValueError("`force_gradient` needs H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): leave it out.")
 
     def architecture(self) -> dict[str, Any]:
-        expressions = self._binding.expressions
         return {
             "ndof": self.ndof,
             "split": {
@@ -452,7 +404,7 @@ class SplitFlow(SympFlow):
                 "terms": self.terms,
                 "filters": self.filtered,
                 "gradients": list(self.gradient_kicks),
-                "expressions": None if expressions is None else list(expressions),
+                "expressions": None if self.expressions is None else list(self.expressions),
             },
         }
 

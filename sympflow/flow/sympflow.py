@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import copy
+import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from sympflow.arguments import plain
+from sympflow.arguments import plain, real_number
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.known import UNCOMPENSATED
-from sympflow.flow.layers import LAYERS, Drift, Kick, Layer
+from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer
 from sympflow.flow.potentials import (
     MLPPotential,
     Potential,
@@ -24,7 +27,7 @@ from sympflow.flow.potentials import (
     module_weights,
     potential_named,
 )
-from sympflow.flow.records import MAX_LAYERS, MAX_PARAMETERS, Refused, checked_widths, count_parameters
+from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_widths, count_parameters
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import Kept, check_compilable, check_memory
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -34,6 +37,69 @@ from sympflow.schemes import Scheme
 if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.kernels.network_tangents import NetworkTangents
     from sympflow.kernels.networks import MLPFlowKernel
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The time t0 as networks take it: by cos(k ω t0) and sin(k ω t0), or from −1 to 1 where there is no period.
+
+    Parameters
+    ----------
+    period : float or None
+        2π/ω.
+    times : (float, float) or None
+        Without a period: the interval of t0 + t that is mapped to [−1, 1].
+    harmonics : int
+        The largest k.
+
+    Raises
+    ------
+    ValueError
+        If a number is not admissible.
+    """
+
+    period: float | None
+    times: tuple[float, float] | None
+    harmonics: int = 2
+
+    def __post_init__(self) -> None:
+        m = self.harmonics
+        if isinstance(m, bool) or not isinstance(m, int) or not 1 <= m <= MAX_DEGREE:
+            raise ValueError(
+                f"`harmonics` must be an integer from 1 to {MAX_DEGREE}, of the drive's frequency; got {m!r}."
+            )
+        if self.period is not None:
+            if not (real_number(self.period) and 0 < self.period < math.inf):
+                raise ValueError(f"`period` must be a positive finite number; got {self.period!r}.")
+            return
+        low, high = (math.nan, math.nan) if self.times is None else self.times
+        if not (real_number(low) and real_number(high) and -math.inf < low < high < math.inf):
+            raise ValueError(
+                f"`times` of a drive without a period must be an interval; got {self.times!r}: give the system its "
+                "`period`, or a longer `t_span`."
+            )
+
+    @classmethod
+    def of(cls, system: HamiltonianSystem, harmonics: int = 2) -> Drive:
+        """The drive of a system: its period, or its `t_span`."""
+        span = (float(min(system.t_span)), float(max(system.t_span))) if system.period is None else None
+        return cls(system.period, span, harmonics)
+
+    @property
+    def size(self) -> int:
+        """The number of features."""
+        return 1 if self.period is None else 2 * self.harmonics
+
+    def features(self, t0: Tensor) -> Tensor:
+        """The features (size, N) of times (1, N)."""
+        if self.period is None:
+            assert self.times is not None
+            low, high = self.times
+            return (2 * t0 - (low + high)) / (high - low)
+        turn = (t0 / self.period) % 1.0
+        k = torch.arange(1, self.harmonics + 1, dtype=t0.dtype, device=t0.device)[:, None]
+        angles = 2 * math.pi * k * turn
+        return torch.cat([torch.cos(angles), torch.sin(angles)])
 
 
 class SympFlow(FlowMap):
@@ -58,6 +124,10 @@ class SympFlow(FlowMap):
         Of the initial parameters.
     scale : Scaling, optional
         Units of q, p and t; `train` takes them from the domain. The default is 1 for q and p, and Δt for t.
+    drive : Drive, optional
+        Of a driven system: the potentials V(t0, t, x) take the time t0 of the state too, see `SympFlow.timed`.
+    layers : iterable of Layer, optional
+        In place of all between `ndof` and `dt`.
 
     References
     ----------
@@ -87,10 +157,17 @@ class SympFlow(FlowMap):
         device: torch.device | str | None = None,
         seed: int = 0,
         scale: Scaling | None = None,
+        drive: Drive | None = None,
+        layers: Iterable[Layer] | None = None,
     ) -> None:
         super().__init__(ndof, dt)
+        self.drive, self.takes_driving = drive, self.takes_driving or drive is not None
+        if layers is not None:
+            self.layers = layers if isinstance(layers, tuple) else nn.ModuleList(layers)
+            return
         scale = Scaling.unit(self.ndof, self.dt) if scale is None else scale
         generator = torch.Generator().manual_seed(plain(seed))
+        features = 0 if drive is None else drive.size
 
         def potential(unit: tuple[float, ...], center: tuple[float, ...]) -> MLPPotential:
             return MLPPotential(
@@ -101,15 +178,16 @@ class SympFlow(FlowMap):
                 center=center,
                 tau=scale.t,
                 gain=scale.action,
+                features=features,
                 dtype=dtype,
                 device=device,
                 generator=generator,
             )
 
-        self.layers = pairs_of_layers(self.ndof, pairs, hidden, scale, potential)
+        self.layers = _pairs_of_layers(self.ndof, pairs, hidden, scale, potential, features)
 
     @classmethod
-    def from_layers(cls, layers: Iterable[Layer], dt: float) -> Self:
+    def from_layers(cls, layers: Iterable[Layer], dt: float, drive: Drive | None = None) -> Self:
         """Return the composition of `layers`, the first applied first, for t ∈ [0, dt].
 
         Raises
@@ -120,10 +198,7 @@ class SympFlow(FlowMap):
         layers = list(layers)
         if not layers or len({layer.ndof for layer in layers}) != 1:
             raise ValueError("`layers` must be one or more layers with the same ndof: check the list.")
-        self = cls.__new__(cls)
-        FlowMap.__init__(self, layers[0].ndof, dt)
-        self.layers = nn.ModuleList(layers)
-        return self
+        return cls(layers[0].ndof, dt=dt, drive=drive, layers=layers)
 
     @classmethod
     def from_potentials(cls, potentials: Iterable[Any], dt: float, *, dtype: torch.dtype | None = None) -> Self:
@@ -260,21 +335,8 @@ class SympFlow(FlowMap):
         ValueError
             If the system is not separable, or an argument is not admissible.
         """
-        return family("primed").untrained(
-            system,
-            stages=stages,
-            dt=dt,
-            palindromic=palindromic,
-            scheme=scheme,
-            degree=degree,
-            force_gradient=force_gradient,
-            processor=processor,
-            curvature=curvature,
-            polynomial=polynomial,
-            first=first,
-            dtype=dtype,
-            device=device,
-        )
+        given = dict(locals())
+        return family("primed").untrained(**given)
 
     @staticmethod
     def split(
@@ -321,18 +383,8 @@ class SympFlow(FlowMap):
         ValueError
             If the system has no such parts, or an argument is not admissible.
         """
-        return family("split").untrained(
-            system,
-            stages=stages,
-            dt=dt,
-            terms=terms,
-            filters=filters,
-            force_gradient=force_gradient,
-            parts=parts,
-            linear_outside=linear_outside,
-            dtype=dtype,
-            device=device,
-        )
+        given = dict(locals())
+        return family("split").untrained(**given)
 
     @staticmethod
     def collocated(
@@ -378,9 +430,8 @@ class SympFlow(FlowMap):
         >>> flow.hamiltonian(0.1, torch.zeros(5, 4, dtype=torch.float64)).shape
         torch.Size([5])
         """
-        return family("collocated").of(
-            system, dt=dt, stages=stages, steps=steps, states=states, dtype=dtype, device=device
-        )
+        given = dict(locals())
+        return family("collocated").of(**given)
 
     @staticmethod
     def timed(
@@ -396,9 +447,10 @@ class SympFlow(FlowMap):
         seed: int = 0,
         scale: Scaling | None = None,
     ) -> Any:
-        """Return a `TimedSympFlow`, of networks for a driven system: their potentials take the time of the state too.
+        """Return a SympFlow of networks for a driven system, whose potentials take the time of the state too.
 
-        The time t0 enters by cos(2πk t0/T) and sin(2πk t0/T) where H has a period T; else by its place in `t_span`.
+        The time t0 enters by cos(2πk t0/T) and sin(2πk t0/T) where H has a period T; else by its place in `t_span`. For
+        each t0 it is a SympFlow in t, and periodic in t0 if H is.
 
         Parameters
         ----------
@@ -414,21 +466,59 @@ class SympFlow(FlowMap):
         ValueError
             If H does not depend on t, or an argument is not admissible.
         """
-        return family("timed").untrained(
-            system,
-            pairs,
-            harmonics,
-            hidden=hidden,
-            activation=activation,
-            dt=dt,
-            dtype=dtype,
-            device=device,
-            seed=seed,
-            scale=scale,
-        )
+        if system.autonomous:
+            raise ValueError(
+                f"`system` {system.name!r} is not driven, its H does not depend on t: use SympFlow, without t0."
+            )
+        drive = Drive.of(system, plain(harmonics))
+        return SympFlow(system.ndof, pairs, hidden, activation, dt, dtype, device, seed, scale, drive)
+
+    @property
+    def driven(self) -> bool:
+        return self.drive is not None
+
+    @property
+    def period(self) -> float | None:
+        return None if self.drive is None else self.drive.period
+
+    def transferred(self, system: HamiltonianSystem) -> Self:
+        """Return an untrained flow of another driven system, with the numbers of this one, to start from in `train`.
+
+        Raises
+        ------
+        ValueError
+            If this is no flow of networks of a driven system, or the system has other degrees of freedom, or a period
+            where this one has none.
+        """
+        drive = None if self.drive is None else Drive.of(system, self.drive.harmonics)
+        if (
+            drive is None
+            or self.drive is None
+            or system.autonomous
+            or (system.ndof, drive.size)
+            != (
+                self.ndof,
+                self.drive.size,
+            )
+        ):
+            raise ValueError(
+                f"`system` {system.name!r} must be driven, with {self.ndof} degrees of freedom and "
+                f"{'a' if self.period else 'no'} period, as that of the flow: train a new one by train(system)."
+            )
+        return type(self).from_layers(copy.deepcopy(self.layers), self.dt, drive)  # type: ignore[arg-type]
+
+    def check_system(self, system: HamiltonianSystem) -> None:
+        super().check_system(system)
+        own = system.autonomous is False and system.period == self.period
+        if self.drive is not None and self.fingerprint is None and not own:
+            raise ValueError(
+                f"`system` {system.name!r} has {'no drive' if system.autonomous else f'the period {system.period}'}, "
+                f"and the flow was made for one of period {self.period}: make one by SympFlow.timed(system)."
+            )
 
     def architecture(self) -> dict[str, Any]:
-        return {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]
+        plan = {"ndof": self.ndof, "layers": [layer.to_dict() for layer in self.layers]}  # type: ignore[operator]
+        return plan if self.drive is None else plan | {"drive": asdict(self.drive)}
 
     @classmethod
     def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
@@ -436,13 +526,17 @@ class SympFlow(FlowMap):
         if not isinstance(layers, list) or not 1 <= len(layers) <= MAX_LAYERS:
             raise Refused("its list of layers is missing or absurdly long")
         # All sizes first: nothing is allocated for a file that asks for too much.
+        drive = _drive_of(plan.get("drive"))
         potentials = [_potential_of(layer) for layer in layers]
-        widths = [checked_widths(plan.get("hidden"), ndof) for plan in potentials if plan["type"] == "mlp"]
-        if sum(count_parameters(w, ndof) for w in widths) > MAX_PARAMETERS:
+        inputs = ndof + (0 if drive is None else drive.size)
+        widths = [checked_widths(plan.get("hidden"), inputs) for plan in potentials if plan["type"] == "mlp"]
+        if any(p.get("features", 0) != inputs - ndof for p in potentials if p["type"] == "mlp"):
+            raise Refused("its potentials do not take the time of its drive")
+        if sum(count_parameters(w, inputs) for w in widths) > MAX_PARAMETERS:
             raise Refused("its architecture is absurdly large")
         built = [_built(potential, ndof, dtype) for potential in potentials]
         made = (LAYERS[layer["kind"]](potential) for layer, potential in zip(layers, built, strict=True))
-        return cls.from_layers(made, dt)
+        return cls.from_layers(made, dt, drive)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         if "layers" in self.architecture():  # the plans of special families describe no layers one by one
@@ -489,24 +583,33 @@ class SympFlow(FlowMap):
         q, p = self._opened(y, t)
         H = torch.zeros_like(y[0])
         for layer in reversed(self.layers):
-            q, p, rate = layer.pull_back(t, q, p)  # type: ignore[operator]
+            q, p, rate = layer.pull_back(t, q, p)
             H = H + rate
         return H.reshape(batch)
 
     def _opened(self, y: Tensor, passed: float | Tensor) -> tuple[Tensor, Tensor]:
         """The q and p that the layers take, of columns y at a time `passed` after t0."""
-        q, p = y.chunk(2)
-        return q, p
+        if self.drive is None:
+            q, p = y.chunk(2)
+            return q, p
+        d = self.ndof
+        features = self.drive.features(y[d : d + 1] - passed)
+        return torch.cat([y[:d], features]), torch.cat([y[d + 1 :], features])
+
+    def _closed(self, q: Tensor, p: Tensor, y: Tensor, passed: float | Tensor) -> Tensor:
+        """The columns of the q and p that the layers give, the time that of y and what has passed."""
+        d = self.ndof
+        return torch.cat([q, p] if self.drive is None else [q[:d], y[d : d + 1] + passed, p[:d]])
 
     def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
-        return torch.cat(self._forwards(t, *y.chunk(2)))
+        return self._closed(*self._forwards(t, *self._opened(y, 0.0)), y, t)
 
     def _map_inverse(self, t: float | Tensor, y: Tensor) -> Tensor:
-        return torch.cat(self._backwards(t, *y.chunk(2)))
+        return self._closed(*self._backwards(t, *self._opened(y, t)), y, -t)
 
     def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        q, p, dq, dp = self._tangents(t, *y.chunk(2))
-        return torch.cat([q, p]), torch.cat([dq, dp])
+        q, p, dq, dp = self._tangents(t, *self._opened(y, 0.0))
+        return self._closed(q, p, y, t), self._closed(dq, dp, torch.zeros_like(y), 1.0)
 
     def _forwards(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         """All layers in turn."""
@@ -517,7 +620,7 @@ class SympFlow(FlowMap):
     def _backwards(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         """The inverses of all layers, the last first."""
         for layer in reversed(self.layers):
-            q, p = layer.inverse(t, q, p)  # type: ignore[operator]
+            q, p = layer.inverse(t, q, p)
         return q, p
 
     def _tangents(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -528,13 +631,63 @@ class SympFlow(FlowMap):
         return q, p, dq, dp
 
 
-def pairs_of_layers(
+class SystemFlow(SympFlow):
+    """A SympFlow whose maps are made of a system's own functions, which its file does not hold."""
+
+    MADE: ClassVar[str] = "primed with the V and T of a system"
+
+    def __init__(self, ndof: int, dt: float, system: HamiltonianSystem | None = None) -> None:
+        super().__init__(ndof, dt=dt, layers=())
+        self._binding = Binding(system, self.MADE)
+        self._loops: tuple[HamiltonianSystem, Any] | None = None  # compiled, of the system that was asked for last
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_loops": None}  # copies and pickles make their own
+
+    @property
+    def system(self) -> HamiltonianSystem | None:
+        """The system whose functions the flow uses, None for one loaded without it."""
+        return self._binding.system if self._binding.known else None
+
+    def bind(self, system: HamiltonianSystem) -> Self:
+        """Give a flow that was loaded from a file the functions of its system; itself.
+
+        Raises
+        ------
+        ValueError
+            If it is not the system that the flow was made for.
+        """
+        self.check_system(system)
+        self._take(system)
+        return self
+
+    def _take(self, system: HamiltonianSystem) -> None:
+        """Take the functions of a system that was checked."""
+        self._binding.bind(system)
+
+    def bound(self, system: HamiltonianSystem) -> Self:
+        return self if self._binding.known else self.bind(system)
+
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
+        if compensated:
+            raise ValueError(UNCOMPENSATED)
+        check_compilable(self.dtype, self.device)
+        if self._loops is None or self._loops[0] is not system:
+            self._loops = system, self._compiled_for(system)
+        return self._loops[1]
+
+    def _compiled_for(self, system: HamiltonianSystem) -> Kernel:
+        """The compiled loops of the flow on a system."""
+        raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
+
+
+def _pairs_of_layers(
     ndof: int,
     pairs: Any,
     hidden: Sequence[int],
     scale: Scaling,
     potential: Callable[[tuple[float, ...], tuple[float, ...]], Potential],
-    features: int = 0,
+    features: int,
 ) -> nn.ModuleList:
     """Return pairs of a kick and a drift, with potentials made of a unit and a center of q or p.
 
@@ -559,6 +712,18 @@ def pairs_of_layers(
         for _ in range(pairs)
         for layer in (Kick(potential(scale.q, scale.q_center)), Drift(potential(scale.p, scale.p_center)))
     )
+
+
+def _drive_of(told: Any) -> Drive | None:
+    """Return the drive of a description."""
+    if told is None:
+        return None
+    if not isinstance(told, dict):
+        raise Refused("its drive is not a table")
+    times = told.get("times")
+    if times is not None and not (isinstance(times, list) and len(times) == 2):
+        raise Refused("the times of its drive are not an interval")
+    return Drive(told.get("period"), None if times is None else tuple(times), told.get("harmonics"))  # type: ignore[arg-type]
 
 
 def _potential_of(layer: Any) -> dict[str, Any]:

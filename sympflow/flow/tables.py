@@ -26,36 +26,7 @@ MOST_KEPT = 256  # a flow with a processor has five for each step length
 
 @dataclass(frozen=True)
 class PrimedShape:
-    """The architecture of a primed flow.
-
-    Parameters
-    ----------
-    first : {"kick", "drift"}
-        The map that comes first, in the kernel and in the processor.
-    maps : int
-        How many kicks and drifts the kernel has.
-    degree : int
-        Degree in t of t b(t/Δt) and t a(t/Δt).
-    palindromic, force_gradient : bool
-    processor : int
-        Number C of pairs of χ, 2C + 1 maps; 0 for none.
-    curvature : bool
-        True if kicks with force gradients have curvature terms too, for symbolic systems and lattices.
-    monomials : tuple of tuple of int
-        The exponents m of polynomials that stand in place of both, for symbolic systems; none for none.
-    timed : bool
-        True if the drifts of the kernel add up to t at every t, as they must with friction, with an exact e^{−γt},
-        and in a driven system, in which the time moves with them.
-    gradient_kicks : tuple of int, optional
-        The kicks of the kernel, counted from 0, that have force gradients, where others have none.
-    curvature_kicks : tuple of int, optional
-        Those of them that have curvature terms, where others have none.
-
-    Raises
-    ------
-    ValueError
-        If there is no such flow.
-    """
+    """The architecture of a primed flow."""
 
     first: Kind
     maps: int
@@ -160,12 +131,7 @@ class PrimedShape:
 
     @classmethod
     def from_dict(cls, plan: Any, ndof: int) -> Self:
-        """Return the shape that a file describes, all of which is checked.
-
-        Raises
-        ------
-        Refused, ValueError
-        """
+        """Return the shape that a file describes, all of which is checked."""
         if not isinstance(plan, dict) or plan.get("first") not in ("kick", "drift"):
             raise Refused("its plan of a primed flow is missing")
         flags: dict[str, Any] = {name: plan.get(name) for name in ("palindromic", "force_gradient")}
@@ -249,19 +215,7 @@ def substeps_of(sequence: Sequence[Kind], columns: Columns, sign: int) -> list[S
 
 
 class Tables:
-    """The numbers of kicks and drifts of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials.
-
-    Parameters
-    ----------
-    substeps : sequence of Substep
-        χ⁻¹, K, χ, with the numbers that they have now.
-    outer : int
-        How many of them χ has.
-    dt : float
-        Δt.
-    monomials
-        Of the polynomials of kicks, where they have them.
-    """
+    """The numbers of kicks and drifts of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials."""
 
     def __init__(self, substeps: Sequence[Substep], outer: int, dt: float, monomials: Monomials = ()) -> None:
         last = len(substeps) - outer
@@ -314,13 +268,7 @@ class Tables:
         return self.kept(("polynomials", back), make)
 
     def variable(self, t: np.ndarray) -> np.ndarray:
-        """t/Δt, or its square where all polynomials are even.
-
-        Raises
-        ------
-        ValueError
-            If a t lies beyond Δt.
-        """
+        """t/Δt, or its square where all polynomials are even."""
         tau = t / self.dt
         if not (tau <= 1 + 1e-12).all():
             raise ValueError(f"`t` must lie in (0, dt] = (0, {self.dt:g}]; got {t.max():g}.")

@@ -19,13 +19,7 @@ _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def checked_dtype(dtype: Any) -> torch.dtype:
-    """Return `dtype` as that of torch: float32 or float64, by torch's, NumPy's or a plain name.
-
-    Raises
-    ------
-    TypeError
-        If it is anything else.
-    """
+    """Return `dtype` as that of torch: float32 or float64, by torch's, NumPy's or a plain name."""
     name = str(dtype).removeprefix("torch.")
     if not isinstance(dtype, (torch.dtype, str)) and dtype is not None:
         try:
@@ -38,15 +32,7 @@ def checked_dtype(dtype: Any) -> torch.dtype:
 
 
 def checked_device(device: Any) -> torch.device | None:
-    """Return `device` as that of torch, once a tensor was put there; None stands for torch's default.
-
-    Raises
-    ------
-    TypeError
-        If it is not a device or the name of one.
-    ValueError
-        If torch knows no such device, or does not see it on this machine.
-    """
+    """Return `device` as that of torch, once a tensor was put there; None stands for torch's default."""
     if device is None:
         return None
     if isinstance(device, bool) or not isinstance(device, (torch.device, str, int)):
@@ -61,15 +47,7 @@ def checked_device(device: Any) -> torch.device | None:
 
 
 def check_memory(what: str, numbers: float, remedy: str) -> None:
-    """Raise ValueError where so many float64 numbers are more than the memory of the machine.
-
-    Parameters
-    ----------
-    what : str
-        The arguments that ask for them, in backticks, with their values.
-    numbers : float
-    remedy : str
-    """
+    """Raise ValueError where so many float64 numbers are more than the memory of the machine."""
     needed, there = 8.0 * numbers, _machine_memory()
     if needed > there:
         raise ValueError(
@@ -101,11 +79,6 @@ class Contents:
     """The values of tensors in some modules' dictionaries, read from memory in microseconds.
 
     A tensor's version counter misses edits through `.data`, and a new tensor may stand in the dictionary.
-
-    Parameters
-    ----------
-    tensors : iterable of dict
-        `_parameters` or `_buffers` of modules.
     """
 
     def __init__(self, tensors: Iterable[Mapping[str, Tensor | None]]) -> None:
@@ -133,13 +106,7 @@ class Contents:
 
 
 class Kept(Generic[T]):
-    """Something that is made of the weights, and made anew when one of them has changed.
-
-    Parameters
-    ----------
-    tensors : iterable of dict
-        As for `Contents`.
-    """
+    """Something that is made of the weights, and made anew when one of them has changed."""
 
     def __init__(self, tensors: Iterable[Mapping[str, Tensor | None]]) -> None:
         self._contents = Contents(tensors)

@@ -23,6 +23,7 @@ from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.times import check_period, probe_times
+from sympflow.show.cards import Card, Shown, cut, numbers
 
 if TYPE_CHECKING:
     import sympy
@@ -33,6 +34,18 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import Kick
 
 MOST_DEGREES = 1_000_000
+UNNAMED = "custom"
+TYPESET = 400
+"""Characters of an H that notebooks typeset."""
+GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
+PROPER = {"henon_heiles": "Hénon–Heiles"}
+SHOWN_NAMES = (
+    *("autonomous", "conservative", "damping", "domain", "dt", "energy_scale", "exact", "expression", "force"),
+    *("from_sympy", "gradient", "hamiltonian", "hessian", "kinetic", "lattice", "linear_part", "name", "ndof", "pairs"),
+    *("params", "period", "potential", "separable", "symbols", "t_span", "vector_field", "velocity"),
+    *("with_force", "with_params", "y0"),
+)
+"""The attributes that `dir` lists: those that users need. All others are for methods and studies."""
 MOST_WRITTEN_OUT = 400
 """Coordinates of an expression before a warning: 512 of a chain take 2 s to define, and a step 14 times as long."""
 
@@ -53,7 +66,7 @@ class Parameters(dict[str, Any]):
         return Parameters, (dict(self),)
 
 
-class HamiltonianSystem(Hamiltonian):
+class HamiltonianSystem(Hamiltonian, Shown):
     """A Hamiltonian system x' = J∇H(x), x = [q, p]; with `time` H(t, x); with `damping` p' = −∂H/∂q − Γp.
 
     Parameters
@@ -146,7 +159,7 @@ class HamiltonianSystem(Hamiltonian):
         time: bool = False,
         period: float | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "custom",
+        name: str = UNNAMED,
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 100.0),
@@ -198,7 +211,7 @@ class HamiltonianSystem(Hamiltonian):
         time: str | sympy.Symbol | None = None,
         period: float | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "custom",
+        name: str = UNNAMED,
         domain: Domain | None = None,
         y0: ArrayLike | None = None,
         t_span: tuple[float, float] = (0.0, 100.0),
@@ -843,7 +856,39 @@ class HamiltonianSystem(Hamiltonian):
             kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
-        return f"<HamiltonianSystem {self.name}({params}): {self.ndof} degree(s) of freedom, {kind}>"
+        degrees = f"{self.ndof:,} degree{'s' * (self.ndof > 1)} of freedom"
+        named = self.title if self.name == UNNAMED and self.symbols is not None else f"{self.name}({params})"
+        return f"<HamiltonianSystem {named}: {degrees}, {kind}>"
+
+    @property
+    def title(self) -> str:
+        """The name and the parameters as they are printed; H where the name says nothing."""
+        params = parameters_text(self.params, GREEK, " = ")
+        name = PROPER.get(self.name, self.name.replace("_", " "))
+        if self.name == UNNAMED and self.symbols is not None:
+            name = cut(f"H = {self.symbols.written[0]}", 60)
+        return name + (f", {params}" if params else "")
+
+    def card(self) -> Card:
+        H, formula = "" if self.symbols is None else str(self.symbols.H), ""
+        if 0 < len(H) <= TYPESET:
+            import sympy
+
+            formula = "H = " + sympy.latex(self.symbols.H)  # type: ignore[union-attr]
+        facts = {
+            "H": "" if formula else H,
+            "parameters": parameters_text(self.params, GREEK, " = "),
+            "degrees of freedom": f"{self.ndof:,}",
+            "structure": repr(self).rsplit("freedom, ", 1)[-1].rstrip(">"),
+            "y0": "" if self.y0 is None else numbers(self.y0),
+            "t_span": f"{self.t_span[0]:g} … {self.t_span[1]:g}",
+            "dt": "" if self._dt is None else f"{self._dt:g}",
+            "domain": "" if self.domain is None else repr(self.domain),
+        }
+        return Card(self.title, facts, formula=formula)
+
+    def __dir__(self) -> list[str]:
+        return [*SHOWN_NAMES]
 
 
 def _check_no_time(time: object) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -11,11 +11,11 @@ import numpy as np
 
 from sympflow.arguments import as_float, check_t_span
 from sympflow.arrays import Array, is_tensor, readable, to_numpy
-from sympflow.hamiltonian.scales import known_scale, smallest_size, weights
+from sympflow.hamiltonian.scales import default_step, known_scale, smallest_size, weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
-from sympflow.integrators.registry import build, check_applies
+from sympflow.integrators.registry import build, check_applies, get
 from sympflow.systems.given import given_system
 
 TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
@@ -96,6 +96,40 @@ def _falls_to_the_origin(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     return bool(
         np.isfinite(V).all() and (V < 0).all() and (np.diff(V, axis=0) < 0).all() and (V[-1] < 100 * V[2]).all()
     )
+
+
+def integrator_for(
+    system: HamiltonianSystem,
+    method: Any,
+    options: Mapping[str, Any],
+    t_span: tuple[float, float],
+    y0: np.ndarray,
+    flows: bool = True,
+) -> Integrator:
+    """The integrator of functions that follow orbits: a method with its options, else the one that suits the system.
+
+    Its steps are equal in t. With `tol` among the options it is chosen, or has the step, for that energy error.
+    """
+    given = dict(options)
+    tol = given.pop("tol", None)
+    if tol is not None:
+        check_tolerance(tol, "energy")
+    if method is None:
+        integrator, _ = choose_method(system, y0, given, tol, False, flows)
+    else:
+        takes_tol = isinstance(method, str) and "tol" in get(method).options()
+        integrator = build(method, dict(options) if takes_tol else given)
+    if tol is not None and "tol" not in integrator.options():
+        problem = Problem(system, *t_span, y0)
+        return replace(integrator, dt=step_for(integrator, problem, tol))  # type: ignore[type-var]
+    return with_step(integrator, system, y0)
+
+
+def with_step(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray) -> Integrator:
+    """The integrator, with a step chosen at the states y0 where neither it nor the system has one."""
+    if not (system.step_is_open and isinstance(integrator, FixedStep)) or integrator.trained or integrator.dt:
+        return integrator
+    return replace(integrator, dt=default_step(system, y0))
 
 
 # the step ------------------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from enum import Enum
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -43,6 +43,7 @@ from sympflow.arrays import Array, is_tensor, jvp, to_numpy
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.progress import Progress
+from sympflow.show.cards import cut
 
 if TYPE_CHECKING:
     from sympflow.flow.flow_map import FlowMap
@@ -419,3 +420,14 @@ def differentiated(
 @cache
 def _field_names(cls: type) -> tuple[str, ...]:
     return tuple(f.name for f in fields(cls))
+
+
+def method_text(integrator: Integrator, dt: float | None = None) -> str:
+    """A method and its options in words: those that differ from the defaults, and the step."""
+    known: tuple[Field[Any], ...] = fields(integrator)  # type: ignore[arg-type]
+    given = {f.name: (getattr(integrator, f.name), f.default) for f in known if f.init and f.repr}
+    options = {name: value for name, (value, default) in given.items() if value is not None and value != default}
+    if dt is not None:
+        options["dt"] = dt
+    shown = (f"{name} = {v:.6g}" if isinstance(v, float) else f"{name} = {v}" for name, v in options.items())
+    return ", ".join([integrator.label, *(cut(text, 40) for text in shown)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +13,7 @@ import numpy as np
 
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
 
 if TYPE_CHECKING:
@@ -36,6 +38,9 @@ H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
 
 
+TOO_LONG = 0.25
+"""Energy error, over the size of the energy, of a run whose step is too long."""
+LARGE = 200  # degrees of freedom
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 """The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
 that share of errors there is told."""
@@ -250,6 +255,42 @@ def _end(
         outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], np.nan)
     else:
         outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)
+
+
+def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem, stacklevel: int) -> None:
+    """Warn where the energy of a run with fixed steps is off by more than `TOO_LONG` of its size.
+
+    H is evaluated at the start and a few outputs, of large systems at one for every 200 steps. Its size is the largest
+    of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
+    """
+    system, n = problem.system, len(outcome.t)
+    if not isinstance(integrator, FixedStep) or integrator.trained or not (system.conservative and system.autonomous):
+        return
+    seen = LOOKED_AT if system.ndof <= LARGE else min(LOOKED_AT, outcome.stats.get("n_steps", 0) // 200)
+    if not n or not seen or problem.letters is not None or problem.system.between_impulses is not problem.system:
+        return
+    width = 2 * system.ndof
+    every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
+    y = np.concatenate(
+        [to_numpy(part).reshape(-1, math.prod(problem.y0.shape[:-1]), width) for part in (problem.y0, outcome.y[every])]
+    )[:, :LOOKED_AT].astype(float)
+    with np.errstate(all="ignore"):
+        try:
+            H = np.asarray(system.hamiltonian(y))
+            change = np.abs(H - H[0]).max(0)
+            if not (change > TOO_LONG * np.abs(H[0])).any():
+                return
+            size = 0.5 * np.abs(y * np.asarray(system.gradient(y))).sum(-1).max(0)
+        except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
+            return
+        off = np.max(change / np.maximum(size, system.energy_scale or 0.0), initial=0.0)
+    if TOO_LONG < off < np.inf:
+        warnings.warn(
+            f"`dt` {integrator.step_length(system):g} is too long for method {integrator.label!r}: the energy of the "
+            f"run is off by {100 * off:.2g} %. Take a shorter step, or tol=1e-6, for which it is chosen.",
+            RuntimeWarning,
+            stacklevel=stacklevel + 1,
+        )
 
 
 def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem, told: bool = False) -> None:

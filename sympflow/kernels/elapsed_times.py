@@ -33,6 +33,7 @@ EPS = 2.0**-52
 MOST_TRIALS = 80
 MOST_AT_ONCE = 1024  # steps between two looks
 CLOSE = 1e-3  # of the elapsed time, beyond which a residual means that no step leads to that time
+LANES = 16  # trajectories side by side, in two registers or four, so that one need not wait for the other
 
 
 def reach_times(
@@ -80,7 +81,7 @@ def reach_times(
     if not isinstance(found, SplittingCode):
         return None
     (table, kinds), step = found.prepared(loops.rows(run_table(scheme, h))), _step(scheme, loops.values)
-    n_rows, width = len(y0), 1 if len(y0) == 1 else found.lanes
+    n_rows, width = len(y0), 1 if len(y0) == 1 else LANES
     function = found.kept(("reach", width), lambda: _compiled(found, width))
     out, counts = np.empty((len(times), n_rows, y0.shape[1] - 2)), np.zeros((n_rows, 2), dtype=np.int64)
     most, work = int(FEWEST + MANY * expected), int(expected * len(kinds) * system.ndof)

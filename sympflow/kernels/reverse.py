@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -157,11 +156,12 @@ class Recorded:
         found = zeros(groups * len(kinds) * code.size * width if slopes else 1)
         rows = np.zeros((n, code.n_values))
         name = ("slopes" if slopes else "reverse") + own
-        for (first, to), kept in reversed([*zip(pairwise(self._ends), self._histories[i.start], strict=True)]):
+        for (first, to), before in reversed([*zip(pairwise(self._ends), self._histories[i.start], strict=True)]):
+            kept = before
             if not self._whole:
-                running, kept = kept, self._room(n, to - first)
+                kept = self._room(n, to - first)
                 nothing = np.empty((n, 0, code.n_out)), np.empty(n, dtype=np.int64)
-                batch = Batch(y0, to, self._save[:0], *nothing, first, running, stop=stop, kept=kept)
+                batch = Batch(y0, to, self._save[:0], *nothing, first, before, stop=stop, kept=kept)
                 code.run(table, batch, False)
             chosen = slice(*self._save.searchsorted((first, to), "right").tolist())
             later, outputs, count = (

@@ -30,7 +30,7 @@ from scipy.linalg import cho_factor, cho_solve
 from sympflow.learning.models import Forced, FreeField, Linear, Model, VectorField
 from sympflow.learning.trajectories import Run, Trajectories
 from sympflow.schemes import Scheme, scheme_named
-from sympflow.training.least_squares import Damping
+from sympflow.training.least_squares import Damping, LinearModel, descend
 
 Field = Model | Forced | FreeField
 """A vector field with numbers θ."""
@@ -620,52 +620,46 @@ def minimized(
     stop: Stop = lambda: False,
 ) -> Fit:
     """Levenberg–Marquardt steps until `patience` of them together gain less than this share of the cost."""
-    level = Damping(damping, LEAST_DAMPING)
-    normal = problem.normal(theta, states)
-    scale = np.diagonal(normal.C).copy()
-    costs, reason = [normal.cost], "the iterations were used up"
-    for _ in range(iterations):
-        if not math.isfinite(costs[-1]):
-            reason = "the orbits are not finite at the start"
-            break
-        if stop():
-            reason = "it was stopped"
-            break
-        found = _stepped(problem, normal, theta, states, scale, level, costs[-1])
-        if found is None:
-            reason = "no step lowers the cost"
-            break
-        theta, states, normal = found
-        scale = np.maximum(scale, np.diagonal(normal.C))
-        costs.append(normal.cost)
-        if len(costs) > patience and normal.cost > (1 - gain) * costs[-1 - patience]:
-            reason = "it has converged"
-            break
-    return Fit(problem, theta, states, costs[-1], normal, costs, reason)
+    start = theta, states
+    known: dict[str, Any] = {"here": (start, problem.normal(*start)), "tried": (None, None)}
+
+    def normal_at(x: Any) -> Normal:
+        found = next((normal for point, normal in known.values() if point is x and normal is not None), None)
+        return problem.normal(*x) if found is None else found
+
+    def model_at(x: Any) -> _Arrow:
+        known["here"] = x, normal_at(x)
+        np.maximum(scale, np.diagonal(known["here"][1].C), out=scale)
+        return _Arrow(x, known["here"][1], scale, problem.frozen)
+
+    def cost(x: Any, attempt: int) -> float:
+        known["tried"] = x, None if attempt else problem.normal(*x)  # the first is mostly taken
+        return problem.cost(*x) if attempt else known["tried"][1].cost
+
+    scale, costs = np.diagonal(normal_at(start).C).copy(), [normal_at(start).cost]
+    if not math.isfinite(costs[0]):
+        return Fit(problem, theta, states, costs[0], normal_at(start), costs, "the orbits are not finite at the start")
+    options: Any = {"tries": TRIES, "iterations": iterations, "patience": patience, "gain": gain, "stop": stop}
+    end, reason = descend(start, costs, model_at, cost, damping=Damping(damping, LEAST_DAMPING), **options)
+    return Fit(problem, end[0], end[1], costs[-1], normal_at(end), costs, reason)
 
 
-def _stepped(
-    problem: Problem,
-    normal: Normal,
-    theta: np.ndarray,
-    states: np.ndarray,
-    scale: np.ndarray,
-    level: Damping,
-    before: float,
-) -> tuple[np.ndarray, np.ndarray, Normal] | None:
-    for attempt in range(TRIES):
-        solved = normal.solved(level.value, scale)
-        if solved is not None:
-            step, moved, promised = solved
-            trial = theta if problem.frozen else theta + step, states + moved
-            made = None if attempt else problem.normal(*trial)  # the first is mostly taken
-            after = problem.cost(*trial) if made is None else made.cost
-            gain = (before - after) / promised if promised > 0 and math.isfinite(after) else -1.0
-            if gain > 0:
-                level.accepted(gain)
-                return *trial, made or problem.normal(*trial)
-        level.rejected()
-    return None
+@dataclass(frozen=True)
+class _Arrow(LinearModel):
+    """The linear model at θ and the initial states, which are eliminated."""
+
+    x: tuple[np.ndarray, np.ndarray]
+    normal: Normal
+    scale: np.ndarray
+    frozen: bool
+
+    def trial(self, damping: float) -> Any:
+        solved = self.normal.solved(damping, self.scale)
+        if solved is None:
+            return None
+        step, moved, promised = solved
+        theta, states = self.x
+        return (theta if self.frozen else theta + step, states + moved), promised
 
 
 # starts and methods ---------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import sys
 import warnings
@@ -10,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +19,13 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import MAX_ASKED_VALUES, floats, plain
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.flow.scaling import Scaling
+from sympflow.show.cards import Card, Shown
+from sympflow.show.pictures import MOST_LINES, trajectory_figure
+from sympflow.show.style import saved
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 UNITS = {
     "1": 1.0, "rad": 1.0, "deg": np.pi / 180, "rev": 2 * np.pi,
@@ -64,8 +71,8 @@ class Run:
         return Run(self.t[start:stop], np.ascontiguousarray(self.y[:, start:stop]))
 
 
-@dataclass(frozen=True)
-class Trajectories:
+@dataclass(frozen=True, repr=False)
+class Trajectories(Shown):
     """Trajectories of one system, from which it is learned; made by `Trajectories.read`.
 
     Attributes
@@ -346,12 +353,37 @@ class Trajectories:
             raise ValueError(f"`span` must be positive; got {span!r}.")
         return replace(self, runs=tuple(piece for run in self.runs for piece in _cut(run, most, span)))
 
-    def __repr__(self) -> str:
+    def card(self) -> Card:
         spans = [run.span for run in self.runs]
-        return (
-            f"<{len(self.runs)} trajectories, ndof {self.ndof}, {self.n_points} points, "
-            f"{min(spans):.3g} to {max(spans):.3g} long>"
-        )
+        facts = {
+            "points": f"{self.n_points:,}",
+            "coordinates": ", ".join(self.names),
+            "durations": f"{min(spans):.3g} … {max(spans):.3g}",
+            "second half": "velocities" if self.velocities else "momenta",
+        }
+        return Card(f"{len(self.runs):,} trajectories", facts)
+
+    def preview(self) -> Figure | None:
+        return self.plot()
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
+        """Draw the samples of 16 trajectories at most: q₁ against q₂, or q over t, and q₁ against the second half.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+
+        Raises
+        ------
+        ImportError
+            Without matplotlib.
+        """
+        runs, d = self.runs[:MOST_LINES], self.ndof
+        most = max(run.n_points for run in runs)
+        t, y = np.full((len(runs), most), np.nan), np.full((len(runs), 2 * d, most), np.nan)
+        for k, run in enumerate(runs):
+            t[k, : run.n_points], y[k, :, : run.n_points] = run.t, run.y
+        return saved(trajectory_figure(t, y, None, f"{len(self.runs):,} trajectories", marker="."), path)
 
 
 def periods_of(period: Any, ndof: int) -> np.ndarray:

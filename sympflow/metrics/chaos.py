@@ -25,6 +25,7 @@ from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.show.cards import Card, Shown, numbers
 from sympflow.systems.given import given_system
 
 ALIGNED = 1e-12
@@ -35,8 +36,8 @@ BACKENDS = ("auto", "compiled", "array")
 LOG_2 = float(np.log(2.0))
 
 
-@dataclass(frozen=True)
-class Indicator:
+@dataclass(frozen=True, repr=False)
+class Indicator(Shown):
     """A chaos indicator of each orbit, at its end and at the times that were asked for.
 
     Attributes
@@ -64,6 +65,10 @@ class Indicator:
     t: np.ndarray = field(repr=False)
     history: np.ndarray = field(repr=False)
 
+    def card(self) -> Card:
+        facts = {"value": numbers(self.value), "t_end": numbers(self.t_end), "status": numbers(self.status)}
+        return Card("Indicator of chaos", facts, self.message)
+
     @property
     def success(self) -> bool:
         """True if no orbit failed."""
@@ -72,7 +77,7 @@ class Indicator:
 
 def lyapunov(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -94,8 +99,9 @@ def lyapunov(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
-        Splitting methods run compiled on symbolic systems; of others each step is differentiated, which takes longer.
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`. Splitting methods run compiled on
+        symbolic systems; of others each step is differentiated, which takes longer.
     t_span : (float, float), optional
         The default is the system's. With fixed steps the run ends with the last whole one.
     y0 : array_like of shape (..., 2d), optional
@@ -139,7 +145,7 @@ def lyapunov(
 
 def sali(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -192,7 +198,7 @@ def sali(
 
 def gali(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,

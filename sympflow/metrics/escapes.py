@@ -16,6 +16,7 @@ from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.show.cards import Card, Shown, numbers
 from sympflow.systems.given import given_system
 
 WINDOW = 256  # steps between which orbits that have left are put aside
@@ -25,8 +26,8 @@ HALVINGS = 48
 Outside = Callable[[np.ndarray], np.ndarray]
 
 
-@dataclass(frozen=True)
-class Escapes:
+@dataclass(frozen=True, repr=False)
+class Escapes(Shown):
     """When and where orbits left a region.
 
     Attributes
@@ -46,6 +47,10 @@ class Escapes:
     status: Any
     message: str
 
+    def card(self) -> Card:
+        facts = {"time": numbers(self.time), "state": numbers(self.state), "status": numbers(self.status)}
+        return Card("Escapes", facts, self.message)
+
     @property
     def success(self) -> bool:
         """True if no orbit failed."""
@@ -54,7 +59,7 @@ class Escapes:
 
 def escape_times(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -71,8 +76,8 @@ def escape_times(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
-        Of fixed steps.
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`; of fixed steps.
     t_span, y0
         As for `solve`; y0 may be a batch of shape (..., 2d).
     outside : float, domain or callable, optional

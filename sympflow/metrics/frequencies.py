@@ -15,6 +15,7 @@ from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.grid import Grid
 from sympflow.metrics.orbits import Orbits, checked_orbits
+from sympflow.show.cards import Card, Shown, numbers
 from sympflow.solver import solve
 from sympflow.systems.given import given_system
 
@@ -30,8 +31,8 @@ FAINTEST = 1e-13
 Signal = Callable[[np.ndarray], np.ndarray]
 
 
-@dataclass(frozen=True)
-class Frequencies:
+@dataclass(frozen=True, repr=False)
+class Frequencies(Shown):
     """The lines Σ_k a_k exp(iω_k (t − t0)) of signals along orbits.
 
     Attributes
@@ -51,6 +52,10 @@ class Frequencies:
     status: Any
     message: str
 
+    def card(self) -> Card:
+        facts = {"frequencies": numbers(self.frequencies), "amplitudes": numbers(np.abs(self.amplitudes))}
+        return Card("Frequencies", {**facts, "status": numbers(self.status)}, self.message)
+
     @property
     def success(self) -> bool:
         """True if no orbit failed."""
@@ -59,7 +64,7 @@ class Frequencies:
 
 def frequencies(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -80,7 +85,8 @@ def frequencies(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`.
     t_span : (float, float), optional
         The default is the system's. Choose ten periods or more.
     y0 : array_like of shape (..., 2d), optional

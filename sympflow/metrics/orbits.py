@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import check_t_span
 from sympflow.arrays import is_tensor
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.choosing import integrator_for
 from sympflow.integrators.contract import Integrator
-from sympflow.integrators.registry import build, check_applies
+from sympflow.integrators.registry import check_applies
 from sympflow.solver import check_y0
 from sympflow.systems.given import given_system
 
@@ -52,11 +53,11 @@ def checked_orbits(
         For bad arguments, and where the method does not apply to the system.
     """
     system = given_system(system)
-    integrator = build(method, dict(options))
     span = check_t_span(system.t_span if t_span is None else t_span)
     if is_tensor(y0):
         raise TypeError(f"`y0` is a tensor, but {purpose} NumPy arrays: pass y0.numpy().")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
+    integrator = integrator_for(system, method, options, span, start)
     integrator = integrator.resolved(system, start, abs(span[1] - span[0]))
     check_applies(integrator, system, start)
     return Orbits(system, integrator, span, start)

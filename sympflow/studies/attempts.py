@@ -245,6 +245,14 @@ class Row:
         return f"Row({', '.join(filled)})"
 
 
+@contextmanager
+def any_step() -> Iterator[None]:
+    """Run without warnings of steps that are too long: studies sweep these, and a row has its energy error."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`dt` .* is too long")
+        yield
+
+
 # attempts ---------------------------------------------------------------------------------------------------------
 
 
@@ -293,7 +301,8 @@ class Attempt:
         try:
             if self.candidate.problem:
                 raise ImportError(self.candidate.problem)
-            found = run(integrator)
+            with any_step():
+                found = run(integrator)
             self.sols = (found,) if isinstance(found, Solution) else tuple(found)
             sol = self.sols[0]  # `sol.integrator` may be another than was asked for: see `Integrator.resolved`
             trained = sol.integrator.figures(sol.system).get("training_seconds") if sol.integrator.trained else None
@@ -459,11 +468,12 @@ def interleaved(calls: Sequence[Callable[[], object]], repeats: int) -> list[Run
     if not calls:
         return []
     passed = np.empty((repeats, len(calls)))
-    for r in range(repeats):
-        for i, call in enumerate(calls):
-            start = time.perf_counter()
-            call()
-            passed[r, i] = time.perf_counter() - start
+    with any_step():
+        for r in range(repeats):
+            for i, call in enumerate(calls):
+                start = time.perf_counter()
+                call()
+                passed[r, i] = time.perf_counter() - start
     low, median, high = np.quantile(passed, [0.25, 0.5, 0.75], axis=0)
     return [RunTime(float(m), float(h - lo)) for lo, m, h in zip(low, median, high, strict=True)]
 

@@ -33,7 +33,7 @@ from sympflow.studies.attempts import (
     shown_compile_time,
     tolerance_of,
 )
-from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
+from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table
 from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
@@ -380,7 +380,7 @@ def matched(
 # the report -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison(Report):
     """Methods side by side on one system.
 
@@ -432,7 +432,7 @@ class Comparison(Report):
     @property
     def title(self) -> str:
         """The scene in a line."""
-        return title(self.system)
+        return self.system.title
 
     def table(self, width: int | None = None) -> str:
         """The rows as text, with the settings above and the reasons below.

@@ -15,10 +15,7 @@ from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
-from sympflow.solution import Solution
-from sympflow.solver import solve
-from sympflow.studies.attempts import Attempt, Row
-from sympflow.studies.figure_style import (
+from sympflow.show.style import (
     TEXT,
     dress,
     filled,
@@ -29,6 +26,9 @@ from sympflow.studies.figure_style import (
     new_figure,
     save,
 )
+from sympflow.solution import Solution
+from sympflow.solver import solve
+from sympflow.studies.attempts import Attempt, Row, any_step
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -361,7 +361,8 @@ def _phase_points(comparison: Compared, integrator: Any) -> np.ndarray:
         found = crossings(integrator, system, comparison.t_span, starts, Plane(0, 0.0, 1), system.dt)
         return found.states[:, [1, 3]]
     t = comparison.t
-    sol = solve(system, integrator, comparison.t_span, comparison.y0, t_eval=t, on_domain_exit="ignore")
+    with any_step():
+        sol = solve(system, integrator, comparison.t_span, comparison.y0, t_eval=t, on_domain_exit="ignore")
     return to_numpy(sol.states).reshape(-1, 2 * system.ndof)[:, [0, 1]]
 
 

@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.arguments import check_counts
+from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
 from sympflow.integrators.registry import name_of
 from sympflow.metrics.crossings import Crossings, Plane, crossings, stroboscopic, whole_periods
 from sympflow.metrics.orbits import Orbits, checked_orbits
-from sympflow.studies.figure_style import saved
-from sympflow.studies.reports import Column, Report, described, text_table, title
+from sympflow.show.style import saved
+from sympflow.studies.reports import Column, Report, described, text_table
 from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
 
 def poincare_section(
     system: HamiltonianSystem,
-    method: Any = "sympflow",
+    method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
     *,
@@ -36,6 +38,9 @@ def poincare_section(
     direction: int | None = None,
     sample: float | None = None,
     period: float | None = None,
+    energy: float | None = None,
+    n: int | None = None,
+    seed: int = 0,
     **options: Any,
 ) -> PoincareSection:
     """The states in which trajectories cross the plane y[coordinate] = level, or those after each period.
@@ -49,7 +54,8 @@ def poincare_section(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str, Integrator or trained flow
+    method : str, Integrator or trained flow, optional
+        By default one that suits the system, as for `solve`.
     t_span : (float, float), optional
         The default is the system's.
     y0 : array_like of shape (..., 2d), optional
@@ -69,6 +75,13 @@ def poincare_section(
     period : float, optional
         T, for a stroboscopic section; by default that of a driven system. Not together with a plane. Fixed steps become
         the largest up to `dt` that divides T; trained flows keep theirs.
+    energy : float, optional
+        In place of `y0`: orbits that start on the plane with this H. Their sections do not cross, for two degrees of
+        freedom, as those of different energies do.
+    n : int, optional
+        Orbits of this energy; by default 16.
+    seed : int
+        Of their starts, which are drawn at random.
     **options
         Options of the method.
 
@@ -86,9 +99,9 @@ def poincare_section(
     --------
     >>> import sympflow
     >>> system = sympflow.systems.henon_heiles()
-    >>> section = poincare_section(system, "kahan_li8", (0, 100))
-    >>> section.states.shape[1]
-    4
+    >>> section = poincare_section(system, "kahan_li8", (0, 100), energy=0.125, n=5)
+    >>> system.hamiltonian(section.y0).round(12).tolist()
+    [0.125, 0.125, 0.125, 0.125, 0.125]
     """
     system = given_system(system)
     plane = {"coordinate": coordinate, "level": level, "direction": direction, "sample": sample}
@@ -100,7 +113,6 @@ def poincare_section(
             raise ValueError(f"`t_span` ({t0:g}, {t1:g}) is shorter than the period {T:g}: choose a later end.")
         seen = stroboscopic(orbits.integrator, system, orbits.t_span, orbits.rows, T)
         return _section(orbits, seen, T)
-    orbits = checked_orbits(system, method, t_span, y0, options, "crossings are located on")
     index = _check_coordinate(0 if coordinate is None else coordinate, system.ndof)
     direction = 1 if direction is None else direction
     if direction not in (-1, 0, 1):
@@ -108,12 +120,90 @@ def poincare_section(
     level = 0.0 if level is None else level
     if not (_is_number(level) and math.isfinite(level)):
         raise ValueError(f"`level` must be a finite number, the value of the coordinate on the plane; got {level!r}.")
+    if energy is not None:
+        if y0 is not None:
+            raise ValueError("`energy` and `y0` both choose the initial states: give one of them.")
+        y0 = states_of_energy(system, energy, 16 if n is None else n, Plane(index, float(level), direction), seed)
+    elif n is not None:
+        raise ValueError("`n` orbits are drawn for an `energy`: give it, or the states `y0`.")
+    orbits = checked_orbits(system, method, t_span, y0, options, "crossings are located on")
     sample = system.dt if sample is None else sample
     if not (_is_number(sample) and sample > 0):
         raise ValueError(f"`sample` must be a positive number, a time; got {sample!r}.")
     where = Plane(index, float(level), direction)
     seen = crossings(orbits.integrator, system, orbits.t_span, orbits.rows, where, float(sample))
     return _section(orbits, seen, where)
+
+
+FINE = 1.05 ** np.arange(-150, 280)
+"""Distances at which rays are tried, from 1e-3 to 1e6 times the one at which the first of them has the energy."""
+
+
+def states_of_energy(system: HamiltonianSystem, energy: float, n: int, plane: Plane, seed: int = 0) -> np.ndarray:
+    """Return n states (n, 2d) on a plane with H = energy, which cross it in its direction.
+
+    They lie on rays from the lowest of a few states on the plane, within the first place where the energy is reached;
+    the coordinate that is conjugate to that of the plane then makes up for the rest of the energy.
+
+    Raises
+    ------
+    ValueError
+        If the system is driven, or no state of this energy is found.
+    """
+    system.check_autonomous("so no `energy` is that of an orbit", "pass `y0`")
+    if not (_is_number(energy) and math.isfinite(energy)):
+        raise ValueError(f"`energy` must be a finite number, a value of H; got {energy!r}.")
+    check_counts(n=n)
+    d, rng, factors = system.ndof, np.random.default_rng(seed), weights(system)
+    c, partner = plane.coordinate, (plane.coordinate + d) % (2 * d)
+
+    def H(y: np.ndarray) -> np.ndarray:
+        return np.asarray(system.hamiltonian(y))
+
+    def reached(starts: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Distances (n,) along rays at which the energy is first reached; NaN where it is not."""
+        coarse = 2.0 ** np.arange(-900.0, 900.0, 2.0)
+        exceeded = (H(starts + coarse[:, None, None] * rays) > energy).any(1)
+        steps = coarse[exceeded.argmax()] * FINE
+        over = H(starts + steps[:, None, None] * rays) > energy
+        first = over.argmax(0)
+        low, high = np.where(first > 0, steps[np.maximum(first - 1, 0)], 0.0), steps[first]
+        for _ in range(60):
+            middle = (low + high) / 2
+            beyond = H(starts + middle[:, None] * rays) > energy
+            low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+        return np.where(over.any(0), low, np.nan)
+
+    known = [np.zeros(2 * d)] if system.y0 is None else [np.zeros(2 * d), system.y0]
+    candidates = np.array(known if system.domain is None else [*known, *system.domain.sample(64, seed)])
+    candidates[:, c], candidates[:, partner] = plane.level, 0.0
+    with np.errstate(all="ignore"):
+        values = H(candidates)
+        lowest = candidates[np.nanargmin(values)] if np.isfinite(values).any() else candidates[0]
+        if not H(lowest) < energy:
+            raise ValueError(
+                f"`energy` {energy:g} is below H = {float(H(lowest)):g}, the lowest of the states that were tried on "
+                "the plane: raise it, or pass `y0`."
+            )
+        rays = rng.standard_normal((n, 2 * d))
+        rays[:, [c, partner]] = 0.0
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-300) * factors
+        y = np.broadcast_to(lowest, (n, 2 * d)).copy()
+        if d > 1:
+            y += (reached(y, rays) * rng.uniform(size=n) ** (1 / (2 * d - 2)))[:, None] * rays
+        up = np.zeros((n, 2 * d))
+        up[:, partner] = 1 / factors[partner]
+        for sign in (1.0, -1.0):
+            ends = y + sign * reached(y, sign * up)[:, None] * up
+            way = np.sign(np.asarray(system.vector_field(ends))[:, c])
+            if plane.direction == 0 or (way == plane.direction).mean() > 0.5:
+                break
+    if not np.isfinite(ends).all():
+        raise ValueError(
+            f"`energy` {energy:g} does not bound the states on the plane: along a ray no state has it. Lower it, or "
+            "pass `y0`."
+        )
+    return ends
 
 
 def _checked_period(system: HamiltonianSystem, period: float | None, plane: list[str]) -> float | None:
@@ -156,7 +246,7 @@ def _section(orbits: Orbits, seen: Crossings, where: Plane | float) -> PoincareS
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PoincareSection(Report):
     """The crossings of a plane, or the states after each period; those of each trajectory together, in order of time.
 
@@ -289,7 +379,7 @@ class PoincareSection(Report):
             if not (_is_number(turn) and 0 < turn < math.inf):
                 raise ValueError(f"`turn` must be positive and finite, such as 2*pi; got {turn!r}.")
             points[:, 0] -= turn * np.rint(points[:, 0] / turn)
-        heading = f"{title(self.system)}, {name_of(self.integrator)}: {self._seen}"
+        heading = f"{self.system.title}, {name_of(self.integrator)}: {self._seen}"
         return section_figure(points, self.trajectory, len(self.y0), (label[i], label[j]), heading)
 
     @property

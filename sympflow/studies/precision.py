@@ -21,12 +21,12 @@ from sympflow.metrics.energy import failed
 from sympflow.metrics.energy_balance import jumps_in_time
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
+from sympflow.show.style import saved
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, shown_compile_time, tolerance_of
-from sympflow.studies.figure_style import saved
-from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table, title
+from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table
 from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
@@ -289,6 +289,10 @@ def _reference(conditions: Conditions) -> tuple[Reference | None, str]:
         return None, str(problem)
 
 
+SETTINGS = ("dt", "tolerance")
+"""What is chosen of a method."""
+
+
 # read off the points --------------------------------------------------------------------------------------------------
 
 
@@ -321,22 +325,24 @@ def _figure(point: Row, measure: str) -> float:
 def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure: str = "energy_error") -> float:
     """Return the cost of one method for an error: between two of its points by interpolation of the logarithms.
 
-    The cheapest point that is more accurate is taken where that costs less; inf if no point is accurate enough.
+    The cheapest point that is more accurate is taken where that costs less; inf if no point is accurate enough. A step
+    or a tolerance is the largest that reaches the error.
     """
     known = [(getattr(p, measure), getattr(p, cost)) for p in points]
     known = sorted((e, c) for e, c in known if e and c and math.isfinite(e))
-    enough = min((c for e, c in known if e <= error), default=math.inf)
+    best = max if cost in SETTINGS else min
+    enough = best((c for e, c in known if e <= error), default=math.inf)
     for (e0, c0), (e1, c1) in pairwise(known):
         if e0 <= error <= e1 and e0 < e1:
             share = math.log(error / e0) / math.log(e1 / e0)
-            enough = min(enough, c0 * (c1 / c0) ** share)
+            enough = best(enough, c0 * (c1 / c0) ** share)
     return enough
 
 
 # the report -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class WorkPrecision(Report):
     """Error against cost on one system.
 
@@ -365,7 +371,7 @@ class WorkPrecision(Report):
     @property
     def title(self) -> str:
         """The scene in a line."""
-        return title(self.system)
+        return self.system.title
 
     @property
     def measure(self) -> str:
@@ -401,6 +407,7 @@ class WorkPrecision(Report):
                 found = [cost_at([r for r in rows if r.label == label], level, cost, self.measure) for label in labels]
                 head = f"{level:.0e}" if cost == "run_time" else "forces"
                 columns.append(Column(head, [show(x) if math.isfinite(x) else "–" for x in found]))
+            columns.append(Column("step", [self._setting([r for r in rows if r.label == n], level) for n in labels]))
         first = {row.label: row for row in reversed(rows)}
         first = {label: first[label] for label in labels}
         trained = {row.label: row for row in rows if row.training_time is not None}
@@ -409,6 +416,11 @@ class WorkPrecision(Report):
         columns.append(Column("paid after t =", paid))
         columns.append(Column("compiled in", [shown_compile_time(r) for r in first.values()]))
         return text_table(columns)
+
+    def _setting(self, rows: list[Row], level: float) -> str:
+        """The step with which a method reaches a level, or its tolerance."""
+        step, rtol = (cost_at(rows, level, setting, self.measure) for setting in SETTINGS)
+        return f"rtol {rtol:.0e}" if rtol < math.inf else f"{step:.2g}" if step < math.inf else ""
 
     def _points(self) -> str:
         rows = self.rows

@@ -17,18 +17,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import naming_path, writable
-from sympflow.hamiltonian.system import parameters_text
+from sympflow.show.cards import Card, Shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from sympflow.hamiltonian.system import HamiltonianSystem
 
-_GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
-_NAMES = {"henon_heiles": "Hénon–Heiles"}
 
-
-class Report(ABC):
+class Report(Shown, ABC):
     """The result of a study. A subclass gives its rows, settings, table and figure."""
 
     columns: ClassVar[tuple[str, ...]]
@@ -52,6 +49,12 @@ class Report(ABC):
     def figure(self) -> Figure:
         """The rows as a matplotlib figure."""
 
+    def card(self) -> Card:
+        return Card("", text=self.table())
+
+    def preview(self) -> Figure | None:
+        return self.figure()
+
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the rows to a CSV file, every figure to full precision."""
         return write_csv(self.rows, path, self.columns)
@@ -63,12 +66,6 @@ class Report(ABC):
     def to_dict(self) -> dict[str, Any]:
         """The settings, and the rows as dictionaries."""
         return {**self.settings(), "rows": records(self.rows, self.columns)}
-
-
-def title(system: HamiltonianSystem) -> str:
-    """The name and parameters of a system, as they are printed."""
-    params = parameters_text(system.params, _GREEK, " = ")
-    return _NAMES.get(system.name, system.name.replace("_", " ")) + (f", {params}" if params else "")
 
 
 def described(system: HamiltonianSystem) -> dict[str, Any]:

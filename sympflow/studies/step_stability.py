@@ -22,12 +22,12 @@ from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.linear_stability import LinearStability, SmallOscillations, of_method, small_oscillations
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
+from sympflow.show.style import saved
 from sympflow.solution import Solution
 from sympflow.solver import check_y0, solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Metric, Row, candidates
-from sympflow.studies.figure_style import saved
-from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table, title
+from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table
 from sympflow.systems.given import given_system
 
 if TYPE_CHECKING:
@@ -156,15 +156,16 @@ def stability(
         small = small_oscillations(one, starts[0], partial(_orbit, one, starts[0], span)) if limits else None
         for candidate in candidates(methods):
             for dtype in dtypes:
-                say = partial(_say, progress, f"{title(one)}: {candidate.label}, {dtype}")
+                say = partial(_say, progress, f"{one.title}: {candidate.label}, {dtype}")
                 study = Study(
                     one, candidate, dtype, span, starts, tuple(metrics), bound, min_steps, max_steps, say, small
                 )
                 say("")
-                own = [study.row(h) for h in study.lengths(lengths)]
-                rows += own
-                if limits and study.has_steps and any(_ran(row) for row in own):
-                    found.append(step_limit(study, own))
+                with attempts.any_step():
+                    own = [study.row(h) for h in study.lengths(lengths)]
+                    rows += own
+                    if limits and study.has_steps and any(_ran(row) for row in own):
+                        found.append(step_limit(study, own))
     return StabilityReport(family, tuple(metrics), float(bound), tuple(rows), tuple(found))
 
 
@@ -313,7 +314,7 @@ class Study:
         """Run all initial states with one step; the row has the largest energy error, and the status."""
         params = self.system.params
         row = Row(
-            title(self.system),
+            self.system.title,
             self.candidate.method,
             self.candidate.label,
             parameter=next(iter(params), None),
@@ -533,7 +534,7 @@ def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
         error = study.stable(low / PRECISION if study.known else low)[1]
     c, params, linear = study.candidate, study.system.params, study.linear
     return StepLimit(
-        title(study.system),
+        study.system.title,
         next(iter(params), None),
         next(iter(params.values()), None),
         c.method,
@@ -700,7 +701,7 @@ class StepLimit:
     intervals: tuple[tuple[float, float], ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StabilityReport(Report):
     """Methods and steps on a system or a family of them.
 

@@ -10,8 +10,8 @@ import numpy as np
 OPTIONS = {"error_model": "numpy", "fastmath": {"contract"}}
 
 
-def pair_functions(pair: Callable[..., Any], strength: np.ndarray, dimension: int) -> dict[str, Any]:
-    """V, ∇V and ∇²V·v of V(q) = Σ_{i<j} strength_ij·u(|q_i − q_j|²), q = [q_1, …, q_n] in `dimension` coordinates each.
+def pair_functions(pair: Callable[..., Any], strength: np.ndarray, dim: int) -> dict[str, Any]:
+    """V, ∇V and ∇²V·v of V(q) = Σ_{i<j} strength_ij·u(|q_i − q_j|²), q = [q_1, …, q_n] in `dim` coordinates each.
 
     Parameters
     ----------
@@ -19,7 +19,7 @@ def pair_functions(pair: Callable[..., Any], strength: np.ndarray, dimension: in
         s ↦ (u, u′, u″) at s = r².
     strength : ndarray of shape (n, n)
         Its upper triangle is used.
-    dimension : int
+    dim : int
 
     Returns
     -------
@@ -39,7 +39,7 @@ def pair_functions(pair: Callable[..., Any], strength: np.ndarray, dimension: in
             "potential of a pair to HamiltonianSystem.pairs."
         ) from error
 
-    n, D = len(strength), dimension
+    n, D = len(strength), dim
     strength = np.ascontiguousarray(strength, dtype=float)
 
     @njit(**OPTIONS)

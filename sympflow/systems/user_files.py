@@ -9,6 +9,7 @@ import os
 import sys
 import tomllib
 from collections.abc import Callable
+from copy import copy
 from functools import cache, wraps
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +17,7 @@ from typing import Any
 
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
 from sympflow.hamiltonian.lattice_states import LatticeStates
-from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.hamiltonian.system import UNNAMED, HamiltonianSystem
 
 DOMAINS: dict[str, tuple[str, ...]] = {
     "Ball": ("center", "radius"),
@@ -114,7 +115,7 @@ def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[.
         raise ValueError(f"`system` {name!r} is not in {str(file)!r}.{hint} {has}")
     found = vars(module)[name]
     if isinstance(found, HamiltonianSystem):
-        return lambda: found
+        return lambda: _named(found, f"{file.name}:{name}")
     if not callable(found):
         raise ValueError(
             f"`system` {name!r} in {str(file)!r} must be a HamiltonianSystem, or a function that returns one; it is "
@@ -144,9 +145,18 @@ def _answering(function: Callable[..., Any], name: str, file: Path) -> Callable[
             raise ValueError(f"{where} failed ({_described(error, file)}): mend it.") from error
         if not isinstance(system, HamiltonianSystem):
             raise ValueError(f"{where} must return a HamiltonianSystem; it returns {type(system).__name__}: mend it.")
-        return system
+        return _named(system, f"{file.name}:{name}")
 
     return make
+
+
+def _named(system: HamiltonianSystem, name: str) -> HamiltonianSystem:
+    """The system, by the name that it has in its file where it has none of its own."""
+    if system.name != UNNAMED:
+        return system
+    system = copy(system)
+    system.name = name
+    return system
 
 
 def _of_toml(file: Path, name: str | None) -> Callable[..., HamiltonianSystem]:

@@ -42,13 +42,7 @@ def identity(flow: FlowMap, system: HamiltonianSystem, config: dict[str, Any]) -
 
 
 def read_same(path: str | os.PathLike[str], mine: dict[str, Any]) -> dict[str, Any]:
-    """`read`, of a run with this identity; how often it writes checkpoints may differ.
-
-    Raises
-    ------
-    ValueError
-        If it is another run; the message names what differs.
-    """
+    """`read`, of a run with this identity; how often it writes checkpoints may differ."""
     state = read(path)
     theirs, ours = (json.loads(run["config"]) for run in (state, mine))
     names = (set(theirs) | set(ours)) - {"checkpoint_every"}
@@ -97,13 +91,7 @@ def write(path: str | os.PathLike[str], state: dict[str, Any]) -> None:
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The state in a checkpoint; only tensors and plain values are ever loaded.
-
-    Raises
-    ------
-    ValueError
-        If the file is not a whole checkpoint of this format.
-    """
+    """The state in a checkpoint; only tensors and plain values are ever loaded."""
     if not Path(path).is_file():
         raise ValueError(f"`resume` {str(path)!r} is not a file: pass the path that was given as checkpoint=.")
     try:

@@ -21,6 +21,7 @@ from sympflow.hamiltonian.time_transformation import default_shift, lifted, proj
 from sympflow.integrators.flows import LogSympFlow
 from sympflow.metrics.energy import max_energy_error
 from sympflow.solver import solve
+from sympflow.training.fits import ClockedFit
 from sympflow.training.points import Stream, states, step_errors
 
 TOLERANCE = 1e-13
@@ -28,33 +29,11 @@ NEWTON_STEPS = 5  # to the nearest point of an orbit
 FRACTIONAL_TIMES = 50
 
 
-def train_clock(
-    system: HamiltonianSystem,
-    dt: float,
-    scheme: str = "leapfrog",
-    terms: int = 10,
-    points: int = 100,
-    label_times: int = 12,
-    seed: int = 0,
-) -> ClockedFlow:
-    """A flow with a trained clock for a separable system, with its record.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        With a domain.
-    dt : float
-        The physical length of the longest step, as the `dt` of methods by the clock "logarithmic".
-    scheme, terms
-        See `ClockedFlow`.
-    points, label_times, seed : int
-        Seeded states of the domain, and steps in (0, Δ] at which each is labelled.
-
-    Raises
-    ------
-    ValueError
-        If the system has no domain.
-    """
+def train_clock(system: HamiltonianSystem, fit: ClockedFit | None = None) -> ClockedFlow:
+    """A flow with a trained clock for a separable system with a domain, with its record."""
+    fit = ClockedFit() if fit is None else fit
+    dt, points, label_times, seed = 1.0 if fit.dt is None else fit.dt, fit.points or 1, fit.label_times, fit.seed
+    scheme, terms = fit.scheme, fit.terms
     if system.domain is None:
         raise ValueError(f"`system` {system.name!r} has no domain to sample: give it one.")
     started, cpu = time.perf_counter(), time.process_time()

@@ -18,14 +18,14 @@ import numpy as np
 
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.options import NewFit, check_counts
+from sympflow.training.fits import PrimedFit
 from sympflow.training.points import Stream, states
 from sympflow.training.starts import frequency
 from sympflow.training.table_fit import RunsFit, Table
 from sympflow.training.table_step import Check
 
 if TYPE_CHECKING:
-    from sympflow.training.lattice_fit import Piece
+    from sympflow.training.lattice_fit import LatticePiece
 
 PERIODS, LOOKS = 25.0, 10
 """Length of a run in periods of the fastest waves, and how often its energy is looked at."""
@@ -34,20 +34,7 @@ PROBE = 1e-6
 
 
 class EnergyRuns(RunsFit):
-    """Relative energy errors in runs of a lattice, as a function of the frozen parameters of a flow.
-
-    Parameters
-    ----------
-    flow : PrimedFlow
-        Of the system; its numbers are changed.
-    system : HamiltonianSystem
-        The lattice.
-    x : ndarray of shape (N, 2d)
-        Where the runs begin.
-    rest : float
-        H of the system at rest.
-    t_end : float
-    """
+    """Relative energy errors in runs of a lattice, as a function of the frozen parameters of a flow."""
 
     compiled = True
 
@@ -97,18 +84,17 @@ class EnergyRuns(RunsFit):
         return r, J
 
 
-def check_runs(system: HamiltonianSystem, asked: NewFit) -> None:
+def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
     """Raise ValueError unless a flow of the system can be fitted to the `runs` that are asked for."""
-    check_counts(runs=asked.runs)
     if not (system.local is not None and system.local.has_piece and system.conservative):
         raise ValueError(f"`runs` are of lattices that keep their energy, and {system.name!r} is none: leave it out.")
-    if asked.data is not None:
+    if fit.data is not None:
         raise ValueError(
             "`runs` begin in states of a larger piece of the system, and `data` are of itself: leave out one of them."
         )
 
 
-def runs_of(piece: Piece, runs: int, seed: int, fitted: PrimedFlow) -> EnergyRuns:
+def runs_of(piece: LatticePiece, runs: int, seed: int, fitted: PrimedFlow) -> EnergyRuns:
     """Return the energy errors in so many runs of a larger piece, by the numbers of a flow of the piece."""
     whole = piece.lattice
     assert whole.local is not None

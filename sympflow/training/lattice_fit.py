@@ -41,20 +41,8 @@ def on_piece(system: HamiltonianSystem) -> bool:
 
 
 @dataclass(frozen=True)
-class Piece:
-    """The few sites that a flow of a lattice is fitted on.
-
-    Attributes
-    ----------
-    lattice : HamiltonianSystem
-        The lattice.
-    few : HamiltonianSystem
-        The piece as a lattice, the lattice itself where that is small.
-    system, domain : HamiltonianSystem, Domain
-        The piece by its coordinates, and the states to fit on.
-    states : LatticeStates
-        Those of the same density, of any size.
-    """
+class LatticePiece:
+    """The few sites that a flow of a lattice is fitted on."""
 
     lattice: HamiltonianSystem
     few: HamiltonianSystem
@@ -63,7 +51,7 @@ class Piece:
     states: LatticeStates
 
     @classmethod
-    def of(cls, lattice: HamiltonianSystem, domain: Domain) -> Piece:
+    def of(cls, lattice: HamiltonianSystem, domain: Domain) -> LatticePiece:
         """The piece of a lattice, for states of a domain of it."""
         found = domain if isinstance(domain, LatticeStates) else LatticeStates.of_states(lattice, domain.sample(DRAWN))
         small = lattice.ndof <= MOST_FITTED

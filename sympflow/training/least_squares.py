@@ -1,7 +1,9 @@
 """Levenberg–Marquardt: least squares by Gauss–Newton steps, damped where the linear model fails.
 
-`levenberg_marquardt` minimizes a function of a few numbers in NumPy, `GaussNewton` trains the weights of a flow, one
-step at a time. Both take the steps of `damped_step`; they differ in how they solve the linear problem of a step.
+There is one method, `descend`, of the steps of `damped_step`, and a `LinearModel` for each way to solve the linear
+problem of a step: `levenberg_marquardt` minimizes a function of a few numbers by compiled QR factorizations,
+`GaussNewtonSteps` trains the weights of a flow by Cholesky's factors, one step at a time, and
+`sympflow.learning.shooting` eliminates the initial states of orbits.
 
 References
 ----------
@@ -27,7 +29,6 @@ from torch import Tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.kernels.gauss_newton import bent, damped, factored
 from sympflow.training.losses import Objective
-from sympflow.training.options import LossOptions
 from sympflow.training.session import OutOfTime
 
 PROBE = 0.1  # share of a step over which the residuals' curvature is measured
@@ -57,66 +58,70 @@ class Damping:
         self.value, self.growth = self.value * self.growth, self.growth * 2
 
 
-class Linearized(ABC):
-    """Residuals r with their Jacobian J at a point x, and the scales D of the parameters: arrays or tensors."""
-
-    x: Any
-    r: Any
-    J: Any
-    D: Any
+class LinearModel(ABC):
+    """Residuals r with their Jacobian J at a point x, and a solver of JᵀJ + λD², D the scales of the parameters."""
 
     @abstractmethod
-    def damp(self, damping: float) -> None:
-        """Get ready to solve with JᵀJ + λD²."""
-
-    @abstractmethod
-    def newton(self) -> tuple[Any, float]:
-        """The s that minimizes ‖J s + r‖² + λ‖D s‖², and the decrease of ‖r‖² that the linear model predicts."""
-
-    @abstractmethod
-    def bend(self, residuals: Callable[[Any], Any], step: Any) -> Any:
-        """The geodesic acceleration of [3]_, by which a step follows a curved valley; 0 where it would lead astray.
-
-        That of the last damping.
-        """
-
-    @abstractmethod
-    def moved(self, step: Any, bend: Any) -> Any:
-        """x + step + bend."""
+    def trial(self, damping: float) -> tuple[Any, float] | None:
+        """The point to try, and the decrease of ‖r‖² that the model predicts there; None if it cannot be solved."""
 
 
 def damped_step(
-    model: Linearized,
-    residuals: Callable[[Any], Any],
-    cost: Callable[[Any], float],
-    before: float,
-    damping: Damping,
-    tries: int,
+    model: LinearModel, cost: Callable[[Any, int], float], before: float, damping: Damping, tries: int
 ) -> tuple[Any, float] | None:
-    """The point after a step that lowers the cost, and the cost there; None if no step of so many does.
+    """The point after a step that lowers the cost from `before`, and the cost there; None if no step of so many does.
 
-    Parameters
-    ----------
-    model : Linearized
-    residuals, cost : callable
-        At any point; the cost is not finite where a point is not admissible.
-    before : float
-        The cost at the point of the model.
-    damping : Damping
-        It grows until a step is accepted.
-    tries : int
+    `cost` takes a point and the number of the try; it is not finite where a point is not admissible.
     """
-    for _ in range(tries):
-        model.damp(damping.value)
-        step, predicted = model.newton()
-        trial = model.moved(step, model.bend(residuals, step))
-        after = cost(trial)
-        gain = (before - after) / predicted if predicted > 0 and math.isfinite(after) else -1.0
-        if gain > 0:
-            damping.accepted(gain)
-            return trial, after
+    for attempt in range(tries):
+        found = model.trial(damping.value)
+        if found is not None:
+            trial, predicted = found
+            after = cost(trial, attempt)
+            gain = (before - after) / predicted if predicted > 0 and math.isfinite(after) else -1.0
+            if gain > 0:
+                damping.accepted(gain)
+                return trial, after
         damping.rejected()
     return None
+
+
+def converged(costs: Sequence[float], patience: int, gain: float) -> bool:
+    """Return whether `patience` steps together lowered the cost by less than this share of it."""
+    return len(costs) > patience and costs[-1] > (1 - gain) * costs[-1 - patience]
+
+
+def descend(
+    x: Any,
+    costs: list[float],
+    model_at: Callable[[Any], LinearModel],
+    cost: Callable[[Any, int], float],
+    *,
+    damping: Damping,
+    tries: int,
+    iterations: int,
+    patience: int,
+    gain: float,
+    stop: Stop,
+) -> tuple[Any, str]:
+    """Levenberg and Marquardt's steps from x, of which `costs` has the cost; the end, and why it is one.
+
+    An OutOfTime that is raised within ends it as `stop` does.
+    """
+    try:
+        for _ in range(iterations):
+            if stop():
+                return x, STOPPED
+            found = damped_step(model_at(x), cost, costs[-1], damping, tries)
+            if found is None:
+                return x, "no step lowers the cost"
+            x, after = found
+            costs.append(after)
+            if converged(costs, patience, gain):
+                return x, "it has converged"
+    except OutOfTime:
+        return x, STOPPED
+    return x, "the iterations were used up"
 
 
 # a few numbers ----------------------------------------------------------------------------------------------------
@@ -152,62 +157,35 @@ def levenberg_marquardt(
     A step solves min ‖J s + r‖² + λ‖D s‖² by QR factorizations, never by normal equations; D holds the largest norms
     that the columns of J had. The step is bent by the geodesic acceleration of [3]_, which follows the curved valleys
     of such problems.
-
-    Parameters
-    ----------
-    residuals : callable
-        r(x), (m,); not finite where x is not admissible.
-    linearized : callable
-        r(x) and its Jacobian J(x), (m, n), or in blocks.
-    x : ndarray, shape (n,)
-        The start.
-    iterations : int
-        The most accepted steps.
-    patience, gain : int, float
-        The search ends when `patience` steps together lower the cost by less than this share of it.
-    damping : float
-        The first λ.
-    stop : callable
-        Asked before each step whether to end here. An OutOfTime that r or J raises ends it as well.
     """
 
-    def cost_at(x: np.ndarray) -> float:
+    scale = np.zeros(len(x))
+
+    def cost_at(x: np.ndarray, attempt: int = 0) -> float:
         r = residuals(x)
         return float(r @ r)
 
-    costs: list[float] = []
-    scale, level = np.zeros(len(x)), Damping(damping, LEAST_DAMPING)
+    def model_at(x: np.ndarray) -> _Factored:
+        nonlocal scale
+        model = _Factored(x, *linearized(x), scale, residuals)
+        scale = model.scale
+        return model
+
+    level = Damping(damping, LEAST_DAMPING)
     try:
-        costs.append(cost_at(x))
-        if not math.isfinite(costs[0]):
-            return Minimum(x, math.inf, 0, "the residuals are not finite at the start")
-        for iteration in range(iterations):
-            if stop():
-                return Minimum(x, costs[-1], iteration, STOPPED)
-            model = _Factored(x, *linearized(x), scale)
-            scale = model.scale
-            found = damped_step(model, residuals, cost_at, costs[-1], level, MAX_REJECTED)
-            if found is None:
-                return Minimum(x, costs[-1], iteration, "no step lowers the cost")
-            x, cost = found
-            costs.append(cost)
-            if len(costs) > patience and cost > (1 - gain) * costs[-1 - patience]:
-                return Minimum(x, cost, iteration + 1, "it has converged")
+        costs = [cost_at(x)]
     except OutOfTime:
-        return Minimum(x, costs[-1] if costs else math.inf, max(len(costs) - 1, 0), STOPPED)
-    return Minimum(x, costs[-1], iterations, "the iterations were used up")
+        return Minimum(x, math.inf, 0, STOPPED)
+    if not math.isfinite(costs[0]):
+        return Minimum(x, math.inf, 0, "the residuals are not finite at the start")
+    options: Any = {"damping": level, "tries": MAX_REJECTED, "iterations": iterations, "patience": patience}
+    x, reason = descend(x, costs, model_at, cost_at, gain=gain, stop=stop, **options)
+    return Minimum(x, costs[-1], len(costs) - 1, reason)
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """A Jacobian in blocks of rows, each some columns of its own times a matrix.
-
-    Parameters
-    ----------
-    columns : (k, m)
-    matrices : (B, k, n)
-        The b-th of B equal blocks of J is the b-th part of the columns, transposed, times the b-th matrix.
-    """
+    """A Jacobian in blocks of rows, each some columns of its own times a matrix."""
 
     columns: np.ndarray
     matrices: np.ndarray
@@ -221,30 +199,27 @@ class Blocks:
 NO_BLOCKS = np.empty((0, 0, 0))
 
 
-class _Factored(Linearized):
+class _Factored(LinearModel):
     """A linear model in compiled code, by QR factorizations of [J r] and, for each λ, of [R; √λ D]."""
 
-    def __init__(self, x: np.ndarray, r: np.ndarray, J: np.ndarray | Blocks, scale: np.ndarray) -> None:
-        self.x, self.r = x, np.ascontiguousarray(r)
-        J = J if isinstance(J, Blocks) else Blocks(np.ascontiguousarray(J.T), NO_BLOCKS)
-        self.J = J
-        self._R, self.scale = factored(J.columns, J.matrices, self.r, scale)
+    def __init__(
+        self,
+        x: np.ndarray,
+        r: np.ndarray,
+        J: np.ndarray | Blocks,
+        scale: np.ndarray,
+        residuals: Callable[[np.ndarray], np.ndarray],
+    ) -> None:
+        self.x, self.r, self.residuals = x, np.ascontiguousarray(r), residuals
+        self.J = J if isinstance(J, Blocks) else Blocks(np.ascontiguousarray(J.T), NO_BLOCKS)
+        self._R, self.scale = factored(self.J.columns, self.J.matrices, self.r, scale)
         self.D = np.where(self.scale > 0, self.scale, 1.0)
 
-    def damp(self, damping: float) -> None:
-        self._damped, step, decrease = damped(self._R, self.D, damping)
-        self._newton = step, decrease
-
-    def newton(self) -> tuple[np.ndarray, float]:
-        step, decrease = self._newton
-        return step, decrease
-
-    def bend(self, residuals: Callable[[np.ndarray], np.ndarray], step: np.ndarray) -> Any:
-        probed = residuals(self.x + PROBE * step)
-        return bent(self.J.columns, self.J.matrices, self.r, probed, PROBE, step, self._damped, self.D, CURVED)
-
-    def moved(self, step: np.ndarray, bend: np.ndarray) -> np.ndarray:
-        return self.x + step + bend
+    def trial(self, damping: float) -> tuple[np.ndarray, float]:
+        triangle, step, decrease = damped(self._R, self.D, damping)
+        probed = self.residuals(self.x + PROBE * step)
+        given = self.J.columns, self.J.matrices, self.r, probed, PROBE, step, triangle, self.D, CURVED
+        return self.x + step + bent(*given), decrease
 
 
 # the weights of a flow --------------------------------------------------------------------------------------------
@@ -270,7 +245,7 @@ def put_weights(parameters: Sequence[Tensor], x: Tensor) -> None:
         w.copy_(part.view_as(w))
 
 
-class GaussNewton:
+class GaussNewtonSteps:
     """Levenberg–Marquardt on the residuals of a flow, one accepted step at a time; it trains networks best.
 
     A step s minimizes ‖J s + r‖² + λ‖D s‖², D the largest norms that the columns of J have had, so that λ bounds
@@ -278,16 +253,11 @@ class GaussNewton:
     tiny multiple of the weights: a neuron that is saturated at all points may else run off to a step of any slope,
     which no held-out point sees, but an orbit meets after some ten thousand steps. The steps end where `PATIENCE` of
     them on the same points lower the loss by less than 1 %, or none does.
-
-    Attributes
-    ----------
-    finished : str or None
-        Why no more steps are worth while.
     """
 
     needs_residuals: ClassVar[bool] = True
 
-    def __init__(self, flow: FlowMap, options: LossOptions) -> None:
+    def __init__(self, flow: FlowMap) -> None:
         if flow.n_parameters > MAX_PARAMETERS:
             raise ValueError(
                 f"`optimizer` 'gauss-newton' keeps a dense Jacobian and takes at most {MAX_PARAMETERS} parameters; the "
@@ -340,31 +310,33 @@ class GaussNewton:
             put_weights(self.parameters, x)
             return objective.residuals()
 
-        def cost_at(x: Tensor) -> float:
+        def cost_at(x: Tensor, attempt: int) -> float:
             return float(residuals(x).square().sum()) + PULL * float(x @ x)
 
-        model = _Normal(x, r, J, self.scale)
+        model = _Normal(x, r, J, self.scale, residuals)
         self.scale = model.scale
-        found = damped_step(model, residuals, cost_at, cost, self.damping, TRIES)
+        found = damped_step(model, cost_at, cost, self.damping, TRIES)
         if found is None:
             put_weights(self.parameters, x)
             self.damping = Damping(FIRST_DAMPING, LEAST_DAMPING_OF_WEIGHTS)
             self.finished = "no step lowers the loss"
             return loss
         self.costs = [*self.costs[-PATIENCE:], found[1]]
-        if len(self.costs) > PATIENCE and found[1] > (1 - GAIN) * self.costs[0]:
+        if converged(self.costs, PATIENCE, GAIN):
             self.finished = "it has converged"
         return loss
 
 
-class _Normal(Linearized):
+class _Normal(LinearModel):
     """A linear model in torch, with the pull to 0, by Cholesky's factors of JᵀJ + λD².
 
     Where λ is small, by a QR factorization of J, once, and one of its triangle for each λ.
     """
 
-    def __init__(self, x: Tensor, r: Tensor, J: Tensor, scale: Tensor | None) -> None:
-        self.x, self.r, self.J = x, r, J
+    def __init__(
+        self, x: Tensor, r: Tensor, J: Tensor, scale: Tensor | None, residuals: Callable[[Tensor], Tensor]
+    ) -> None:
+        self.x, self.r, self.J, self.residuals = x, r, J, residuals
         self._G, self._g = gram(J), J.T @ r + PULL * x
         self._G.diagonal().add_(PULL)
         squares = self._G.diagonal()
@@ -373,34 +345,33 @@ class _Normal(Linearized):
         self._in_units = self._G / self.D / self.D[:, None]
         self._triangle: Tensor | None = None
 
-    def damp(self, damping: float) -> None:
+    def trial(self, damping: float) -> tuple[Tensor, float]:
+        R = self._triangle_of(damping)
+
+        def solved(w: Tensor) -> Tensor:
+            """(JᵀJ + λD²)⁻¹ w."""
+            return torch.cholesky_solve((w / self.D)[:, None], R, upper=True)[:, 0] / self.D
+
+        step = -solved(self._g)
+        decrease = -float(step @ (self._G @ step + 2 * self._g))
+        curvature = (self.residuals(self.x + PROBE * step) - self.r - PROBE * (self.J @ step)) / PROBE**2
+        acceleration = -solved(self.J.T @ curvature)
+        norms = (torch.linalg.vector_norm(self.D * v) for v in (acceleration, step))
+        small = 2 * next(norms) <= CURVED * next(norms)  # NaN is not small
+        return self.x + (step + acceleration if small else step), decrease
+
+    def _triangle_of(self, damping: float) -> Tensor:
+        """R of JᵀJ + λD² in units of D."""
         if damping > WELL_CONDITIONED:
-            damped = self._in_units.clone()
-            damped.diagonal().add_(damping)
-            R, failed = torch.linalg.cholesky_ex(damped, upper=True)
-        if damping <= WELL_CONDITIONED or failed:
-            if self._triangle is None:
-                self._triangle = torch.linalg.qr(self.J, mode="r")[1] / self.D
-            below = (damping + PULL / self.D**2).sqrt().diag()
-            R = torch.linalg.qr(torch.cat([self._triangle, below]), mode="r")[1]
-        self._R = R
-
-    def newton(self) -> tuple[Tensor, float]:
-        s = -self.solve(self._g)
-        return s, -float(s @ (self._G @ s + 2 * self._g))
-
-    def solve(self, w: Tensor) -> Tensor:
-        """(JᵀJ + λD²)⁻¹ w."""
-        return torch.cholesky_solve((w / self.D)[:, None], self._R, upper=True)[:, 0] / self.D
-
-    def bend(self, residuals: Callable[[Tensor], Tensor], step: Tensor) -> Tensor:
-        curvature = (residuals(self.x + PROBE * step) - self.r - PROBE * (self.J @ step)) / PROBE**2
-        bend = -self.solve(self.J.T @ curvature)
-        small = 2 * torch.linalg.vector_norm(self.D * bend) <= CURVED * torch.linalg.vector_norm(self.D * step)
-        return bend if small else 0 * step  # NaN is not small
-
-    def moved(self, step: Tensor, bend: Tensor) -> Tensor:
-        return self.x + (step + bend)
+            shifted = self._in_units.clone()
+            shifted.diagonal().add_(damping)
+            R, failed = torch.linalg.cholesky_ex(shifted, upper=True)
+            if not failed:
+                return R
+        if self._triangle is None:
+            self._triangle = torch.linalg.qr(self.J, mode="r")[1] / self.D
+        below = (damping + PULL / self.D**2).sqrt().diag()
+        return torch.linalg.qr(torch.cat([self._triangle, below]), mode="r")[1]
 
 
 def gram(J: Tensor) -> Tensor:

@@ -107,20 +107,7 @@ def never() -> None:
 
 @dataclass(frozen=True)
 class Objective:
-    """A loss of a flow at given points, as a number, or as the residuals whose sum of squares it is.
-
-    Parameters
-    ----------
-    loss : Loss
-    flow : FlowMap
-    points : Points
-    draw : int
-        Which points of the run these are.
-    check : callable
-        Called before each evaluation, and may raise to end it.
-    tangents : NetworkTangents, optional
-        Those of the flow, by which residuals and label errors are compiled; their order is another one then.
-    """
+    """A loss of a flow at given points, as a number, or as the residuals whose sum of squares it is."""
 
     loss: Loss
     flow: FlowMap

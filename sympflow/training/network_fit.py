@@ -18,9 +18,9 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.network_tangents import NetworkTangents
+from sympflow.training.fits import Adam, Resolved, Solver
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.optimizers import MEMORY, Optimizer, optimizer
-from sympflow.training.options import LossOptions
 from sympflow.training.points import (
     BLOCK,
     Labelled,
@@ -43,25 +43,10 @@ BACKWARD = 2.0  # times what a point takes in a validation, that it takes in a s
 
 @dataclass
 class LossRun(Run):
-    """The state of such a fit, and what acts on it.
-
-    Attributes
-    ----------
-    held_out, reference
-        Points of the losses that are never trained on; states, where the exact flow takes them in Δt, and of a driven
-        system the times of the states.
-    tangents : NetworkTangents or None
-        For the residuals and their Jacobian; None where the optimizer needs none, or the flow is no such network.
-    step : int
-        Steps taken.
-    best : dict
-        The weights with the least held-out loss so far.
-    step_seconds : float
-        What the longest step took; before there was one, what it takes at least.
-    """
+    """The state of such a fit, and what acts on it."""
 
     scaling: Scaling
-    options: LossOptions
+    fit: Resolved
     loss: Loss
     source: PointSource
     held_out: Points
@@ -83,42 +68,38 @@ class LossRun(Run):
         system: HamiltonianSystem,
         domain: Domain,
         scaling: Scaling,
-        options: LossOptions,
-        data: Labelled | None = None,
+        fit: Resolved,
+        solver: Resolved,
         deadline: Deadline | None = None,
     ) -> LossRun:
-        """A run of a flow with fresh points; labels are made where they have a weight and none are handed in.
-
-        Raises
-        ------
-        OutOfTime
-            If the labels take longer than their share of the time.
-        """
-        method = optimizer(flow, options)
-        _check_memory(flow, options)
+        """A run of a flow with fresh points; labels are made where they have a weight and none are handed in."""
+        fit, solver = fit.resolved(solver, flow.kind), solver.but(steps=200)
+        method = optimizer(flow, solver)
+        _check_memory(flow, fit, solver)
+        data: Labelled | None = fit.data
         deadline = Session().deadline if deadline is None else deadline
-        loss = Loss(system, scaling, options.residual_weight, options.matching_weight, options.label_weight)
+        loss = Loss(system, scaling, fit.residual_weight, fit.matching_weight, fit.label_weight)
         labels = unseen = None
-        if options.label_weight:
+        if fit.label_weight:
             if data is None:
-                labels, unseen = _labels(system, domain, flow.dt, options, deadline.part(LABEL_SHARE))
+                labels, unseen = _labels(system, domain, flow.dt, fit, deadline.part(LABEL_SHARE))
             else:
-                labels, unseen = parted(data, options.seed)
-        common = (options.matching_times, options.seed, flow.dtype, flow.device)
-        block = 1 if options.refresh is None else BLOCK
-        source = PointSource(domain, flow.dt, options.points, *common, block=block, labels=labels, system=system)
+                labels, unseen = parted(data, fit.seed)
+        common = (fit.matching_times, fit.seed, flow.dtype, flow.device)
+        block = 1 if solver.refresh is None else BLOCK
+        source = PointSource(domain, flow.dt, fit.points, *common, block=block, labels=labels, system=system)
         streams = (Stream.VALIDATION, Stream.VALIDATION)
         held_out = PointSource(
-            domain, flow.dt, options.validation_points, *common, streams=streams, block=1, labels=unseen, system=system
+            domain, flow.dt, fit.validation_points, *common, streams=streams, block=1, labels=unseen, system=system
         )(0)
-        start = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
-        t0 = start_times(system, flow.dt, len(start), options.seed, Stream.REFERENCE)
+        start = states(domain, fit.reference_states, fit.seed, Stream.REFERENCE)
+        t0 = start_times(system, flow.dt, len(start), fit.seed, Stream.REFERENCE)
         end = _end_of_step(system, start, flow.dt, deadline.part(LABEL_SHARE), t0)
         exists = np.isfinite(end).all(-1)
         known = (start, end) if t0 is None else (start, end, t0)
         reference = tuple(torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in known)
         tangents = flow.tangents() if method.needs_residuals else None
-        return cls(flow, system, domain, scaling, options, loss, source, held_out, reference, method, tangents)
+        return cls(flow, system, domain, scaling, fit, solver, loss, source, held_out, reference, method, tangents)
 
     @property
     def done(self) -> int:
@@ -126,7 +107,7 @@ class LossRun(Run):
 
     @property
     def planned(self) -> int:
-        return self.options.steps
+        return self.solver.steps
 
     def begin(self, session: Session) -> None:
         self.held_out = self._affordable(session.deadline)
@@ -142,7 +123,7 @@ class LossRun(Run):
             with torch.no_grad():
                 self.loss.terms(self.flow, self.held_out)
             each = (session.passed - began) / len(self.held_out.t)
-            self.step_seconds = BACKWARD * each * max(self.options.points - PROBE, 0)
+            self.step_seconds = BACKWARD * each * max(self.fit.points - PROBE, 0)
         if not math.isfinite(self.history[0]["loss"]):
             raise FloatingPointError(
                 "The loss is not finite at the first validation: the system's H or its gradient is not finite "
@@ -158,12 +139,12 @@ class LossRun(Run):
 
     def _fits(self) -> bool:
         """Return whether there is time for another step; those of Adam are one piece, others can be cut."""
-        in_time = self.options.optimizer != "adam" or self.step_seconds <= self.work_end.left
+        in_time = not isinstance(self.solver, Adam) or self.step_seconds <= self.work_end.left
         return not self.work_end.over() and in_time
 
     def advance(self, session: Session) -> Advance:
-        options = self.options
-        index = 0 if options.refresh is None else self.step // options.refresh
+        solver = self.solver
+        index = 0 if solver.refresh is None else self.step // solver.refresh
         began = session.passed
         objective = Objective(self.loss, self.flow, self.source(index), index, self.work_end.check, self.tangents)
         try:
@@ -177,12 +158,12 @@ class LossRun(Run):
         if not math.isfinite(value):
             self.ended, self.reason = True, f"the loss was not finite at step {self.step}: lower `learning_rate`"
             return Advance(value, None, False)
-        last = self.step == options.steps or (options.refresh is None and self.optimizer.finished is not None)
+        last = self.step == self.planned or (solver.refresh is None and self.optimizer.finished is not None)
         self.ended = last or not self._fits()
         if self.ended and not last:
             self.reason = OUT_OF_TIME
-        figures = self._validate() if self.ended or self.step % options.validate_every == 0 else None
-        return Advance(value, figures, self.ended or self.step % options.checkpoint_every == 0)
+        figures = self._validate() if self.ended or self.step % solver.validate_every == 0 else None
+        return Advance(value, figures, self.ended or self.step % solver.checkpoint_every == 0)
 
     def end(self, session: Session) -> str | None:
         return INTERRUPTED if session.interruption.asked else self.reason
@@ -278,22 +259,22 @@ class LossRun(Run):
         return min((f for f in self.history if math.isfinite(f["loss"])), key=lambda f: f["loss"])
 
 
-def _check_memory(flow: FlowMap, options: LossOptions) -> None:
+def _check_memory(flow: FlowMap, fit: Resolved, solver: Solver) -> None:
     """Raise ValueError where the points, or what the optimizer keeps, are more than the memory of the machine."""
     n, width = flow.n_parameters, 2 * flow.ndof
-    points = max(options.points, options.validation_points, options.reference_states)
-    of_points = points * width * (1 if options.refresh is None else BLOCK)
-    if options.label_weight and options.data is None:
-        of_points += (options.points + options.validation_points) * options.label_times * width
-    check_memory(f"`points` {options.points} and `validation_points`", of_points, "take fewer")
+    points = max(fit.points, fit.validation_points, fit.reference_states)
+    of_points = points * width * (1 if solver.refresh is None else BLOCK)
+    if fit.label_weight and fit.data is None:
+        of_points += (fit.points + fit.validation_points) * fit.label_times * width
+    check_memory(f"`points` {fit.points} and `validation_points`", of_points, "take fewer")
     kept = {
         "adam": 4 * n,
         "lbfgs": 2 * MEMORY * n,
         "bfgs": 3 * n**2,
-        "gauss-newton": 3 * n * (options.points * width + n),
+        "gauss-newton": 3 * n * (fit.points * width + n),
     }
     smaller = "take fewer `points`, a smaller network, or optimizer='adam'"
-    check_memory(f"`optimizer` {options.optimizer!r} of {n} parameters", kept[options.optimizer], smaller)
+    check_memory(f"`optimizer` {solver.name!r} of {n} parameters", kept[solver.name], smaller)
 
 
 def _first(points: Points, n: int) -> Points:
@@ -322,15 +303,15 @@ def _end_of_step(
 
 
 def _labels(
-    system: HamiltonianSystem, domain: Domain, dt: float, options: LossOptions, deadline: Deadline
+    system: HamiltonianSystem, domain: Domain, dt: float, fit: Resolved, deadline: Deadline
 ) -> tuple[Labelled, Labelled]:
     """Labels to train on, and held-out ones, at equidistant times; of a driven system with the times of the states."""
-    t = dt * np.arange(1, options.label_times + 1) / options.label_times
-    unseen = max(1, options.validation_points // options.label_times)
+    t = dt * np.arange(1, fit.label_times + 1) / fit.label_times
+    unseen = max(1, fit.validation_points // fit.label_times)
     sets = []
-    for n, stream in ((options.points, Stream.LABELS), (unseen, Stream.VALIDATION)):
-        t0 = start_times(system, dt, n, options.seed, stream)
-        labels = Labels.needed(system, states(domain, n, options.seed, stream), t, deadline, t0)
+    for n, stream in ((fit.points, Stream.LABELS), (unseen, Stream.VALIDATION)):
+        t0 = start_times(system, dt, n, fit.seed, stream)
+        labels = Labels.needed(system, states(domain, n, fit.seed, stream), t, deadline, t0)
         x = np.broadcast_to(labels.x, labels.y.shape).reshape(-1, labels.x.shape[1])
         begun = () if labels.t0 is None else (np.tile(labels.t0, len(t)),)
         sets.append((np.repeat(t, len(labels.x)), x, labels.y.reshape(x.shape), *begun))

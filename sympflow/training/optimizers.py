@@ -1,4 +1,4 @@
-"""The optimizers of losses: one small class each, registered by name in `optimizer`.
+"""The optimizers of losses: one small class each, chosen by `optimizer`.
 
 Gauss–Newton, which needs residuals, is in `least_squares`.
 """
@@ -16,9 +16,10 @@ from scipy.optimize import line_search
 from torch import Tensor
 
 from sympflow.flow.flow_map import FlowMap
-from sympflow.training.least_squares import MAX_PARAMETERS, GaussNewton, put_weights, weight_vector
+from sympflow.training import fits
+from sympflow.training.fits import Solver
+from sympflow.training.least_squares import MAX_PARAMETERS, GaussNewtonSteps, put_weights, weight_vector
 from sympflow.training.losses import Objective
-from sympflow.training.options import LossOptions
 from sympflow.training.session import OutOfTime
 
 ITERATIONS = 20  # of quasi-Newton methods, in a step
@@ -26,15 +27,7 @@ MEMORY = 30
 
 
 class Optimizer(Protocol):
-    """A method that lowers an objective of the flow that it was made for.
-
-    Attributes
-    ----------
-    finished : str or None
-        Why no more steps on the same points are worth while.
-    needs_residuals : bool
-        True if it lowers a sum of squares by its residuals.
-    """
+    """A method that lowers an objective of the flow that it was made for."""
 
     finished: str | None
     needs_residuals: ClassVar[bool]
@@ -47,13 +40,13 @@ class Optimizer(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
-class Adam:
+class AdamSteps:
     """Adam (Kingma & Ba 2015) with a schedule and gradient clipping."""
 
     finished: str | None = None
     needs_residuals: ClassVar[bool] = False
 
-    def __init__(self, flow: FlowMap, options: LossOptions) -> None:
+    def __init__(self, flow: FlowMap, options: fits.Adam) -> None:
         self.options = options
         self.parameters = list(flow.parameters())
         self.method = torch.optim.Adam(self.parameters, lr=options.learning_rate, fused=True)
@@ -76,13 +69,13 @@ class Adam:
         self.method.load_state_dict(state)
 
 
-class LBFGS:
+class LBFGSSteps:
     """L-BFGS by torch, its memory 30 pairs: 20 iterations a step, on the points of the step."""
 
     finished: str | None = None
     needs_residuals: ClassVar[bool] = False
 
-    def __init__(self, flow: FlowMap, options: LossOptions) -> None:
+    def __init__(self, flow: FlowMap) -> None:
         self.parameters = list(flow.parameters())
         self.method = torch.optim.LBFGS(
             self.parameters,
@@ -119,7 +112,7 @@ class LBFGS:
         self.method.load_state_dict(state)
 
 
-class BFGS:
+class BFGSSteps:
     """BFGS with Oren and Luenberger's self-scaling, limited to growth of the inverse Hessian B: 20 iterations a step.
 
     A B that has learnt the curvature far from the minimum is soon forgotten. On residual losses of small networks it
@@ -136,7 +129,7 @@ class BFGS:
     finished: str | None = None
     needs_residuals: ClassVar[bool] = False
 
-    def __init__(self, flow: FlowMap, options: LossOptions) -> None:
+    def __init__(self, flow: FlowMap) -> None:
         if flow.n_parameters > MAX_PARAMETERS:
             raise ValueError(
                 f"`optimizer` 'bfgs' keeps a dense matrix and takes at most {MAX_PARAMETERS} parameters; the flow has "
@@ -234,12 +227,10 @@ class BFGS:
         return float(value.detach()), torch.cat([g.reshape(-1) for g in gradients])
 
 
-def optimizer(flow: FlowMap, options: LossOptions) -> Optimizer:
-    """The optimizer that the options name."""
-    named: dict[str, Callable[[FlowMap, LossOptions], Optimizer]] = {
-        "adam": Adam,
-        "bfgs": BFGS,
-        "lbfgs": LBFGS,
-        "gauss-newton": GaussNewton,
-    }
-    return named[options.optimizer](flow, options)
+def optimizer(flow: FlowMap, solver: Solver) -> Optimizer:
+    """The optimizer of a flow that a solver describes."""
+    if isinstance(solver, fits.Adam):
+        return AdamSteps(flow, solver)
+    made: dict[str, Callable[[FlowMap], Optimizer]]
+    made = {"bfgs": BFGSSteps, "lbfgs": LBFGSSteps, "gauss-newton": GaussNewtonSteps}
+    return made[solver.name](flow)

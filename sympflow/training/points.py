@@ -5,7 +5,6 @@ Labels say where the exact flow takes sampled states, at several times. They are
 
 from __future__ import annotations
 
-import hashlib
 import math
 import warnings
 from dataclasses import dataclass
@@ -102,13 +101,7 @@ def drive_times(system: HamiltonianSystem) -> tuple[float, float] | None:
 
 
 def times_of(system: HamiltonianSystem, dt: float) -> tuple[float, float]:
-    """The interval of the times at which steps of a driven system begin: its period, or else its `t_span` less Δt.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """The interval of the times at which steps of a driven system begin: its period, or else its `t_span` less Δt."""
     if system.period is not None:
         return 0.0, system.period
     low, high = min(system.t_span), max(system.t_span)
@@ -242,11 +235,6 @@ class Labels:
         """Make labels by DOP853 at rtol = 1e-13, all states in one integration from each time to the next.
 
         States whose solution ends before the last time are left out.
-
-        Raises
-        ------
-        OutOfTime
-            At the deadline; it says how far the labels got.
         """
         width, field = x.shape[1], system
         if t0 is not None and system.conservative:
@@ -278,15 +266,7 @@ class Labels:
         deadline: Deadline | None = None,
         t0: np.ndarray | None = None,
     ) -> Labels:
-        """`of`, for a fit, which cannot do without.
-
-        Raises
-        ------
-        ValueError
-            If there are none.
-        OutOfTime
-            As `of` does.
-        """
+        """`of`, for a fit, which cannot do without."""
         labels = cls.of(system, x, t, deadline, t0)
         if not len(labels.x):
             raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
@@ -370,15 +350,6 @@ def shares_missed(difference: np.ndarray, labels: Labels, unit: np.ndarray) -> t
     """The share that is missed of what a step of Δt moves a state: mean of all states over mean, median over median.
 
     They are 1 for the identity, and the same in all units of q, p and t; infinite if anything is not a number.
-
-    Parameters
-    ----------
-    difference : (N, 2d)
-        ψ̄_Δt(x) − φ_H,Δt(x).
-    labels : Labels
-        The last time is Δt.
-    unit : (2d,)
-        In which coordinates and momenta are measured: their spread over Ω.
     """
     error, moved = (np.linalg.norm(v / unit, axis=-1) for v in (difference, labels.y[-1] - labels.x))
     return _share(error.mean(), moved.mean()), _share(np.median(error), np.median(moved))
@@ -420,13 +391,7 @@ def unlabelled(t: np.ndarray, dt: float) -> tuple[tuple[float, float], ...]:
 
 
 def warn_of_another_system(data: Labelled, system: HamiltonianSystem) -> None:
-    """Warn if the exact flow of the system takes a few of the labelled states elsewhere than the labels say.
-
-    Warns
-    -----
-    UserWarning
-        If the distance is, in the median, a tenth or more of what the labels move.
-    """
+    """Warn if the exact flow of the system takes a few of the labelled states elsewhere than the labels say."""
     t, x, y = data
     rows = np.linspace(0, len(t) - 1, min(len(t), LABELS_COMPARED)).astype(int)
     with np.errstate(all="ignore"):
@@ -444,14 +409,6 @@ def warn_of_another_system(data: Labelled, system: HamiltonianSystem) -> None:
             UserWarning,
             stacklevel=5,
         )
-
-
-def digest(labels: Labelled) -> str:
-    """The checksum of labels."""
-    content = hashlib.sha256()
-    for array in labels:
-        content.update(np.ascontiguousarray(array).tobytes())
-    return content.hexdigest()
 
 
 def parted(data: Labelled, seed: int) -> tuple[Labelled, Labelled]:

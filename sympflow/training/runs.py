@@ -16,8 +16,8 @@ from sympflow.flow.scaling import Scaling
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
+from sympflow.training.fits import Resolved
 from sympflow.training.least_squares import STOPPED, Minimum
-from sympflow.training.options import LossOptions, SearchOptions
 from sympflow.training.points import USELESS, drive_times
 from sympflow.training.session import Deadline, Path, Session
 
@@ -38,31 +38,25 @@ class Advance:
 
 @dataclass
 class Run(ABC):
-    """The state of a run, and the loop that acts on it.
-
-    Attributes
-    ----------
-    history : list of dict
-        The figures of each validation.
-    seconds : float
-        Wall time of the run, and of those that it goes on with.
-    closing : float
-        Seconds that its end takes, which are kept free.
-    unfitted : tuple of (float, float)
-        Intervals of t at which the fit compares the flow with nothing.
-    """
+    """The state of a run, and the loop that acts on it."""
 
     flow: FlowMap
     system: HamiltonianSystem
     domain: Domain
     scaling: Scaling | None
-    options: LossOptions | SearchOptions
+    fit: Resolved
+    solver: Resolved
     history: list[dict[str, float]] = field(default_factory=list, kw_only=True)
     seconds: float = field(default=0.0, kw_only=True)
     closing: float = field(default=0.0, kw_only=True)
     unfitted: tuple[tuple[float, float], ...] = field(default=(), kw_only=True)
 
     UNIT: ClassVar[str]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """The choices that determine the trained numbers."""
+        return self.fit.record(self.solver)
 
     @property
     @abstractmethod
@@ -166,7 +160,7 @@ class Run(ABC):
         flow.identify(self.system, self.domain)
         flow.drive_times = drive_times(self.system)
         earlier = float(flow.figures.get("training_seconds", 0.0))
-        stage = {**self.options.to_dict(), **self.remarks(reason)}
+        stage = {**self.record, **self.remarks(reason)}
         if self.done and not stage.get("kept_start"):
             flow.unfitted = self.unfitted
         flow.recipe = {
@@ -210,17 +204,11 @@ class Run(ABC):
         """Write the state of the run."""
         run = {"step": self.done, "flow": self.flow.state_dict(), **self.kept()}
         run |= {"history": self.history, "seconds": self.seconds}
-        checkpoints.write(path, checkpoints.identity(self.flow, self.system, self.options.to_dict()) | run)
+        checkpoints.write(path, checkpoints.identity(self.flow, self.system, self.record) | run)
 
     def load(self, path: Path) -> None:
-        """Take over the state of a run with the same flow, system and options.
-
-        Raises
-        ------
-        ValueError
-            If the file is not a checkpoint, or one of another run.
-        """
-        state = checkpoints.read_same(path, checkpoints.identity(self.flow, self.system, self.options.to_dict()))
+        """Take over the state of a run with the same flow, system and options."""
+        state = checkpoints.read_same(path, checkpoints.identity(self.flow, self.system, self.record))
         try:
             self.restore(state)
         except (RuntimeError, KeyError, ValueError) as error:
@@ -230,13 +218,7 @@ class Run(ABC):
 
 @dataclass
 class Unstarted(Run):
-    """A run for which there was no time: what it was to start from took longer. The flow stays as it is.
-
-    Parameters
-    ----------
-    reached : str
-        How far that got.
-    """
+    """A run for which there was no time: what it was to start from took longer. The flow stays as it is."""
 
     reached: str
 
@@ -311,7 +293,6 @@ def descended(common: tuple[Searched, int, Deadline, bool], theta: np.ndarray) -
 class SearchRun(Run):
     """Many starts, each followed to a minimum, and a flow that is made of the best of them."""
 
-    options: SearchOptions
     minima: list[Minimum] = field(default_factory=list, kw_only=True)
     coming: Generator[Minimum] | None = field(default=None, init=False, repr=False)
     """The minima of a round of starts, as the crew finds them."""
@@ -331,7 +312,7 @@ class SearchRun(Run):
     @property
     def search_steps(self) -> int:
         """The most iterations from each start."""
-        return self.options.steps
+        return self.solver.steps
 
     def next_minimum(self, session: Session, deadline: Deadline) -> Minimum:
         """The minimum of the next start, of number len(minima)."""
@@ -357,7 +338,7 @@ class SearchRun(Run):
 
     @property
     def planned(self) -> int:
-        return self.options.restarts
+        return self.solver.restarts
 
     def begin(self, session: Session) -> None:
         if session.checkpoint is not None and not self.minima:  # a first search may be long

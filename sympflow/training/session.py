@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
+from sympflow.arguments import real_number
 from sympflow.training.checkpoint import check_writable
-from sympflow.training.options import is_number
 from sympflow.workers import Crew, Unpicklable, available_cores
 
 Path = str | os.PathLike[str]
@@ -34,13 +34,6 @@ class Interruption:
 
     A second one raises KeyboardInterrupt in any case. In another thread than the main one, or where the program has a
     handler of its own, nothing is changed.
-
-    Attributes
-    ----------
-    armed : bool
-        Whether there is something to return.
-    asked : bool
-        Whether the end was asked for; what runs looks at it.
     """
 
     def __init__(self) -> None:
@@ -66,35 +59,7 @@ class Interruption:
 
 @dataclass
 class Session:
-    """The surroundings of a run, and the clock that began with it.
-
-    Parameters
-    ----------
-    checkpoint, resume : path, optional
-        Files to keep the state of the run in, and to go on from.
-    time_budget : float, optional
-        Seconds.
-    progress : bool, optional
-        Whether to show a bar; None means on a terminal only.
-    callback : callable, optional
-        callback(step, figures) after each validation.
-    crew : Crew
-        Those who do independent pieces of work.
-    interruption : Interruption
-        Asks the run to end.
-
-    Attributes
-    ----------
-    cut : bool
-        Whether the time was up when a `Deadline` was asked.
-    crew_is_busy : bool
-        Whether the crew has work.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is not admissible, or no checkpoint can be written.
-    """
+    """The surroundings of a run, and the clock that began with it."""
 
     checkpoint: Path | None = None
     resume: Path | None = None
@@ -109,7 +74,7 @@ class Session:
     def __post_init__(self) -> None:
         self._began = time.perf_counter()
         budget, callback = self.time_budget, self.callback
-        if budget is not None and not (is_number(budget) and 0 < budget < math.inf):
+        if budget is not None and not (real_number(budget) and 0 < budget < math.inf):
             raise ValueError(f"`time_budget` must be a positive number of seconds; got {budget!r}: leave it out.")
         if callback is not None and not callable(callback):
             raise TypeError(
@@ -208,15 +173,7 @@ class Session:
 
 @dataclass(frozen=True)
 class Deadline:
-    """The moment by which a piece of work has to end; it is handed down to all that takes long.
-
-    Parameters
-    ----------
-    session : Session
-        Its `interruption` ends every piece, and it notes that the time was up.
-    end : float
-        By the clock `time.perf_counter`; infinite for none.
-    """
+    """The moment by which a piece of work has to end; it is handed down to all that takes long."""
 
     session: Session
     end: float = math.inf

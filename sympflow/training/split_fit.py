@@ -23,8 +23,8 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.parts import Map
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.parts_loops import parts_loops
+from sympflow.training.fits import GaussNewton, Resolved
 from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
-from sympflow.training.options import SplitOptions
 from sympflow.training.points import Labels, Stream, shares_missed, states, stream_seed
 from sympflow.training.runs import LABEL_SHARE, SearchRun
 from sympflow.training.session import Deadline, Session
@@ -42,8 +42,9 @@ class SplitRun(SearchRun):
     """The state of a fit of a split flow, and what acts on it."""
 
     flow: SplitFlow
-    options: SplitOptions
-    fit: SplitFit
+    fit: Resolved
+    solver: Resolved
+    problem: SplitProblem
 
     @classmethod
     def start(
@@ -51,57 +52,52 @@ class SplitRun(SearchRun):
         flow: SplitFlow,
         system: HamiltonianSystem,
         domain: Domain,
-        options: SplitOptions,
+        fit: Resolved,
+        solver: GaussNewton = GaussNewton(),  # noqa: B008
         deadline: Deadline | None = None,
     ) -> SplitRun:
-        """A run of a flow that is bound to its system.
-
-        Raises
-        ------
-        ValueError
-            If the system cannot be compiled, or no solution from the domain exists up to Δt.
-        OutOfTime
-            If the labels take longer than their share of the time.
-        """
+        """A run of a flow that is bound to its system."""
         deadline = Session().deadline if deadline is None else deadline
-        return cls(flow, system, domain, None, options, SplitFit(flow, system, domain, options, deadline))
+        solver = solver.but(restarts=8, steps=150)
+        problem = SplitProblem(flow, system, domain, fit, solver, deadline)
+        return cls(flow, system, domain, None, fit, solver, problem)
 
     def searched(self) -> AtEnd:
-        return AtEnd(self.fit)
+        return AtEnd(self.problem)
 
     def start_of(self, restart: int) -> np.ndarray:
         """Numbers u at Δt: those of the flow as it is, then random ones."""
-        return self.fit.random(restart) if restart else self.fit.current(self.fit.t[-1])
+        return self.problem.random(restart) if restart else self.problem.current(self.problem.t[-1])
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.history.append({"step": len(self.minima), "loss": minimum.cost, "iterations": minimum.iterations})
         return self.history[-1]
 
     def complete(self, session: Session) -> None:
-        u = self.fit.current(self.fit.t[-1])  # if there was no time for a start
+        u = self.problem.current(self.problem.t[-1])  # if there was no time for a start
         if self.minima:
             best = min(self.minima, key=lambda m: m.cost)
             if not math.isfinite(best.cost):
                 raise FloatingPointError("The residuals are not finite from any start: shrink `domain` or `dt`.")
             u = best.x
-        whole = self.fit.whole(u, self.whole_end.over)
+        whole = self.problem.whole(u, self.whole_end.over)
         last = {"step": len(self.minima), "loss": whole.cost, "iterations": whole.iterations}
-        self.history.append(last | self.fit.errors())
+        self.history.append(last | self.problem.errors())
 
     def missed(self) -> tuple[float, float]:
-        return self.fit.missed()
+        return self.problem.missed()
 
 
 @dataclass(frozen=True)
 class AtEnd:
     """The fit at Δt, of the numbers u."""
 
-    fit: SplitFit
+    problem: SplitProblem
     compiled: ClassVar[bool] = False
 
     def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
         """The minimum from the numbers θ = u; none of the searches is thorough."""
-        return self.fit.minimize(theta, len(self.fit.t) - 1, iterations, deadline.over)
+        return self.problem.minimize(theta, len(self.problem.t) - 1, iterations, deadline.over)
 
     def own(self) -> AtEnd:
         """The same: nothing changes in it."""
@@ -113,25 +109,31 @@ def _phases(share: np.ndarray) -> np.ndarray:
     return np.where(share == 1, 1.0, np.sin(np.pi / 2 * share))
 
 
-class SplitFit:
+class SplitProblem:
     """Labels in modes, and the flow's coefficients as numbers: those of the first half of the palindrome."""
 
     def __init__(
-        self, flow: SplitFlow, system: HamiltonianSystem, domain: Domain, options: SplitOptions, deadline: Deadline
+        self,
+        flow: SplitFlow,
+        system: HamiltonianSystem,
+        domain: Domain,
+        fit: Resolved,
+        solver: Resolved,
+        deadline: Deadline,
     ) -> None:
-        self.flow, self.options, self.parts = flow, options, flow.parts
+        self.flow, self.fit, self.solver, self.parts = flow, fit, solver, flow.parts
         self.kernel = parts_loops(self.parts)
         self.columns = flow.columns()
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
         self.n = int(ends[-1]) if len(ends) else 0
-        t = flow.dt * _phases(np.arange(1, options.label_times + 1) / options.label_times)
-        x = states(domain, options.points, options.seed, Stream.RESIDUAL)
+        t = flow.dt * _phases(np.arange(1, fit.label_times + 1) / fit.label_times)
+        x = states(domain, fit.points, fit.seed, Stream.RESIDUAL)
         labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE))
         self.t, self.z, self.labels = t, self._modes(labels.x), [self._modes(y) for y in labels.y]
         self.unit = self._unit(float(np.std(system.hamiltonian(labels.x))))
-        x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
-        between = _phases((np.arange(2 * options.label_times) + 1) / (2 * options.label_times))
+        x = states(domain, fit.reference_states, fit.seed, Stream.REFERENCE)
+        between = _phases((np.arange(2 * fit.label_times) + 1) / (2 * fit.label_times))
         self.held_out = Labels.of(system, x, flow.dt * between, deadline.part(LABEL_SHARE))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -239,7 +241,7 @@ class SplitFit:
         return u
 
     def random(self, restart: int) -> np.ndarray:
-        rng = np.random.default_rng([stream_seed(self.options.seed, Stream.RESTARTS), restart])
+        rng = np.random.default_rng([stream_seed(self.fit.seed, Stream.RESTARTS), restart])
         u, dt = np.empty(self.n), self.flow.dt
         for c, part in zip(self.columns, self.slices, strict=True):
             m = (c.n + 1) // 2
@@ -270,7 +272,7 @@ class SplitFit:
         b = ((np.array(followed) - offsets) / scale).ravel()
         A = np.concatenate([A, ROUGHNESS * np.eye(A.shape[1])])
         theta = np.linalg.lstsq(A, np.concatenate([b, np.zeros(A.shape[1])]), rcond=None)[0]
-        weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.options.frozen_weight, 1.0)
+        weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.fit.frozen_weight, 1.0)
         weight /= math.sqrt(len(self.t))
 
         equal, bend = np.array([self.equal(t) for t in self.t]), (weight * pulls)[:, None] / scale
@@ -285,7 +287,7 @@ class SplitFit:
             data = [weight[j] * self.jacobian(u[j], j) @ designs[j] for j in range(len(self.t))]
             return residuals(theta), np.concatenate([*data, *(bend[..., None] * designs)])
 
-        m = levenberg_marquardt(residuals, linearized, theta, iterations=self.options.steps, stop=stop)
+        m = levenberg_marquardt(residuals, linearized, theta, iterations=self.solver.steps, stop=stop)
         self.assign(m.x)
         return m
 

@@ -1,29 +1,18 @@
-"""Flows to start a training from: their shapes, and the primed flow to fit where nothing else is said."""
+"""The primed flow to fit where nothing else is said, and domains and steps that suit no flow."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import partial
-from typing import ClassVar, Protocol
 
 import numpy as np
-import torch
 from scipy.integrate import DOP853
 
-from sympflow.flow.flow_map import FlowMap
-from sympflow.flow.mlp import MLPFlow, matching_widths
-from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.split import SplitFlow
-from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.options import NewFlow
+from sympflow.training.fits import PrimedFit
 from sympflow.training.points import Stream, box_without, start_times, states
-from sympflow.training.table_fit import take_over
 from sympflow.training.table_step import DENSE, forces_of
 
 SCALING_SAMPLES = 4096
@@ -41,108 +30,19 @@ ENERGIES = (0.9, 0.75, 0.5)  # shares of the states, with less energy than the o
 ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method, for many degrees of freedom
 
 
-class Start(Protocol):
-    """A flow before its training, of a `kind` that the command of the shipped flows knows."""
-
-    @property
-    def kind(self) -> str: ...
-
-    def flow(self, system: HamiltonianSystem, domain: Domain, earlier: FlowMap | None = None) -> FlowMap:
-        """The flow; `earlier` is one that was trained before, whose numbers it may take over."""
-
-
-# primed flows ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Primed:
-    """A primed flow, see `SympFlow.primed`.
-
-    Parameters
-    ----------
-    dt : float
-        Δt.
-    stages : int
-        Kicks of the kernel K.
-    processor : int
-        Kicks of the processor χ.
-    curvature : bool or tuple of int
-        Whether, or which, kicks have curvature terms.
-    polynomial : int, optional
-        The degree of the polynomials in place of these.
-    first : {"drift", "kick"}
-    scheme : str, optional
-        A scheme of `stages` kicks, from which the search starts in place of equal leapfrog steps: one of a high order
-        leads to valleys that random tables, most of whose numbers are positive, do not lie near.
-    force_gradient : bool or tuple of int, optional
-        Whether kicks have force gradients, or which: see `SympFlow.primed`.
-    """
-
-    dt: float
-    stages: int = 3
-    processor: int = 6
-    curvature: bool | tuple[int, ...] = False
-    polynomial: int | None = None
-    first: str = "drift"
-    scheme: str | None = None
-    force_gradient: bool | tuple[int, ...] | None = None
-
-    kind: ClassVar[str] = "primed"
-
-    @property
-    def levels(self) -> list[int]:
-        """The terms of each kick of a step, see `sympflow.schemes.Scheme.level`; one that steps share counts once."""
-        n = self.stages + (self.first == "kick")
-
-        def having(which: bool | tuple[int, ...] | None) -> Iterable[int]:
-            return which if isinstance(which, tuple) else range(n if which or which is None else 0)
-
-        levels = [(i in having(self.force_gradient)) * (1 + (i in having(self.curvature))) for i in range(n)]
-        return levels if self.first == "drift" else levels[:-1]
-
-    def flow(
-        self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None
-    ) -> PrimedFlow:
-        flow = SympFlow.primed(
-            system,
-            self.stages if self.scheme is None else None,
-            dt=self.dt,
-            scheme=self.scheme,
-            first=self.first,
-            processor=self.processor,
-            curvature=self.curvature,
-            force_gradient=self.force_gradient,
-            polynomial=self.polynomial,
-        )
-        if earlier is not None:
-            assert isinstance(earlier, PrimedFlow)
-            take_over(flow, earlier)
-        return flow
-
-
 def default_primed(
     system: HamiltonianSystem, domain: Domain | None = None, dt: float | None = None, phase: float = PHASE
-) -> Primed:
+) -> PrimedFit:
     """Three kicks and a processor of six, with Δt such that ω Δt is about 1; for a given Δt as many kicks as it needs.
 
     ω is the fastest frequency of the linearized motion, √ of the largest eigenvalue of M⁻¹∇²V, that 99 % of the states
     of the domain stay below. The processor costs nothing over a long run, and is larger than the kernel for that.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        Separable.
-    domain : Domain, optional
-        Ω; the default is that of the system.
-    dt : float, optional
-        Δt.
-    phase : float
-        Another ω Δt, where no Δt is given.
     """
     omega = frequency(system, system.domain if domain is None else domain)
     if dt is None:
-        return Primed(_rounded(phase / omega))
-    return Primed(float(dt), min(max(2, math.ceil(omega * dt / KICK_PHASE - 1e-9)), MOST_STAGES))
+        return PrimedFit(_rounded(phase / omega), stages=3, processor=6)
+    stages = min(max(2, math.ceil(omega * dt / KICK_PHASE - 1e-9)), MOST_STAGES)
+    return PrimedFit(float(dt), stages=stages, processor=6)
 
 
 @np.errstate(all="ignore")  # of states at which H is not defined
@@ -336,77 +236,9 @@ def _rounded(dt: float) -> float:
     return float(f"{max(m for m in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if m * unit <= dt * 1.02) * unit:.3g}")
 
 
-# split flows and networks ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Split:
-    """A split flow of a stiff system, see `SympFlow.split`; `turn` is Δt times the fastest frequency."""
-
-    turn: float
-    stages: int
-    terms: int
-    force_gradient: bool | tuple[int, ...] | None = None
-
-    kind: ClassVar[str] = "split"
-
-    def flow(
-        self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None
-    ) -> SplitFlow:
-        dt = self.turn / float(system.linear_part.frequencies.max())
-        return SympFlow.split(system, dt=dt, stages=self.stages, terms=self.terms, force_gradient=self.force_gradient)
-
-
 def scaling_of(domain: Domain, dt: float, seed: int) -> Scaling:
-    """The units of x and t, from samples of the domain.
-
-    Raises
-    ------
-    ValueError
-        If the squares of its states overflow.
-    """
+    """The units of x and t, from samples of the domain."""
     x = states(domain, SCALING_SAMPLES, seed, Stream.SCALING)
     if not np.abs(x).max() < math.sqrt(np.finfo(float).max) / SCALING_SAMPLES:
         raise ValueError(f"`domain` has states as large as {np.abs(x).max():.1e}, whose squares overflow: shrink it.")
     return Scaling.of_samples(x, dt)
-
-
-def new_network(system: HamiltonianSystem, new: NewFlow, dt: float, scaling: Scaling, seed: int) -> FlowMap:
-    """A SympFlow with MLP potentials, or the baseline of as many parameters.
-
-    Raises
-    ------
-    ValueError
-        If no baseline has as many parameters.
-    """
-    activation = "tanh" if new.activation is None else new.activation
-    make = partial(SympFlow, system.ndof) if system.autonomous else partial(SympFlow.timed, system)
-    flow = make(
-        3 if new.pairs is None else new.pairs,
-        hidden=(10, 10) if new.hidden is None else new.hidden,
-        activation=activation,
-        dt=dt,
-        dtype=torch.float64 if new.dtype is None else new.dtype,
-        device=new.device,
-        seed=seed,
-        scale=scaling,
-    )
-    if new.kind != "mlp":
-        return flow
-    if matching_widths(flow.ndof, flow.n_parameters) is None:
-        raise ValueError(
-            f"`hidden` and `pairs` describe a SympFlow of only {flow.n_parameters} parameters, which no "
-            "MLPFlow matches within 2 %: give wider layers or more pairs."
-        )
-    return MLPFlow.matching(flow, seed, scaling, activation)
-
-
-@dataclass(frozen=True)
-class Network:
-    """A network of the default widths, its `kind` "sympflow" or "mlp"."""
-
-    kind: str = "sympflow"
-    dt: float = 1.0
-
-    def flow(self, system: HamiltonianSystem, domain: Domain, earlier: FlowMap | None = None) -> FlowMap:
-        return new_network(system, NewFlow(self.kind), self.dt, scaling_of(domain, self.dt, SEED), SEED)

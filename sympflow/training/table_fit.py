@@ -32,14 +32,12 @@ from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import check_memory
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.monomials import in_monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.training.fits import GaussNewton, PrimedFit, Resolved
 from sympflow.training.least_squares import Blocks, Minimum, levenberg_marquardt, put_weights
 from sympflow.training.losses import Loss, Objective
-from sympflow.training.options import TableOptions
 from sympflow.training.points import (
     USELESS,
-    Labelled,
     Labels,
     PointSource,
     Stream,
@@ -83,27 +81,16 @@ RESIDUALS = 10  # at least, at Δt, for each number of the table; half as many f
 
 @dataclass
 class TableRun(SearchRun):
-    """The state of such a fit, and what acts on it.
-
-    Attributes
-    ----------
-    tried : PrimedFlow or None
-        A flow like this one from a trial, which the result of an interrupted run is to be no worse than.
-    runs : RunsFit or None
-        Long runs, to which the best tables are fitted in the end.
-    kept_start : bool
-        Whether the flow is returned as it was given.
-    at_start, at_end : ndarray
-        Differences from the exact flow at the held-out labels: of the flow as it was given, and as it is.
-    """
+    """The state of such a fit, and what acts on it."""
 
     flow: PrimedFlow
     scaling: Scaling
-    options: TableOptions
+    fit: Resolved
+    solver: Resolved
     step: TableStep
     frozen: TableFit | None
     weighted: TableFit | None
-    whole: Fit
+    whole: Problem
     held_out: Labels
     tried: PrimedFlow | None = None
     runs: RunsFit | None = None
@@ -124,25 +111,21 @@ class TableRun(SearchRun):
         system: HamiltonianSystem,
         domain: Domain,
         scaling: Scaling,
-        options: TableOptions,
-        data: Labelled | None = None,
+        fit: PrimedFit,
+        solver: GaussNewton = GaussNewton(),  # noqa: B008
         tried: PrimedFlow | None = None,
         deadline: Deadline | None = None,
         made_runs: MadeRuns | None = None,
     ) -> TableRun:
-        """A run for labels made on the spot, or for `data`: times (n,), states and where they go, (n, 2d).
+        """A run for labels made on the spot, or for the `data` of the options.
 
         `made_runs` gives the `runs` of a flow.
-
-        Raises
-        ------
-        ValueError
-            If T is not ½ pᵀM⁻¹p, no solution from the domain exists up to Δt, or the data have no labels at Δt.
-        OutOfTime
-            If the labels take longer than their share of the time.
         """
         deadline = Session().deadline if deadline is None else deadline
         fractions = FRACTIONAL_TIMES
+        options: Resolved = fit.resolved
+        solver = solver.but(restarts=24, steps=1000)
+        data: Any = options.data
         step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled=True)
         table = Table(flow)
         unit = np.array(scaling.x)
@@ -150,7 +133,7 @@ class TableRun(SearchRun):
             system.check_autonomous(
                 "and what is not its own labels tells no time at which a step begins", "leave out `loss` and `data`"
             )
-        parts: list[tuple[float, Fit]] = []
+        parts: list[tuple[float, Problem]] = []
         frozen = weighted = None
         if options.label_weight and data is None:
             numbers = table.frozen(flow.dt)[1].shape[-1]
@@ -190,14 +173,14 @@ class TableRun(SearchRun):
             loss = Loss(system, scaling, options.residual_weight, options.matching_weight, rest)
             shape = (flow.dt, options.loss_points, options.matching_times, options.seed, flow.dtype, flow.device)
             points_at = replace(PointSource(domain, *shape, block=1)(0), labels=_tensors(data) if rest else None)
-            parts.append((1.0, LossFit(table, Objective(loss, flow, points_at))))
+            parts.append((1.0, LossProblem(table, Objective(loss, flow, points_at))))
         x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
         t = flow.dt * (np.arange(fractions) + 0.5) / fractions
         t0 = start_times(system, flow.dt, len(x), options.seed, Stream.REFERENCE)
         held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE), t0)
         whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
         runs = None if made_runs is None else made_runs(flow)
-        run = cls(flow, system, domain, scaling, options, step, frozen, weighted, whole, held_out, tried, runs)
+        run = cls(flow, system, domain, scaling, options, solver, step, frozen, weighted, whole, held_out, tried, runs)
         began = deadline.session.passed
         run.at_start = run.differences()
         run.closing = LAST_EVALUATIONS * (deadline.session.passed - began)
@@ -207,19 +190,24 @@ class TableRun(SearchRun):
         super().begin(session)
         self._frozen_end = self.whole_end.part(FROZEN_SHARE)
 
-    def searched(self) -> Fit:
+    def searched(self) -> Problem:
         return self.frozen or self.whole
 
     @property
+    def most_steps(self) -> int:
+        """Iterations of each of the final fits."""
+        return self.solver.steps
+
+    @property
     def search_steps(self) -> int:
-        return min(SEARCH_STEPS, self.options.steps)
+        return min(SEARCH_STEPS, self.most_steps)
 
     def found(self, minimum: Minimum) -> dict[str, float]:
         self.table.assign(self._continued(min(self.minima, key=lambda m: m.cost)))
         return self._record(minimum)
 
     def complete(self, session: Session) -> None:
-        finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.options.steps
+        finalists, frozen, steps = _distinct(self.minima)[:FINALISTS], self.frozen, self.most_steps
         if frozen is not None:
             for fit in filter(None, (frozen, self.weighted)):
                 common = (fit, steps, self._frozen_end, True)
@@ -242,18 +230,18 @@ class TableRun(SearchRun):
         """Fit the finalists to long runs and take the best; False, with a warning, where there are none to compare."""
         labels = self.weighted or self.frozen
         assert labels is not None
-        fit = StackedFit((1.0, runs), (LABEL_WEIGHT, labels))
-        tables = [m.x for m in _distinct(finalists) if np.isfinite(fit.residuals(m.x)).all()]
+        both = StackedFit((1.0, runs), (LABEL_WEIGHT, labels))
+        tables = [m.x for m in _distinct(finalists) if np.isfinite(both.residuals(m.x)).all()]
         late = self.whole_end.over()
         if late or not tables:
             reason = "the time was up" if late else "those of the flow do not stay finite: take a shorter `dt`"
             warnings.warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning, stacklevel=8)
             self.runs = None
             return False
-        common = fit, min(self.options.steps, RUN_STEPS), self.whole_end, False
-        best = min(session.each(descended, common, tables, self.whole_end, fit.compiled), key=lambda m: m.cost)
+        common = both, min(self.most_steps, RUN_STEPS), self.whole_end, False
+        best = min(session.each(descended, common, tables, self.whole_end, both.compiled), key=lambda m: m.cost)
         theta = runs.parameters(best.x)
-        if self.options.label_times >= self.flow.shape.degree:  # fewer would leave the polynomials open in between
+        if self.fit.label_times >= self.flow.shape.degree:  # fewer would leave the polynomials open in between
             between = Restricted(self.whole, theta, self.table.free_at_dt())
             theta = between.point(between.minimize(between.start, RUN_STEPS, self.whole_end).x)
         self.table.assign(theta)
@@ -287,7 +275,7 @@ class TableRun(SearchRun):
 
     def _asked(self) -> np.ndarray:
         """The held-out states that were drawn."""
-        return states(self.domain, self.options.reference_states, self.options.seed, Stream.REFERENCE)
+        return states(self.domain, self.fit.reference_states, self.fit.seed, Stream.REFERENCE)
 
     def _lost(self) -> np.ndarray:
         """The drawn states from which no solution exists up to Δt."""
@@ -356,9 +344,7 @@ class TableRun(SearchRun):
         offset, design = table.polynomial(np.array([table.dt]))
         coefficients = offset[0] + design[0] @ given
         if restart:
-            coefficients = table.random(
-                np.random.default_rng([stream_seed(self.options.seed, Stream.RESTARTS), restart])
-            )
+            coefficients = table.random(np.random.default_rng([stream_seed(self.fit.seed, Stream.RESTARTS), restart]))
         if self.frozen is None:
             return table.continued(coefficients) if restart else given
         return table.frozen_parameters(coefficients)
@@ -383,11 +369,11 @@ class TableRun(SearchRun):
         return figures
 
 
-def _check_memory(points: int, options: TableOptions, numbers: int, ndof: int) -> None:
+def _check_memory(points: int, fit: Resolved, numbers: int, ndof: int) -> None:
     """Raise ValueError where the labels and the Jacobian of a fit are more than the memory of the machine."""
-    labels = max(points, min(points, FITTED_POINTS) * options.label_times, options.reference_states * FRACTIONAL_TIMES)
+    labels = max(points, min(points, FITTED_POINTS) * fit.label_times, fit.reference_states * FRACTIONAL_TIMES)
     check_memory(
-        f"`points` {points}, `label_times` {options.label_times} and `reference_states` {options.reference_states}",
+        f"`points` {points}, `label_times` {fit.label_times} and `reference_states` {fit.reference_states}",
         2 * ndof * labels * 3 * numbers,
         "take fewer",
     )
@@ -431,7 +417,7 @@ def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
 # least squares ------------------------------------------------------------------------------------------------------
 
 
-class Fit:
+class Problem:
     """Residuals of parameters θ whose sum of squares is to be small."""
 
     compiled = False
@@ -448,7 +434,7 @@ class Fit:
         """The same, the Jacobian in blocks where these are smaller."""
         return self.linearized(theta, check)
 
-    def own(self) -> Fit:
+    def own(self) -> Problem:
         """The same for one thread alone; one that changes nothing is that already."""
         return self
 
@@ -469,14 +455,14 @@ class Fit:
         )
 
 
-class StackedFit(Fit):
+class StackedFit(Problem):
     """Several fits of the same parameters, with a weight each."""
 
-    def __init__(self, *parts: tuple[float, Fit]) -> None:
+    def __init__(self, *parts: tuple[float, Problem]) -> None:
         self.parts = parts
         self.compiled = all(fit.compiled for _, fit in parts)
 
-    def own(self) -> Fit:
+    def own(self) -> Problem:
         return StackedFit(*((weight, fit.own()) for weight, fit in self.parts))
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
@@ -487,14 +473,8 @@ class StackedFit(Fit):
         return np.concatenate([w * r for w, r, _ in pieces]), np.concatenate([w * J for w, _, J in pieces])
 
 
-class RunsFit(Fit):
-    """Errors in long runs by the frozen parameters of a table.
-
-    Attributes
-    ----------
-    record : dict
-        The choices of the runs, for the recipe of a flow.
-    """
+class RunsFit(Problem):
+    """Errors in long runs by the frozen parameters of a table."""
 
     record: dict[str, Any]
 
@@ -506,10 +486,10 @@ class RunsFit(Fit):
 MadeRuns = Callable[[PrimedFlow], RunsFit]
 
 
-class Restricted(Fit):
+class Restricted(Problem):
     """A fit of parameters that are a point and some directions (f, k) times what is to be found, (k,)."""
 
-    def __init__(self, fit: Fit, point: np.ndarray, directions: np.ndarray) -> None:
+    def __init__(self, fit: Problem, point: np.ndarray, directions: np.ndarray) -> None:
         self._fit, self._origin, self._directions = fit, point, directions
         self.start = np.zeros(directions.shape[1])
 
@@ -525,13 +505,13 @@ class Restricted(Fit):
         return r, J @ self._directions
 
 
-class LossFit(Fit):
+class LossProblem(Problem):
     """The residuals of a `Loss` (the flow's residual, Hamiltonian matching, labels at any times) at given points."""
 
     def __init__(self, table: Table, objective: Objective) -> None:
         self.table, self.objective = table, objective
 
-    def own(self) -> Fit:  # the parameters are put into the flow
+    def own(self) -> Problem:  # the parameters are put into the flow
         return copy.deepcopy(self)
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
@@ -544,21 +524,8 @@ class LossFit(Fit):
         return r.detach().numpy(), J.detach().numpy()
 
 
-class TableFit(Fit):
-    """The labels' residuals as a function of parameters on which the table at each time depends affinely.
-
-    Parameters
-    ----------
-    step : TableStep
-    labels : Labels
-    offset, design : (J, n), (J, n, f)
-        The coefficients at the label times are offset + design · θ.
-    unit : (2d,)
-        Residuals are divided by it.
-    weight : (J,)
-    slope : (J, N, 2d), optional
-        Of the energy, in such units that an error δ counts by slope·δ besides.
-    """
+class TableFit(Problem):
+    """The labels' residuals as a function of parameters on which the table at each time depends affinely."""
 
     def __init__(
         self,
@@ -763,42 +730,12 @@ class Table:
             table += self._places[2] @ (rng.choice([0.0, 1 / 12]) * np.abs(kicks) ** 3)
         elif flow.polynomials is not None:
             size = rng.choice([0.0, 1 / 12]) * np.abs(kicks) ** 3
-            for place, e in zip(self._places[2 : self._kernel], force_gradient_in(flow), strict=True):
+            for place, e in zip(self._places[2 : self._kernel], flow.force_gradient_coefficients(), strict=True):
                 table += place @ (size * e)
         for c, place in zip(self.columns[self._kernel :], self._places[self._kernel :], strict=True):
             if c.power == 1:
                 table += place @ rng.normal(0, PROCESSOR_SPREAD * self.dt, c.offset.shape[0])
         return table
-
-
-def force_gradient_in(flow: PrimedFlow) -> np.ndarray:
-    """−½|∇V|²_{M⁻¹} by the monomials of the flow's kicks (M,); 0 where it is no such polynomial."""
-    system = flow.system
-    assert system is not None
-    assert system.symbols is not None
-    e = in_monomials(system.symbols.force_gradient, system.symbols, flow.monomials)
-    return np.zeros(len(flow.monomials)) if e is None else e
-
-
-@torch.no_grad()
-def take_over(flow: PrimedFlow, other: PrimedFlow) -> None:
-    """Give a flow the numbers of another with as many kicks: those of a longer Δt as they are at its own.
-
-    Polynomials take over force gradients.
-    """
-    shorter = min(flow.dt / other.dt, 1.0)
-    mine, theirs = dict(flow.columns()), dict(other.columns())
-    for name, column in mine.items():
-        if name in theirs:
-            column.set(theirs[name].table.cpu().double().numpy() * shorter ** np.array(theirs[name].exponents, float))
-    if flow.polynomials is None or other.gradients is None:
-        return
-    e = force_gradient_in(flow)
-    for part in ("", "processor_"):
-        gradients = theirs[f"{part}gradients"]
-        table = gradients.table.cpu().double().numpy() * shorter ** np.array(gradients.exponents, float)
-        for m, e_m in enumerate(e):
-            mine[f"{part}polynomials.{m}"].set(e_m * table)
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:

@@ -15,10 +15,10 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
-from sympflow.training.options import TableOptions
+from sympflow.training.fits import GaussNewton, PrimedFit, Resolved
 from sympflow.training.points import USELESS, Stream, shares_missed, start_times, states, step_errors
 from sympflow.training.session import Deadline, OutOfTime, Session
-from sympflow.training.starts import PHASE, SEED, Primed, default_primed
+from sympflow.training.starts import PHASE, SEED, default_primed
 from sympflow.training.table_fit import TableRun
 
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
@@ -66,7 +66,7 @@ ALIKE = 2.0  # energy errors above that which differ by no more are the same
 class Trial:
     """The flow of a short fit, None if it leads nowhere, and its energy error."""
 
-    start: Primed
+    start: Resolved
     error: float
     flow: PrimedFlow | None = None
 
@@ -93,17 +93,17 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     from sympflow.kernels.splitting_loops import splitting_loops
 
     assert system.symbols is not None
-    starts = tried_starts(system, domain, curvature=False)
+    starts: list[Resolved] = tried_starts(system, domain, curvature=False)
     try:
         ranges = position_ranges(system.symbols, domain) if system.autonomous else ()
         loops = splitting_loops(system)
         costs = [loops.kick_cycles(level, ranges if level else ()) for level in (0, FORCE_GRADIENT, CURVATURE)]
     except ValueError:  # H has no compiled form
         return Trial(starts[0], math.inf)
-    session, found = Session() if session is None else session, dict[Primed, Trial]()
+    session, found = Session() if session is None else session, dict[PrimedFit, Trial]()
     interruption, deadline = session.interruption, session.deadline.part(SHARE)
 
-    def good(tried: list[Primed]) -> dict[Primed, float]:
+    def good(tried: list[Resolved]) -> dict[Resolved, float]:
         """The work of those that are good enough."""
         least = min(found[start].error for start in tried)
         worst = GOAL if least <= GOAL else ALIKE * least
@@ -116,14 +116,14 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
             if found[start].error <= worst
         }
 
-    def best(tried: list[Primed]) -> Primed:
+    def best(tried: list[PrimedFit]) -> PrimedFit:
         work = good(tried)
         return min(work, key=work.__getitem__)
 
     bends = costs[CURVATURE] <= DEAREST * costs[FORCE_GRADIENT]
     with session.bar(len(starts) + bends + 2 * len(SHAPES), f"{system.name} trials") as bar:
 
-        def attempt(wanted: list[Primed]) -> None:
+        def attempt(wanted: list[PrimedFit]) -> None:
             answers = session.each(_trial_of, (system, domain, deadline), wanted, deadline)
             for start in wanted:
                 if deadline.over():
@@ -161,7 +161,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         return found[min(long, key=lambda start: long[start] * (1.0 if start == first else CLEAR), default=first)]
 
 
-def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[Primed]) -> None:
+def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[PrimedFit]) -> None:
     """Warn where the time ended the trials, not Ctrl-C: the flow may be far from what `train` finds else."""
     if n_tried < len(wanted) and not session.interruption.asked:
         warnings.warn(
@@ -174,8 +174,8 @@ def _warn_if_cut(session: Session, n_tried: int, wanted: Collection[Primed]) -> 
 
 
 def _long_work(
-    work: dict[Primed, float], found: dict[Primed, Trial], system: HamiltonianSystem, domain: Domain
-) -> dict[Primed, float]:
+    work: dict[PrimedFit, float], found: dict[PrimedFit, Trial], system: HamiltonianSystem, domain: Domain
+) -> dict[PrimedFit, float]:
     """The estimated work of those that are nearly as good as the best, by their energy errors in long runs."""
     near = [start for start in sorted(work, key=work.__getitem__) if work[start] <= NEAR * min(work.values())][:NEAREST]
     flows = [flow for start in near if (flow := found[start].flow) is not None]
@@ -208,19 +208,19 @@ def long_errors(flows: Sequence[PrimedFlow], system: HamiltonianSystem, domain: 
     return errors
 
 
-def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[Primed]:
+def tried_starts(system: HamiltonianSystem, domain: Domain, curvature: bool = True) -> list[PrimedFit]:
     """The flows that are tried first, from the shortest Δt to the longest; with `curvature` also with such terms."""
     plain = list(dict.fromkeys(default_primed(system, domain, phase=phase) for phase in PHASES))
     return plain + [replace(start, curvature=True) for start in plain if curvature]
 
 
-def all_starts(system: HamiltonianSystem, domain: Domain) -> list[Primed]:
+def all_starts(system: HamiltonianSystem, domain: Domain) -> list[PrimedFit]:
     """All flows that `chosen_trial` may choose."""
     starts = tried_starts(system, domain)
     return starts + [other for start in starts for other in shaped(start)]
 
 
-def shaped(start: Primed) -> list[Primed]:
+def shaped(start: Resolved) -> list[PrimedFit]:
     """The flow in each of the `SHAPES` with kicks of its kind, about as many in a unit of time: see `dividing`."""
     made = []
     for shape, processor, longer in SHAPES:
@@ -255,13 +255,13 @@ def dividing(dt: float) -> float:
     return min((10 * unit / n for n in range(1, 11)), key=lambda t: abs(math.log(t / dt)))
 
 
-def _described(start: Primed) -> str:
+def _described(start: PrimedFit) -> str:
     words = {0: "plain", FORCE_GRADIENT: "with a force gradient", CURVATURE: "with a curvature term"}
     kinds = ", ".join(f"{start.levels.count(level)} {words[level]}" for level in sorted({*start.levels}))
     return f"Δt = {start.dt:g}, kicks: {kinds}; processor of {start.processor}"
 
 
-def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: Primed) -> Trial:
+def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: PrimedFit) -> Trial:
     """A trial as a piece of work, which says nothing where the time ends within it."""
     system, domain, deadline = common
     try:
@@ -270,31 +270,31 @@ def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: Primed)
         return Trial(start, math.inf)
 
 
-def trial(start: Primed, system: HamiltonianSystem, domain: Domain, deadline: Deadline | None = None) -> Trial:
+def trial(start: Resolved, system: HamiltonianSystem, domain: Domain, deadline: Deadline | None = None) -> Trial:
     """A short fit of the flow at its Δt, with its relative energy error, the median over held-out orbits.
 
     Infinite if there are no orbits, or the fit leads nowhere: where in the median it misses a tenth of what a step
     moves a state. The energy alone would be kept best by the identity.
     """
     deadline = Session().deadline if deadline is None else deadline
-    options = TableOptions(
-        points=POINTS, label_times=1, restarts=STARTS, steps=STEPS, reference_states=ORBITS, seed=SEED
-    )
-    scaling = Scaling.of_samples(states(domain, 1000, SEED, Stream.SCALING), start.dt)
+    dt = start.dt
+    fit = replace(start, points=POINTS, label_times=1, reference_states=ORBITS, seed=SEED)
+    solver = GaussNewton(restarts=STARTS, steps=STEPS)
+    scaling = Scaling.of_samples(states(domain, 1000, SEED, Stream.SCALING), dt)
     try:
-        run = TableRun.start(start.flow(system), system, domain, scaling, options, deadline=deadline)
+        run = TableRun.start(start.flow(system), system, domain, scaling, fit, solver, deadline=deadline)
     except (ValueError, OutOfTime):  # of no state of Ω the solution exists up to Δt, or it takes too long
         return Trial(start, math.inf)
-    fit = run.frozen
-    assert fit is not None
+    frozen = run.frozen
+    assert frozen is not None
     for _ in range(STARTS):
         run.minima.append(run.next_minimum(deadline.session, deadline))
     best = min(run.minima, key=lambda m: m.cost)
-    for final in filter(None, (fit, run.weighted)):
+    for final in filter(None, (frozen, run.weighted)):
         best = final.minimize(best.x, FINAL_STEPS, deadline, thorough=True)
-    table = fit.coefficients(best.x)[:, :1]
+    table = frozen.coefficients(best.x)[:, :1]
     exact = states(domain, ORBITS, SEED, Stream.REFERENCE)
-    t = start_times(system, start.dt, len(exact), SEED, Stream.REFERENCE)
+    t = start_times(system, dt, len(exact), SEED, Stream.REFERENCE)
     H, worst, y = system.hamiltonian(exact, t), np.zeros(len(exact)), exact.T
     scale = np.abs(H) if system.energy_scale is None else system.energy_scale
     labels = run.held_out
@@ -306,8 +306,8 @@ def trial(start: Primed, system: HamiltonianSystem, domain: Domain, deadline: De
             end = run.step(table, y, t0=t)
             y, E = end[: len(y)], end[len(y) :].sum(0)  # less the work of a drive, where there is one
             if not system.conservative:  # the energy that the exact flow has left
-                exact = reference_step(system, exact, start.dt, REFERENCE, deadline.check, t)
-            t = None if t is None else t + start.dt
+                exact = reference_step(system, exact, dt, REFERENCE, deadline.check, t)
+            t = None if t is None else t + dt
             H = H - E if system.conservative else system.hamiltonian(exact, t)
             worst = np.maximum(worst, np.abs(system.hamiltonian(y.T, t) - H))
         worst /= scale

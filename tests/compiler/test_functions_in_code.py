@@ -1,13 +1,14 @@
 """Machine code of elementary functions: as accurate as promised, and the same in a scalar as in every lane."""
 
 import ctypes
+import math
 
 import mpmath
 import numpy as np
 import pytest
 
 from sympflow.compiler.control import INT, POINTER, Module, Type
-from sympflow.compiler.elementary import INLINE
+from sympflow.compiler.elementary import FAR, INLINE
 from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.machine import compiled
 
@@ -30,7 +31,8 @@ def wide(low, high, count=400):
     return np.exp(around((low + high) / 2, (high - low) / 2, count))
 
 
-ANGLES = np.concatenate([around(0, 7), around(0, 1e9), wide(-740, 20), -wide(20, 709), HALVES, WORST])
+ANGLES = np.concatenate([around(0, 7), around(0, FAR[False]), around(0, FAR[True]), wide(-740, 20), HALVES])
+FAR_ANGLES = np.concatenate([-wide(21, 709), WORST])
 LIMITS = np.array([708.0, 708.1, 709.4, 709.78, -708.0, -708.1, -740.0, -745.1, 1e-17])
 CASES = {  # points, and the largest errors in units in the last place, with fused operations and without
     "exp": (np.concatenate([around(0, 700), around(0, 1), LIMITS]), 1.0, 1.0),
@@ -102,6 +104,14 @@ def test_accuracy_and_the_same_bits_in_all_lanes(name):
 def test_accuracy_without_fused_operations(name):
     x, _, bound = CASES[name]
     assert units(run(of(name), x, width=8, fused=False), getattr(mpmath, name), x) < bound
+
+
+@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize("name", ["sin", "cos", "tan"])
+def test_angles_of_millions_of_turns_go_to_the_c_library(name, fused):
+    expected = np.array([*map(getattr(math, name), FAR_ANGLES)])
+    for width in (1, 8):
+        assert same(run(of(name), FAR_ANGLES, width=width, fused=fused), expected)
 
 
 @pytest.mark.parametrize("fused", [True, False])

@@ -38,7 +38,7 @@ def started(flow):
 
 
 def test_every_family_is_here():
-    assert FLOWS.keys() == FAMILIES.keys()
+    assert FLOWS.keys() - {"timed"} == FAMILIES.keys()  # a SympFlow with a drive
 
 
 @EACH
@@ -46,7 +46,7 @@ def test_a_flow_is_built_again_from_its_architecture(name):
     make, system = FLOWS[name]
     flow = make()
     plan = flow.architecture()
-    assert type(flow) is family(name) is family_of(flow.kind, plan)
+    assert type(flow) is family("sympflow" if name == "timed" else name) is family_of(flow.kind, plan)
     again = type(flow).from_architecture(plan["ndof"], plan, flow.dt, flow.dtype)
     assert again.architecture() == plan
     again.load_state_dict(flow.state_dict())

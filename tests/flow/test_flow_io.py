@@ -2,7 +2,6 @@
 
 import json
 import math
-import pickle
 import struct
 from pathlib import Path
 
@@ -330,15 +329,6 @@ def test_the_domain_of_a_file_is_a_domain(tmp_path):
     flow.domain = Ball([0.0, 0.0], 2.0)
     flow.save(tmp_path / "ball.safetensors")
     assert load(tmp_path / "ball.safetensors").domain == flow.domain
-
-
-def test_a_pickle_of_a_version_without_identities_is_read():
-    flow = SympFlow.primed(henon_heiles(), 3, dt=0.5)
-    for name in ("identity", "unfitted", "drive_times"):
-        vars(flow).pop(name, None)
-    again = pickle.loads(pickle.dumps(flow))
-    assert again.identity is None
-    assert again.unfitted == ()
 
 
 @pytest.mark.parametrize(

@@ -66,8 +66,8 @@ def states(n, d):
 
 @pytest.fixture(autouse=True)
 def _own_registries(monkeypatch):
-    for table in ("_activations", "_potentials"):
-        monkeypatch.setattr(potentials, table, dict(getattr(potentials, table)))
+    for register in (potentials.activations, potentials.potentials):
+        monkeypatch.setattr(register, "added", dict(register.added))
     torch.manual_seed(5)
 
 
@@ -272,9 +272,12 @@ def test_activations_that_cannot_be_right_are_refused(arguments, error, message)
 
 
 def test_closed_forms_of_a_user_are_checked():
-    class Wrong(potentials.Tanh):
+    class Wrong(potentials.Activation):
+        def slope(self, a):
+            return potentials.ACTIVATIONS["tanh"].slope(a)
+
         def tangent(self, a, da):
-            h, slope, dh, dslope = super().tangent(a, da)
+            h, slope, dh, dslope = potentials.ACTIVATIONS["tanh"].tangent(a, da)
             return h, slope, dh, -dslope
 
     with pytest.raises(ValueError, match=r"^`activation` 'wrong' has a tangent\(\) whose dslope is not that of value"):
@@ -321,7 +324,7 @@ def test_a_file_says_which_activation_it_needs_and_how_it_gets_it(tmp_path, monk
     flow = SympFlow(1, pairs=1, hidden=(3,), activation="softsign_like")
     flow.save(path)
     assert torch.equal(load(path)(0.5, states(2, 1)), flow(0.5, states(2, 1)))
-    monkeypatch.setattr(potentials, "_activations", {})
+    monkeypatch.setattr(potentials.activations, "added", {})
     with pytest.raises(ValueError) as refused:
         load(path)
     assert str(refused.value).endswith(
@@ -343,7 +346,7 @@ def test_a_file_says_which_potential_it_needs_and_how_it_gets_it(tmp_path, monke
     register_potential("square", Crooked)
     with pytest.raises(ValueError, match=r"its potential 'square' cannot be built \(KeyError: 'width'\)"):
         load(path)
-    monkeypatch.setattr(potentials, "_potentials", {"mlp": MLPPotential})
+    monkeypatch.setattr(potentials.potentials, "added", {})
     with pytest.raises(ValueError, match=r"it needs the potential 'square', .* sympflow.flow.potentials.register_pot"):
         load(path)
 
@@ -380,9 +383,11 @@ def announced(monkeypatch):
         EntryPoint("pi", "math:pi", potentials.POTENTIAL_GROUP),
     ]
     monkeypatch.setattr(metadata, "entry_points", lambda group: [p for p in points if p.group == group])
-    potentials._announced.cache_clear()
+    for register in (potentials.activations, potentials.potentials):
+        vars(register).pop("announced", None)
     yield
-    potentials._announced.cache_clear()
+    for register in (potentials.activations, potentials.potentials):
+        vars(register).pop("announced", None)
 
 
 def test_a_file_finds_what_installed_plugins_announce(announced, tmp_path):
@@ -393,7 +398,7 @@ def test_a_file_finds_what_installed_plugins_announce(announced, tmp_path):
     assert torch.equal(load(tmp_path / "flow.safetensors")(0.4, states(2, 1)), flow(0.4, states(2, 1)))
     with pytest.raises(ImportError, match=r"^`activation` 'seven' of the plug-in .* is none"):
         activation_named("seven")
-    with pytest.raises(ImportError, match=r"^`potential` 'pi' of the plug-in .* is no Potential class"):
+    with pytest.raises(ImportError, match=r"^`potential` 'pi' of the plug-in .* is none"):
         potentials.potential_named("pi")
 
 

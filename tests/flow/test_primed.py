@@ -479,9 +479,9 @@ def test_times_of_a_scheme():
 
 def test_options_of_primed_are_none_of_train():
     with pytest.raises(
-        TypeError, match=r"^`curvature` is .*: pass flow=SympFlow.primed\(system, ..., curvature=True\)"
+        TypeError, match=r"^`palindromic` is .*: pass flow=SympFlow.primed\(system, ..., palindromic=False\)"
     ):
-        train(HH, curvature=True)
+        train(HH, palindromic=False)
     with pytest.raises(TypeError, match=r"^`restart` is no option of train\(\): is `restarts` meant\?"):
         train(HH, restart=2)
 

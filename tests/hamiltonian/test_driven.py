@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 import sympflow
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.fingerprint import same_system
-from sympflow.studies.reports import described, title
+from sympflow.studies.reports import described
 from sympflow.systems.user_files import from_toml
 from sympflow.testing.checks import CHECKS
 
@@ -286,7 +286,7 @@ def test_reports_name_a_drive_and_its_samples():
     assert report.rows[0].status == "ok"
     assert report.to_dict()["system"]["params"] == {"a": 0.3, "w": W}
     sampled = made("p**2/2 - a*cos(q)", params=SAMPLED, t_span=(0, 9))
-    assert "81 samples" in title(sampled)
+    assert "81 samples" in sampled.title
     assert "samples" in described(sampled)["params"]["a"]
 
 

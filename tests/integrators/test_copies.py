@@ -10,6 +10,8 @@ import sympflow
 from sympflow import HamiltonianSystem, systems
 from sympflow.interop.scipy import as_scipy
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 H = "(q**2 + 1)*(p**2 + 1)/2"
 
 

@@ -11,7 +11,7 @@ from sympflow.hamiltonian.monomials import gradient, in_monomials, monomials, va
 from sympflow.integrators.splitting import Splitting
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.schemes import Scheme
-from sympflow.training.starts import Primed
+from sympflow.training.fits import PrimedFit
 
 pytestmark = pytest.mark.slow
 
@@ -162,7 +162,7 @@ def test_a_rung_takes_over_the_force_gradients():
     """If a polynomial holds ½|∇V|², the search begins at the table without one; and comes nearer than that."""
     options = {"restarts": 1, "points": 60, "label_times": 2, "reference_states": 50}
     before = train(QUARTIC, flow=SympFlow.primed(QUARTIC, 3, dt=0.5, processor=2), **{**options, "restarts": 3})
-    start, after = Primed(0.5, 3, 2, polynomial=6).flow(QUARTIC, earlier=before), {}
+    start, after = PrimedFit(0.5, stages=3, processor=2, polynomial=6).flow(QUARTIC, earlier=before), {}
     flow = train(QUARTIC, flow=start, steps=1, callback=lambda n, figures: after.update(figures), **options)
     assert flow.monomials == monomials(QUARTIC.symbols, 6)
     assert after["one_step_error"] < before.figures["one_step_error"]

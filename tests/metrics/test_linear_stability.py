@@ -10,6 +10,8 @@ from sympflow import HamiltonianSystem, get, max_energy_error, solve, systems
 from sympflow.metrics.linear_stability import half_trace, linear_stability, of_method, small_oscillations
 from sympflow.schemes import SCHEMES, Scheme, compose
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 FIRST_EXIT = {
     **{"verlet": 2.0, "leapfrog": 2.0, "yoshida4": 1.5734, "yoshida6": 2.2691, "suzuki4": 2.7210, "mclachlan4": 3.0355},
     **{"blanes_moan4": 3.1328, "kahan_li6": 2.5326, "kahan_li8": 3.0964, "srkn6b": 3.1635, "srkn11b": 3.1414},

@@ -8,6 +8,8 @@ import pytest
 from sympflow import HamiltonianSystem, energy_drift, energy_error, max_energy_error, solve, systems
 from sympflow.metrics.energy import energy_scale
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 
 @pytest.mark.parametrize(("omega", "z"), [(1.0, 0.1), (1.0, 0.9), (1.0, 1.9), (1e6, 0.9)])
 def test_verlet_energy_error_on_the_oscillator_is_bounded_by_a_quarter_of_z_squared(omega, z):

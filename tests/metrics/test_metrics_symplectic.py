@@ -21,6 +21,8 @@ from sympflow.flow.shipped import shipped
 from sympflow.integrators.base import FixedStep
 from sympflow.metrics.symplectic import loop_area, natural_scale, step_tangents
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 EPS = np.finfo(float).eps
 SPLITTINGS = ["verlet", "leapfrog", "yoshida4", "kahan_li8", "chin4a"]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sympflow import compare, get, poincare_section, systems
-from sympflow.studies.figure_style import labelled, legend_above, new_figure
+from sympflow.show.style import labelled, legend_above, new_figure
 from sympflow.studies.figures import _annotate, overview, save_comparison
 
 

@@ -8,7 +8,7 @@ import torch
 from conftest import KINDS
 
 import sympflow
-from sympflow import poincare_section, solve, systems
+from sympflow import HamiltonianSystem, poincare_section, solve, systems
 from sympflow.integrators.tableaux import ADAPTIVE
 
 HH, OSCILLATOR = systems.henon_heiles(), systems.harmonic_oscillator()
@@ -248,3 +248,39 @@ def test_a_driven_system_without_a_period_needs_one():
         poincare_section(system, "verlet", (0, 1))
     assert len(poincare_section(system, "leapfrog", (0, 1), period=0.5)) == 3
     assert len(poincare_section(OSCILLATOR, "leapfrog", (0, 20), period=2 * np.pi)) == 4  # of any system
+
+
+SI = {"m": 1e-27, "w": 1e13, "k": 1e20}
+TRAP = HamiltonianSystem.from_sympy(
+    "(p1**2 + p2**2)/(2*m) + m*w**2*(q1**2 + q2**2)/2 + k*q1**2*q2**2", params=SI, t_span=(0, 1e-11)
+)
+
+
+@pytest.mark.parametrize(
+    ("system", "energy"),
+    [(systems.henon_heiles(), 0.125), (systems.henon_heiles(), 0.01), (TRAP, 1e-21), (systems.pendulum(), 0.7)],
+)
+@pytest.mark.parametrize("direction", [1, -1, 0])
+def test_orbits_of_one_energy_start_on_the_plane(system, energy, direction):
+    section = poincare_section(system, None, (0, 20 * system.dt), energy=energy, n=40, direction=direction)
+    np.testing.assert_allclose(system.hamiltonian(section.y0), energy, rtol=1e-13)
+    assert (section.y0[:, 0] == 0).all()
+    velocities = system.vector_field(section.y0)[:, 0]
+    assert (direction * velocities >= 0).all()
+    if system.ndof == 2:
+        spread = np.abs(section.y0[:, 1]).max() / np.abs(section.y0[:, 1]).min()
+        assert spread > 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
+        ({"energy": -1.0}, "`energy` -1 is below"),
+        ({"energy": 0.1, "y0": systems.henon_heiles().y0}, "`energy` and `y0`"),
+        ({"n": 4}, "`n` orbits are drawn for an `energy`"),
+        ({"energy": np.nan}, "`energy` must be a finite number"),
+    ],
+)
+def test_energies_are_checked(arguments, answer):
+    with pytest.raises(ValueError, match=answer):
+        poincare_section(systems.henon_heiles(), "verlet", (0, 1), **arguments)

@@ -14,6 +14,8 @@ from sympflow.integrators.base import FixedStep
 from sympflow.studies.attempts import Row, warm_up
 from sympflow.studies.precision import break_even, cost_at
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 QUICK = {"t_span": (0, 10), "n_outputs": 10, "repeats": 1}
 
 

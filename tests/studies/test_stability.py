@@ -20,6 +20,8 @@ from sympflow.metrics.linear_stability import small_oscillations
 from sympflow.studies.attempts import candidates
 from sympflow.studies.step_stability import Search, Study, blow_up, initial_states
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 SINGULARITY = 5.450984210235402  # of Hénon–Heiles from q = 0, p = (0, 0.7)
 
 

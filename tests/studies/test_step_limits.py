@@ -5,6 +5,8 @@ import pytest
 
 from sympflow import max_energy_error, solve, systems
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 BOUNDS = {"verlet": lambda z: z**2 / 4, "leapfrog": lambda z: z**2 / 4 / (1 - z**2 / 4)}
 
 

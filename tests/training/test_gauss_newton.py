@@ -12,8 +12,8 @@ from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
 from sympflow.flow.scaling import Scaling
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trainer
+from sympflow.training.fits import PrimedFit
 from sympflow.training.least_squares import levenberg_marquardt
-from sympflow.training.options import TableOptions
 from sympflow.training.points import Labels, Stream, states
 from sympflow.training.table_fit import Table, TableFit, TableRun
 from sympflow.training.table_step import TableStep
@@ -111,7 +111,7 @@ def test_derivatives_by_the_table(system, force_gradient, first):
         np.testing.assert_allclose(J[:, :, k].T, expected.numpy(), rtol=1e-12, atol=1e-13)
 
 
-FEW = TableOptions(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
+FEW = PrimedFit(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
 
 
 def errors_of(run, psi):
@@ -338,7 +338,7 @@ def test_other_losses_train_too(loss):
 def test_residuals_of_a_loss_are_those_of_the_flow():
     """The whole fit against Loss: the sum of squares is the loss, and the Jacobian its derivative."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=1)
-    config = TableOptions(label_weight=0.0, residual_weight=2.0, matching_weight=3.0, loss_points=20)
+    config = PrimedFit(loss="residual+matching", residual_weight=2.0, matching_weight=3.0, loss_points=20)
     run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
     theta = Table(flow).parameters() + np.random.default_rng(0).normal(0, 0.02, flow.n_parameters)
     r, J = run.whole.linearized(theta)
@@ -568,11 +568,12 @@ def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatc
     assert all(torch.equal(v, resumed.state_dict()[k]) for k, v in whole.state_dict().items())
 
 
-def test_nothing_said_means_at_most_a_quarter_of_a_minute(monkeypatch):
-    """A search that is out of time ends with what it has, says so in the recipe, and does not warn."""
-    monkeypatch.setattr("sympflow.training.trainer.SHORT_BUDGET", 4.0)
+def test_nothing_said_means_at_most_a_minute(monkeypatch):
+    """A search that is out of time ends with what it has, says so in the recipe, and warns: it is another flow."""
+    monkeypatch.setattr("sympflow.training.trainer.BUDGET", 4.0)
     monkeypatch.setattr("sympflow.kernels.table_loops.table_loops", lambda *_: None)  # slower
-    flow = train(PENDULUM, points=60, reference_states=20, progress=False)
+    with pytest.warns(RuntimeWarning, match="of 72 starts because the time budget was used up"):
+        flow = train(PENDULUM, points=60, reference_states=20, progress=False)
     stage = flow.recipe["stages"][-1]
     assert stage["restarts_taken"] < stage["restarts"] == 72
     assert stage["ended_early"] == "the time budget was used up"
@@ -584,4 +585,4 @@ def test_nothing_said_means_at_most_a_quarter_of_a_minute(monkeypatch):
             train(PENDULUM, points=30, reference_states=5, **options)
         assert seen["budget"] is None if budget is None else 0 < seen["budget"] <= budget  # labels are part of it
     monkeypatch.undo()
-    assert (trainer.BUDGET, trainer.SHORT_BUDGET) == (60.0, 15.0)
+    assert trainer.BUDGET == 60.0

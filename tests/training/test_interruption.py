@@ -244,7 +244,7 @@ def test_a_budget_and_the_training_time_count_the_trials(monkeypatch):
 
     monkeypatch.setattr(trials, "chosen_trial", chosen)
     monkeypatch.setattr(TableRun, "go", go)
-    for options, whole in (({"time_budget": 70.0}, 70.0), ({}, trainer.SHORT_BUDGET)):
+    for options, whole in (({"time_budget": 70.0}, 70.0), ({}, trainer.BUDGET)):
         clock.now = 0.0
         with pytest.raises(KeyboardInterrupt):
             train(PENDULUM, progress=False, **options)

@@ -27,16 +27,14 @@ from sympflow.flow.shipped import ShippedFlow, choose
 from sympflow.integrators import flows
 from sympflow.training import pretrained
 from sympflow.training.clock_fit import clock_errors
-from sympflow.training.options import NewFit
+from sympflow.training.fits import GaussNewton, PrimedFit
 from sympflow.training.shipped import rows
 from sympflow.training.shipped.judges import ByCertificate, one_step_errors, primed_cost
 from sympflow.training.shipped.recipe import Recipe, made
-from sympflow.training.starts import Primed
-from sympflow.training.table_fit import take_over
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUARTIC = HamiltonianSystem.from_sympy("p**2/2 + q**4/4", name="plain_quartic", domain=sympflow.Ball([0.0, 0.0], 1.0))
-QUICK = NewFit(restarts=2, points=40, reference_states=10, steps=20)
+QUICK = PrimedFit(0.5, stages=2, processor=0, points=40, reference_states=10)
 LADDERS = {scene: [r for r in rows.ladders() if r.scene == scene] for scene in {r.scene: 0 for r in rows.ladders()}}
 FILES = [f for f in shipped_flows() if f.stages is not None or f.shift is not None]
 
@@ -202,7 +200,7 @@ def test_listing_loads_no_weights():
 
 
 def test_the_command_builds_a_ladder(tmp_path, monkeypatch, capsys):
-    rungs = [rows.rung("pendulum", s, 0.5, 0, QUICK, judge=ByCertificate(50.0)) for s in (1, 2)]
+    rungs = [rows.rung("pendulum", replace(QUICK, stages=s), 2, 20, judge=ByCertificate(50.0)) for s in (1, 2)]
     monkeypatch.setattr(rows, "recipes", lambda: rungs)
     pretrained.main(["pendulum", "--kind", "primed", "--out", str(tmp_path)])
     assert capsys.readouterr().out.count("energy_error_95") == 2
@@ -221,7 +219,7 @@ def test_the_command_builds_a_ladder(tmp_path, monkeypatch, capsys):
 
 
 def test_rebuilding_gives_the_same_weights():
-    recipe = rows.rung("pendulum", 2, 0.5, 1, QUICK)
+    recipe = rows.rung("pendulum", replace(QUICK, processor=1), 2, 20)
     flows = [recipe.fitted(PENDULUM, progress=False) for _ in range(2)]
     assert flows[0].figures["training_cpu_seconds"] > 0
     one, two = (flow.state_dict() for flow in flows)
@@ -251,12 +249,12 @@ def test_the_figure_is_met_by_95_per_cent_of_other_states(name):
 
 def test_a_rung_starts_from_the_one_with_a_longer_step():
     """Up to its own Δt it begins as the same map; alone it needs the other."""
-    fit = replace(QUICK, restarts=1)
-    first = Recipe("pendulum", "first", lambda: PENDULUM, Primed(0.5, 2, 1), ByCertificate(5.0), (fit,))
-    second = replace(first, name="second", start=Primed(0.25, 2, 1), after="first")
+    fit, solver = replace(QUICK, processor=1), GaussNewton(steps=20, restarts=1)
+    first = Recipe("pendulum", "first", lambda: PENDULUM, fit, ByCertificate(5.0), solver)
+    second = replace(first, name="second", fit=replace(fit, dt=0.25), after="first")
     (_, longer), (_, shorter) = made([first, second], progress=False)
     start = SympFlow.primed(PENDULUM, 2, dt=0.25, processor=1)
-    take_over(start, longer)
+    start.take_over(longer)
     x = torch.from_numpy(PENDULUM.domain.sample(5, 0))
     torch.testing.assert_close(start.psi(0.2, x), longer.psi(0.2, x), rtol=1e-14, atol=1e-14)
     both = lambda flow: flow.figures["one_step_error"] + flow.figures["fractional_error"]  # noqa: E731
@@ -338,7 +336,7 @@ def test_what_costs_more_is_more_accurate(name):
     cheap = {"outer_solar_system": 0.1}  # the cheapest rung is better than 1e-4 already
     assert errors[-1] < cheap.get(name, 1e-3) * errors[0]
     of_state = {  # polynomials that are fitted to the state alone, beside flows for the energy
-        f"{name}-{r.name}" for r in LADDERS[name] if r.name.startswith("polynomial") and r.fits[0].energy_weight == 0.0
+        f"{name}-{r.name}" for r in LADDERS[name] if r.name.startswith("polynomial") and r.fit.energy_weight == 0.0
     }
     of_state.add("driven_pendulum-primed-8-0.5")  # a third of the state error of the rung before
     of_state.add(

@@ -20,9 +20,9 @@ from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.systems import harmonic_oscillator, henon_heiles
 from sympflow.training import checkpoint as checkpoints
+from sympflow.training.fits import SOLVERS, Adam
 from sympflow.training.losses import Loss
-from sympflow.training.optimizers import BFGS, LBFGS
-from sympflow.training.options import OPTIMIZERS, LossOptions
+from sympflow.training.optimizers import BFGSSteps, LBFGSSteps
 from sympflow.training.points import Points, PointSource, Stream, states
 from sympflow.training.trainer import train
 
@@ -356,7 +356,7 @@ def test_a_system_without_a_domain_says_what_to_pass():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"optimizer": "sgd"}, f"`optimizer` 'sgd' is unknown: choose one of {', '.join(OPTIMIZERS)}"),
+        ({"optimizer": "sgd"}, f"`optimizer` 'sgd' is unknown: choose one of {', '.join(SOLVERS)}"),
         ({"kind": "gan"}, "`kind` 'gan' is unknown"),
         ({"schedule": "hope"}, "`schedule`"),
         ({"dt": 0.0}, "`dt`"),
@@ -423,22 +423,22 @@ def test_a_flow_of_another_system_is_refused():
 
 
 def test_schedules():
-    rates = [LossOptions(steps=100, learning_rate=1.0, schedule="one-cycle").rate(k) for k in range(100)]
+    rates = [Adam(steps=100, learning_rate=1.0, schedule="one-cycle").rate(k) for k in range(100)]
     assert max(rates) == pytest.approx(1.0, rel=1e-3)
     assert rates[0] < 0.3
     assert rates[-1] == pytest.approx(1e-3)
-    assert LossOptions(schedule="constant", learning_rate=0.1).rate(7) == 0.1
-    cosine = LossOptions(steps=100, schedule="cosine", learning_rate=1.0)
+    assert Adam(schedule="constant", learning_rate=0.1).rate(7) == 0.1
+    cosine = Adam(steps=100, schedule="cosine", learning_rate=1.0)
     assert [cosine.rate(k) for k in range(100)] == sorted((cosine.rate(k) for k in range(100)), reverse=True)
 
 
-@pytest.mark.parametrize("method", [BFGS, LBFGS])
+@pytest.mark.parametrize("method", [BFGSSteps, LBFGSSteps])
 def test_quasi_newton_methods_find_a_minimum(method):
     """The Rosenbrock valley, a step at a time, to rounding."""
     module = torch.nn.Module()
     module.x = torch.nn.Parameter(torch.tensor([-1.2, 1.0], dtype=torch.float64))
     module.n_parameters = 2
-    method = method(module, LossOptions())
+    method = method(module)
 
     def rosenbrock():
         x, y = module.x

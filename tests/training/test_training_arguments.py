@@ -4,12 +4,25 @@ import inspect
 
 import numpy as np
 import pytest
+import torch
 
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
-from sympflow.training.options import NewFit, NewFlow, TableOptions, plain_numbers
+from sympflow.training.fits import (
+    BFGS,
+    KINDS,
+    SOLVERS,
+    Adam,
+    ClockedFit,
+    GaussNewton,
+    LossFit,
+    NetworkFit,
+    PrimedFit,
+    SplitFit,
+    keywords,
+)
 from sympflow.training.table_fit import TableRun
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
@@ -20,7 +33,7 @@ WHOLE = HamiltonianSystem(hamiltonian=lambda q, p: (q * q + p * p).sum(-1) / 2, 
 
 @pytest.mark.parametrize("maker", [SympFlow.primed, SympFlow.split])
 def test_options_of_flows_are_told_from_those_of_training(maker):
-    of_train = inspect.signature(train).parameters
+    of_train = {*inspect.signature(train).parameters, *keywords()}
     alone = [name for name in inspect.signature(maker).parameters if name not in of_train]
     assert alone
     for name in alone:
@@ -68,8 +81,8 @@ def test_numbers_may_be_numpys(tmp_path):
     flow = SympFlow.primed(PENDULUM, np.int64(2), dt=np.float32(0.5), processor=np.int32(1))
     assert (flow.dt, flow.architecture()) == (0.5, SympFlow.primed(PENDULUM, 2, dt=0.5, processor=1).architecture())
     assert SympFlow(np.int64(1), pairs=np.int64(2), hidden=(np.int64(3), 4), dt=np.float32(0.5)).dt == 0.5
-    asked = NewFit(points=np.int64(30), restarts=np.int64(1), steps=np.int64(2), energy_weight=np.float32(10))
-    assert TableOptions.of(plain_numbers(asked)) == TableOptions(points=30, restarts=1, steps=2)
+    assert PrimedFit(points=np.int64(30), energy_weight=np.float32(10)) == PrimedFit(points=30)
+    assert GaussNewton(np.int64(2), np.int64(1)) == GaussNewton(steps=2, restarts=1)
     plain = {"dt": 0.5, "stages": 2, "points": 30, "restarts": 1, "steps": 2, "reference_states": 5}
     path = tmp_path / "run.ckpt"
     train(PENDULUM, checkpoint=path, progress=False, **{k: np.asarray(v)[()] for k, v in plain.items()})
@@ -103,12 +116,75 @@ def test_the_remedies_work():
     assert train(WHOLE, pairs=1, hidden=(3,), **quick).kind == "sympflow"
 
 
-def test_the_defaults_of_the_options_are_those_of_train():
-    arguments = inspect.signature(train).parameters
-    for asked in (NewFlow(), NewFit()):
-        assert {name: arguments[name].default for name in vars(asked)} == vars(asked)
-    surroundings = {"system", "dt", "flow", "domain", "checkpoint", "resume", "time_budget", "progress", "callback"}
-    assert set(arguments) == {*vars(NewFlow()), *vars(NewFit()), *surroundings, "workers", "unknown"}
+def test_unknown_options_are_refused_with_those_that_there_are():
+    for name in ("nonsense", "stagse"):
+        with pytest.raises(TypeError, match=rf"^`{name}` is no option of train\(\): .*stages, .*learning_rate"):
+            train(HH, **{name: 3})
+    for kind in KINDS:
+        for solver in SOLVERS:
+            with pytest.raises(TypeError, match=r"^`(runs|learning_rate|pairs)` is not an option of .*: leave it out"):
+                train(HH, kind=kind, optimizer=solver, **({"pairs": 2} if kind == "primed" else {"runs": 2}))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"fit": PrimedFit(), "stages": 3}, TypeError, "^`stages` was given beside `fit`"),
+        ({"fit": "primed"}, TypeError, "^`fit` must be a fit of sympflow.training"),
+        ({"fit": PrimedFit(), "solver": Adam()}, TypeError, "^`solver` of PrimedFit is GaussNewton; .*LossFit"),
+        ({"fit": PrimedFit(), "solver": "adam"}, TypeError, "^`solver` must be GaussNewton"),
+        ({"fit": LossFit()}, TypeError, "^`flow` is missing, which LossFit trains further"),
+        ({"fit": NetworkFit(), "flow": SympFlow(2)}, TypeError, "^`fit` NetworkFit is not one of a given SympFlow"),
+        ({"fit": SplitFit(), "flow": SympFlow(2)}, TypeError, "^`fit` SplitFit is not one of a given SympFlow"),
+        ({"solver": GaussNewton(), "steps": 3}, TypeError, "^`steps` was given beside `solver`"),
+    ],
+)
+def test_fits_and_solvers_that_do_not_go_together_are_refused(options, error, message):
+    with pytest.raises(error, match=message):
+        train(HH, **options)
+
+
+QUICK = {"points": 30, "label_times": 2, "reference_states": 5}
+
+
+@pytest.mark.parametrize(
+    ("system", "fit", "solver", "keywords"),
+    [
+        (
+            PENDULUM,
+            PrimedFit(0.5, stages=2, processor=1, **QUICK),
+            GaussNewton(steps=3, restarts=2),
+            {"dt": 0.5, "stages": 2, "processor": 1, "steps": 3, "restarts": 2, **QUICK},
+        ),
+        (
+            PENDULUM,
+            NetworkFit(0.5, pairs=1, hidden=(4,), points=30, validation_points=30),
+            Adam(steps=3, learning_rate=1e-3),
+            {"dt": 0.5, "pairs": 1, "hidden": (4,), "points": 30, "validation_points": 30, "steps": 3}
+            | {"learning_rate": 1e-3},
+        ),
+        (
+            PENDULUM,
+            NetworkFit(hidden=(4,), points=30, validation_points=30, baseline=True),
+            BFGS(steps=1),
+            {"kind": "mlp", "hidden": (4,), "points": 30, "validation_points": 30, "steps": 1, "optimizer": "bfgs"},
+        ),
+    ],
+    ids=["primed", "network", "baseline"],
+)
+def test_keywords_say_what_fits_and_solvers_say(system, fit, solver, keywords):
+    objects = train(system, fit, solver=solver, progress=False)
+    plain = train(system, **keywords, progress=False)
+    assert objects.recipe == plain.recipe
+    assert all(torch.equal(v, plain.state_dict()[name]) for name, v in objects.state_dict().items())
+
+
+def test_a_fit_makes_its_own_split_flow_or_clock():
+    spring = systems.spring_pendulum(1e3, coordinates="polar")
+    flow = train(spring, SplitFit(dt=0.05, stages=1, terms=2, **QUICK), solver=GaussNewton(1, 1), progress=False)
+    assert (type(flow).__name__, flow.dt, flow.recipe["stages"][0]["restarts"]) == ("SplitFlow", 0.05, 1)
+    flow = train(systems.kepler(0.6), ClockedFit(0.5, points=20, label_times=3, terms=4))
+    assert (type(flow).__name__, flow.figures["step"]) == ("ClockedFlow", 0.5)
 
 
 class Started(Exception):

@@ -11,9 +11,8 @@ import sympflow
 from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, load, solve, systems, train
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
-from sympflow.training.least_squares import PULL, GaussNewton
+from sympflow.training.least_squares import PULL, GaussNewtonSteps
 from sympflow.training.losses import Loss, Objective, jacobian
-from sympflow.training.options import LossOptions
 from sympflow.training.points import Labels, Points, PointSource, unlabelled
 
 HH, OSCILLATOR, PENDULUM = systems.henon_heiles(), systems.harmonic_oscillator(), systems.pendulum()
@@ -126,7 +125,7 @@ def test_a_linear_problem_is_solved_at_once(damping, worst):
     A[:, 0] = A[:, 1] + worst * A[:, 0]
     b = A @ torch.arange(1.0, 6.0, dtype=torch.float64)
     target = module(5)
-    method = GaussNewton(target, LossOptions())
+    method = GaussNewtonSteps(target)
     method.damping.value = damping
     cost = [method.step(0, Quadratic(target, A, b)) for _ in range(8)]
     assert cost[-1] < 1e-12 * cost[0]
@@ -142,7 +141,7 @@ def test_a_weight_that_no_point_sees_does_not_run_away():
     target = module(2)
     with torch.no_grad():
         target.x[1] = 1e8
-    method = GaussNewton(target, LossOptions())
+    method = GaussNewtonSteps(target)
     for _ in range(40):
         method.step(0, Quadratic(target, A, b))
     assert target.x[1].abs() < 1.0

@@ -13,7 +13,7 @@ from sympflow.flow.shipped import shipped
 from sympflow.flow.sympflow import SympFlow
 from sympflow.systems import harmonic_oscillator
 from sympflow.training import pretrained
-from sympflow.training.options import NewFit
+from sympflow.training.fits import GaussNewton, LossFit, NetworkFit
 from sympflow.training.shipped import rows
 from sympflow.training.shipped.recipe import file_of
 
@@ -59,7 +59,7 @@ def test_shipped_networks_are_those_of_their_recipes(name, kind):
     system = recipe.system()
     flow = load(path(name, kind), system=system)
     assert isinstance(flow, {"sympflow": SympFlow, "mlp": MLPFlow}[kind])
-    assert flow.dt == recipe.start.dt
+    assert flow.dt == recipe.fit.dt
     assert flow.domain.attach(system.hamiltonian).contains(recipe.judge.initial()).all()
     assert [stage["optimizer"] for stage in flow.recipe["stages"]] in (["gauss-newton"] * 2, ["adam", "bfgs"])
     assert path(name, kind).stat().st_size < 25_000
@@ -112,9 +112,9 @@ def test_a_blow_up_is_not_a_small_error():
 
 @pytest.mark.slow
 def test_the_command_trains_and_measures(tmp_path, monkeypatch, capsys):
-    fits = [NewFit(optimizer="gauss-newton", points=n, steps=k, seed=i) for i, (n, k) in enumerate(((40, 2), (50, 1)))]
+    fit, further = NetworkFit(1.0, points=40), ((LossFit(points=50, seed=1), GaussNewton(1)),)
     judge = replace(RECIPES["henon_heiles"].judge, initial=lambda: np.full((2, 4), 0.1))
-    quick = replace(RECIPES["henon_heiles"], fits=tuple(fits), judge=judge)
+    quick = replace(RECIPES["henon_heiles"], fit=fit, solver=GaussNewton(2), further=further, judge=judge)
     monkeypatch.setattr(rows, "recipes", lambda: [quick])
     pretrained.main(["henon_heiles", "--kind", "sympflow", "--out", str(tmp_path)])
     trained = capsys.readouterr().out

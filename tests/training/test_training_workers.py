@@ -13,11 +13,11 @@ import torch
 
 from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.training import trials
-from sympflow.training.options import NewFit, SplitOptions, TableOptions
+from sympflow.training.fits import GaussNewton, PrimedFit, SplitFit
 from sympflow.training.session import Session
 from sympflow.training.shipped.recipe import Recipe, made
 from sympflow.training.split_fit import SplitRun
-from sympflow.training.starts import Primed, scaling_of
+from sympflow.training.starts import scaling_of
 from sympflow.training.table_fit import TableFit, TableRun
 from sympflow.training.table_step import TableStep
 from sympflow.workers import Crew
@@ -60,9 +60,8 @@ def test_trials_are_the_same_whatever_the_workers(monkeypatch):
 
 def test_fits_are_the_same_in_another_process():
     """Their products are rounded by the order of arrays in memory, which a pickle must not change."""
-    table = TableOptions(
-        points=20, label_times=3, reference_states=5, residual_weight=1.0, loss_points=10, matching_times=2
-    )
+    few = {"points": 20, "label_times": 3, "reference_states": 5, "loss_points": 10, "matching_times": 2}
+    table = PrimedFit(loss="labels+residual", **few)
     run = TableRun.start(FLOW, PENDULUM, PENDULUM.domain, scaling_of(PENDULUM.domain, FLOW.dt, 0), table)
     theta = run.table.continued(run.frozen.coefficients(run.start_of(1))[:, 0])
     fits = [(run.frozen, run.start_of(1)), (run.weighted, run.start_of(0)), (run.whole, theta)]
@@ -81,8 +80,8 @@ def test_fits_are_the_same_in_another_process():
 def test_split_fits_are_the_same_in_another_process():
     spring = systems.spring_pendulum(1e3, coordinates="polar")
     flow = SympFlow.split(spring, dt=0.05, stages=1, terms=2)
-    options = SplitOptions(points=5, label_times=2, steps=2, restarts=2, reference_states=3)
-    run = SplitRun.start(flow.bound(spring), spring, spring.domain, options)
+    fit, solver = SplitFit(points=5, label_times=2, reference_states=3), GaussNewton(steps=2, restarts=2)
+    run = SplitRun.start(flow.bound(spring), spring, spring.domain, fit, solver)
     fit, u = run.searched(), run.start_of(1)
     other = pickle.loads(pickle.dumps(fit.own()))
     mine, theirs = (f.minimize(u, 2, Session().deadline) for f in (fit, other))
@@ -129,10 +128,11 @@ def test_a_time_budget_does_not_wait_for_workers_that_start():
 
 
 def test_rungs_come_after_those_that_they_start_from():
-    fit = NewFit(restarts=1, steps=2, points=20, label_times=2, reference_states=5)
+    fit = PrimedFit(0.5, stages=2, processor=0, points=20, label_times=2, reference_states=5)
+    solver = GaussNewton(steps=2, restarts=1)
 
     def rung(name, after=None):
-        return Recipe("pendulum", name, systems.pendulum, Primed(0.5, 2, 0), lambda *_: None, (fit,), after=after)
+        return Recipe("pendulum", name, systems.pendulum, fit, lambda *_: None, solver, after=after)
 
     recipes = [rung("c", "b"), rung("a"), rung("b", "a"), rung("d")]
     with ThreadPoolExecutor(2) as threads:

@@ -74,24 +74,7 @@ def clocked_cost(flow: ClockedFlow) -> float:
 def measure(
     flow: FlowMap, system: HamiltonianSystem, x: np.ndarray, *, steps: int = 1000, omega: float = 1.0
 ) -> dict[str, Any]:
-    """Figures of a flow from the initial states x (n, 2d), as the published checkpoints were measured.
-
-    Parameters
-    ----------
-    flow, system
-    x : ndarray, shape (n, 2d)
-    steps : int
-        Over which the energy is followed.
-    omega : float
-        Frequency of the system: states are measured as [q, p/ω], energies in H's own units.
-
-    Returns
-    -------
-    dict
-        `error_1`, `error_10`, `error_100`: mean over the states of ‖ψ_kΔt(x) − φ_H,kΔt(x)‖, the reference by DOP853;
-        `energy_error`: of each state the largest |H − H0| over the steps, then the mean over the states;
-        `energy_error_max`: the largest of all. None where a state is not finite.
-    """
+    """Figures of a flow from the initial states x (n, 2d), as the published checkpoints were measured."""
     units = np.repeat([1.0, omega], system.ndof)
     y = torch.as_tensor(x, dtype=flow.dtype, device=flow.device)
     H0 = system.hamiltonian(y)
@@ -172,15 +155,7 @@ class ByCertificate:
 
 @dataclass(frozen=True)
 class ByRuns:
-    """Energy errors of runs from given states over T = t_end, at steps and between them; a certificate beside.
-
-    Parameters
-    ----------
-    held_out : callable
-        The states (n, 2d) of a system.
-    t_end, t_certified : float
-        T of the energy errors and of the certificate.
-    """
+    """Energy errors of runs from given states over T = t_end, at steps and between them; a certificate beside."""
 
     held_out: Callable[[HamiltonianSystem], np.ndarray]
     t_end: float
@@ -235,15 +210,7 @@ def _of_runs(errors: Any, t_end: float) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class AsPublished:
-    """`measure` of a network, `one_step_errors`, and a certificate if it is symplectic.
-
-    Parameters
-    ----------
-    initial : callable
-        The 100 initial states of the figures, drawn with seed 0.
-    omega : float
-        The frequency in whose units the figures are.
-    """
+    """`measure` of a network, `one_step_errors`, and a certificate if it is symplectic."""
 
     initial: Callable[[], np.ndarray]
     omega: float = 1.0

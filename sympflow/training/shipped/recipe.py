@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -16,9 +16,9 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import time_transformed
-from sympflow.training.options import NewFit, NewFlow
+from sympflow.training.clock_fit import train_clock
+from sympflow.training.fits import ClockedFit, Fit, GaussNewton, LossFit, NetworkFit, Solver
 from sympflow.training.session import Session
-from sympflow.training.starts import Start
 from sympflow.training.trainer import fit_flow
 from sympflow.workers import Crew
 
@@ -34,41 +34,22 @@ class Judge(Protocol):
 
 @dataclass(frozen=True)
 class Recipe:
-    """A flow that ships.
-
-    Parameters
-    ----------
-    scene, name : str
-        Its file is SCENE-NAME.safetensors.
-    system : callable
-        The system.
-    start : Start
-        The flow before its training.
-    judge : Judge
-        Measures it when it is trained.
-    fits : tuple of NewFit
-        The options of `train`, one fit after another.
-    domain : callable, optional
-        Ω of a system; the default is its own.
-    after : str, optional
-        The name of the recipe with the same kicks and the same processor whose table, continued to this Δt, is where
-        the search starts: deep valleys are found at a long Δt, and followed to a short one; and found without
-        polynomials, and followed with them.
-    """
+    """A flow that ships."""
 
     scene: str
     name: str
     system: Callable[[], HamiltonianSystem]
-    start: Start
+    fit: Fit
     judge: Judge
-    fits: tuple[NewFit, ...] = ()
+    solver: Solver = field(default_factory=GaussNewton)
+    further: tuple[tuple[LossFit, Solver], ...] = ()
     domain: Callable[[HamiltonianSystem], Domain] | None = None
     after: str | None = None
 
     @property
     def kind(self) -> str:
         """The kind of flow, by which the command chooses."""
-        return self.start.kind
+        return "primed" if isinstance(self.fit, ClockedFit) else self.fit.kind  # it is one of a ladder
 
     def domain_of(self, system: HamiltonianSystem) -> Domain:
         """The states that are trained on."""
@@ -82,9 +63,13 @@ class Recipe:
         """The trained flow, not judged yet; `earlier` is that of the recipe `after` which it comes."""
         before = time.process_time()
         domain = self.domain_of(system)
-        flow = self.start.flow(system, domain, earlier)
-        for fit in self.fits:
-            flow = fit_flow(system, None, flow, NewFlow(), fit, domain, Session(progress=progress))
+        if isinstance(self.fit, ClockedFit):
+            return train_clock(system, self.fit)
+        start = None if isinstance(self.fit, NetworkFit) else self.fit.flow(system, domain, earlier)
+        first = self.fit if start is None else self.fit.of_a_given_flow
+        flow = fit_flow(system, start, first, self.solver, domain, Session(progress=progress))
+        for fit, solver in self.further:
+            flow = fit_flow(system, flow, fit, solver, domain, Session(progress=progress))
         flow.figures["training_cpu_seconds"] = round(time.process_time() - before, 3)
         return flow
 
@@ -114,11 +99,6 @@ def made(
 
     `earlier` gives, by a recipe and the name of the one that it comes after, a flow that was made before. `workers`
     share the recipes, a number of them being processes: those that come after others when these are made.
-
-    Raises
-    ------
-    ValueError
-        If a recipe comes after one that is neither made nor given.
     """
     flows: dict[tuple[str, str], FlowMap] = {}
     left = list(recipes)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -30,11 +30,9 @@ from sympflow.systems import (
     sine_gordon,
     spring_pendulum,
 )
-from sympflow.training.clock_fit import train_clock
-from sympflow.training.options import NewFit
+from sympflow.training.fits import ClockedFit, GaussNewton, LossFit, NetworkFit, PrimedFit, SplitFit
 from sympflow.training.shipped.judges import AsPublished, ByBalance, ByCertificate, ByClock, ByRuns, OfStiff
-from sympflow.training.shipped.recipe import Judge, Recipe
-from sympflow.training.starts import Network, Primed, Split
+from sympflow.training.shipped.recipe import Recipe
 
 YEAR = 365.25  # days
 
@@ -49,85 +47,53 @@ def recipes() -> list[Recipe]:
 
 def rung(
     scene: str,
-    stages: int,
-    dt: float,
-    processor: int = 6,
-    fit: NewFit | None = None,
-    *,
-    curvature: bool | tuple[int, ...] = False,
-    force_gradient: bool | tuple[int, ...] | None = None,
-    polynomial: int | None = None,
-    first: str = "drift",
+    fit: PrimedFit,
+    restarts: int = 12,
+    steps: int | None = None,
     after: str | None = None,
-    judge: Judge | None = None,
+    judge: Any = None,
 ) -> Recipe:
-    """A primed flow of a ladder; its search has 12 starts if nothing else is said.
-
-    Parameters
-    ----------
-    scene, after, judge
-        See `Recipe`; it is judged by its certificate over T = 1000 by default.
-    stages, dt, processor, curvature, force_gradient, polynomial, first
-        See `sympflow.training.starts.Primed`.
-    fit : NewFit, optional
-        The options of `train`.
-    """
-    fit = NewFit() if fit is None else fit
-    fit = replace(fit, restarts=12) if fit.restarts is None else fit
-    name = f"{'primed' if polynomial is None else 'polynomial'}-{stages}-{dt:g}"
-    start = Primed(dt, stages, processor, curvature, polynomial, first, force_gradient=force_gradient)
-    judge = ByCertificate() if judge is None else judge
-    return Recipe(scene.replace("-", "_"), name, SYSTEMS[scene], start, judge, (fit,), after=after)
-
-
-@dataclass(frozen=True)
-class Clock:
-    """A flow on the logarithmic Hamiltonian, its clock trained (`sympflow.flow.clocked`).
-
-    `step` is the physical length of its longest step.
-    """
-
-    step: float
-    kind: str = "primed"  # it is one of a ladder
-
-    def flow(self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None) -> FlowMap:
-        return train_clock(system, self.step)
+    """A primed flow of a ladder; it is judged by its certificate over T = 1000 if nothing else is said."""
+    name = f"{'primed' if fit.polynomial is None else 'polynomial'}-{fit.stages}-{fit.dt:g}"
+    judge, solver = ByCertificate() if judge is None else judge, GaussNewton(steps, restarts)
+    return Recipe(scene.replace("-", "_"), name, SYSTEMS[scene], fit, judge, solver, after=after)
 
 
 def ladders() -> list[Recipe]:
     """The rungs of the ladders."""
-    plain = NewFit(energy_weight=0.0)
     hh, swing, quartic, kepler, planets = "henon-heiles", "pendulum", "quartic", "kepler", "outer-solar-system"
+    made = partial(PrimedFit, processor=6)
+    plain, curved = partial(made, energy_weight=0.0), partial(made, curvature=True)
     # Many numbers: most of what they can do at Δt they would give up for the times before it.
-    followed = NewFit(steps=300, frozen_weight=10.0)
-    of_state = replace(followed, energy_weight=0.0)
-    in_powers = partial(rung, quartic, polynomial=6, first="kick")
+    in_powers = partial(made, polynomial=6, first="kick", frozen_weight=10.0, processor=8)
+    of_state = partial(in_powers, energy_weight=0.0)
     # d = 18: starts are dear, few and short, and the gain of more is small
-    short = NewFit(restarts=2, energy_weight=0.0, points=40, label_times=5, reference_states=20, steps=200)
+    short = partial(plain, points=40, label_times=5, reference_states=20)
     along = ByRuns(along_the_orbit, 1e5 * YEAR, 100 * YEAR)
+    shared = partial(curved, curvature=(1,), first="kick", processor=12)
     return [
         # Of six seeds the one whose energy error over a long time is the lowest: the fit looks at single steps.
-        rung(hh, 1, 0.82, fit=NewFit(seed=4, energy_weight=1000.0)),
-        *(rung(hh, 3, dt, curvature=True) for dt in (1.6, 1.4, 1.0, 0.8, 0.6, 0.4)),
-        rung(hh, 3, 1.75, 12, NewFit(restarts=24), curvature=True),
+        rung(hh, made(0.82, stages=1, seed=4, energy_weight=1000.0)),
+        *(rung(hh, curved(dt, stages=3)) for dt in (1.6, 1.4, 1.0, 0.8, 0.6, 0.4)),
+        rung(hh, curved(1.75, stages=3, processor=12), 24),
         # a force gradient in the kick that steps share, a curvature term besides in the one between
-        rung(hh, 2, 1.12, 12, NewFit(restarts=60), curvature=(1,), first="kick"),
-        rung(hh, 2, 0.77, 12, NewFit(restarts=24), curvature=(1,), first="kick"),
-        rung(swing, 2, 1.5, fit=plain),
-        *(rung(swing, 3, dt, fit=plain, curvature=True) for dt in (2.0, 1.5)),
-        *(rung(swing, 3, dt, curvature=True) for dt in (1.0, 0.8, 0.6, 0.4)),
-        rung(quartic, 1, 0.5),
-        *(rung(quartic, 3, dt) for dt in (0.75, 0.6, 0.5, 0.4)),
-        rung(quartic, 4, 0.83, 9, NewFit(restarts=40), force_gradient=(1, 3), first="kick"),
+        rung(hh, shared(1.12, stages=2), 60),
+        rung(hh, shared(0.77, stages=2), 24),
+        rung(swing, plain(1.5, stages=2)),
+        *(rung(swing, plain(dt, stages=3, curvature=True)) for dt in (2.0, 1.5)),
+        *(rung(swing, curved(dt, stages=3)) for dt in (1.0, 0.8, 0.6, 0.4)),
+        rung(quartic, made(0.5, stages=1)),
+        *(rung(quartic, made(dt, stages=3)) for dt in (0.75, 0.6, 0.5, 0.4)),
+        rung(quartic, made(0.83, stages=4, processor=9, force_gradient=(1, 3), first="kick"), 40),
         # Beside the first for the energy, those for the state; T = 100 and 1000 are whole numbers of their Δt.
-        in_powers(8, 1.0, 8, replace(followed, restarts=40, steps=400, seed=1)),
-        *(in_powers(6, dt, 8, replace(of_state, restarts=24, seed=1)) for dt in (100 / 62, 100 / 96)),
-        in_powers(8, 0.625, 8, replace(of_state, restarts=1), after="polynomial-8-1"),
-        in_powers(8, 0.5, 8, replace(of_state, restarts=1), after="polynomial-8-0.625"),
-        *(rung(kepler, 2, dt, fit=plain) for dt in (0.25, 0.15)),
-        *(rung(kepler, 3, dt, fit=plain) for dt in (0.2, 0.15, 0.1, 0.08, 0.06, 0.045, 0.03)),
-        Recipe("kepler", "log-1", SYSTEMS[kepler], Clock(1.0), ByClock()),
-        *(rung(planets, 3, dt, fit=short, judge=along) for dt in (300.0, 200.0, 100.0)),
+        rung(quartic, in_powers(1.0, stages=8, seed=1), 40, 400),
+        *(rung(quartic, of_state(dt, stages=6, seed=1), 24, 300) for dt in (100 / 62, 100 / 96)),
+        rung(quartic, of_state(0.625, stages=8), 1, 300, after="polynomial-8-1"),
+        rung(quartic, of_state(0.5, stages=8), 1, 300, after="polynomial-8-0.625"),
+        *(rung(kepler, plain(dt, stages=2)) for dt in (0.25, 0.15)),
+        *(rung(kepler, plain(dt, stages=3)) for dt in (0.2, 0.15, 0.1, 0.08, 0.06, 0.045, 0.03)),
+        Recipe("kepler", "log-1", SYSTEMS[kepler], ClockedFit(1.0), ByClock()),
+        *(rung(planets, short(dt, stages=3), 2, 200, judge=along) for dt in (300.0, 200.0, 100.0)),
         lattice_rung(SYSTEMS["toda-chain"], 0.94, fit=LONG_RUNS, stages=2, first="kick"),
         *(lattice_rung(SYSTEMS["toda-chain"], dt) for dt in (1.2, 0.7, 0.2)),
         lattice_rung(SYSTEMS["toda-chain"], 0.5, fit=LONG_RUNS, stages=6, force_gradient=(1, 4)),
@@ -164,9 +130,9 @@ def driven_rung(
     So many that the rounding of other compiled code ends a search in another one: a fit again gives the same errors
     within a few percent, not the same numbers.
     """
-    start = Primed(dt, stages, processor, curvature=True, first=first)
-    fit = NewFit(restarts=restarts, seed=seed, energy_weight=1.0)
-    return Recipe(system().name, f"primed-{stages}-{dt:g}", system, start, ByBalance(), (fit,))
+    shape = {"stages": stages, "processor": processor, "first": first}
+    fit = PrimedFit(dt, **shape, curvature=True, seed=seed, energy_weight=1.0)  # type: ignore[arg-type]
+    return Recipe(system().name, f"primed-{stages}-{dt:g}", system, fit, ByBalance(), GaussNewton(restarts=restarts))
 
 
 def weak_duffing() -> HamiltonianSystem:
@@ -190,9 +156,9 @@ def double_wells_in_a_plane(n: int) -> HamiltonianSystem:
     return HamiltonianSystem.lattice(onsite="(q**2 - 1)**2/4", bond="r**2/2", shape=(side, side), name="phi4_sheet")
 
 
-LABELS_ALONE = NewFit(restarts=20, energy_weight=300.0, frozen_weight=1000.0, label_times=5)
-LONG_RUNS = NewFit(restarts=24, energy_weight=300.0, steps=300, runs=48)
-FEWER_RUNS = replace(LONG_RUNS, restarts=12)
+LABELS_ALONE = PrimedFit(energy_weight=300.0, frozen_weight=1000.0, label_times=5), GaussNewton(restarts=20)
+LONG_RUNS = PrimedFit(energy_weight=300.0, runs=48), GaussNewton(300, 24)
+FEWER_RUNS = LONG_RUNS[0], GaussNewton(300, 12)
 """Fits of flows of lattices: to labels of a few sites, and further to the energy errors of runs of a ring."""
 
 
@@ -200,7 +166,7 @@ def lattice_rung(
     system: Callable[..., HamiltonianSystem],
     dt: float,
     processor: int = 12,
-    fit: NewFit = LABELS_ALONE,
+    fit: tuple[PrimedFit, GaussNewton] = LABELS_ALONE,
     *,
     stages: int = 4,
     force_gradient: tuple[int, ...] | None = None,
@@ -212,16 +178,11 @@ def lattice_rung(
     Force gradients of a polynomial bond are polynomials of a higher degree: those of a processor of 12, one after the
     other, spoil the rare states with much energy in a few sites, where Δt is long.
     """
-    many = partial(system, n=256)
-    return Recipe(
-        many().name,
-        f"primed-{stages}-{dt:g}",
-        many,
-        Primed(dt, stages, processor, force_gradient=force_gradient, first=first),
-        ByCertificate(200.0, states=100, times=9, held_out=100),
-        (fit,),
-        partial(_at_density, density=density),
-    )
+    many, name = partial(system, n=256), f"primed-{stages}-{dt:g}"
+    shape = {"dt": dt, "stages": stages, "processor": processor, "first": first, "force_gradient": force_gradient}
+    judge = ByCertificate(200.0, states=100, times=9, held_out=100)
+    whole = replace(fit[0], **shape)  # type: ignore[arg-type]
+    return Recipe(many().name, name, many, whole, judge, fit[1], domain=partial(_at_density, density=density))
 
 
 def of_double_wells(system: Callable[..., HamiltonianSystem], two: float, five: float, six: float) -> list[Recipe]:
@@ -253,24 +214,23 @@ def along_the_orbit(system: HamiltonianSystem, n: int = 10, span: float = 1e5 * 
 def stiff() -> list[Recipe]:
     """SympFlows of the exact flows of the parts of stiff systems."""
     polar = partial(spring_pendulum, 1e6, coordinates="polar")
+    fit = partial(SplitFit, frozen_weight=3.0)
+    fifty = fit(turn=10.0, stages=6, terms=10, force_gradient=(0, 5), label_times=24)
+    thousand = fit(turn=20.0, stages=4, terms=16, force_gradient=False, label_times=40)
     return [
-        _stiff("fput_50", partial(fput, omega=50.0), Split(10.0, 6, 10, (0, 5)), 24, partial(low_energies, omega=50.0)),
-        _stiff(
-            "fput_1000", partial(fput, omega=1000.0), Split(20.0, 4, 16, False), 40, partial(low_energies, omega=1000.0)
-        ),
-        _stiff("spring_pendulum_1e6", polar, Split(10.0, 1, 8), 20, own_domain),
+        _stiff("fput_50", partial(fput, omega=50.0), fifty, partial(low_energies, omega=50.0)),
+        _stiff("fput_1000", partial(fput, omega=1000.0), thousand, partial(low_energies, omega=1000.0)),
+        _stiff("spring_pendulum_1e6", polar, fit(turn=10.0, stages=1, terms=8, label_times=20), own_domain),
     ]
 
 
 def _stiff(
     scene: str,
     system: Callable[[], HamiltonianSystem],
-    start: Split,
-    label_times: int,
+    fit: SplitFit,
     domain: Callable[[HamiltonianSystem], Domain],
 ) -> Recipe:
-    fit = NewFit(label_times=label_times, frozen_weight=3.0)
-    return Recipe(scene, "sympflow", system, start, OfStiff(domain), (fit,), domain)
+    return Recipe(scene, "sympflow", system, fit, OfStiff(domain), domain=domain)
 
 
 def own_domain(system: HamiltonianSystem) -> Domain:
@@ -318,13 +278,12 @@ def _networks(
     steps: tuple[int, int] = (150, 100),
     margin: float = 1.0,
 ) -> list[Recipe]:
-    first, second = (
-        NewFit(optimizer="gauss-newton", points=n, steps=k, seed=stage)
-        for stage, (n, k) in enumerate(zip(points, steps, strict=True))
-    )
     judge, domain = AsPublished(initial, omega), partial(widened, margin=margin)
+    second = LossFit(points=points[1], seed=1), GaussNewton(steps[1])
     return [
-        Recipe(scene, kind, system, Network(kind, dt), judge, (first, second), domain) for kind in ("sympflow", "mlp")
+        Recipe(scene, kind, system, first, judge, GaussNewton(steps[0]), (second,), domain)
+        for kind in ("sympflow", "mlp")
+        for first in [NetworkFit(dt, points=points[0], baseline=kind == "mlp")]
     ]
 
 

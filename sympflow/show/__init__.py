@@ -1,0 +1,1 @@
+"""Objects to look at: cards as text and HTML, and figures."""

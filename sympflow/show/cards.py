@@ -1,0 +1,100 @@
+"""Cards: objects shown as a caption, a table of labels and values, and a text, in a terminal and in a notebook."""
+
+from __future__ import annotations
+
+import html
+import io
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LONGEST = 100
+"""Characters of a value before it is cut."""
+
+
+@dataclass(frozen=True)
+class Card:
+    """What is shown of an object: values are cut to `LONGEST` characters, those that are empty are left out."""
+
+    caption: str
+    facts: Mapping[str, str] = field(default_factory=dict)
+    text: str = ""
+    formula: str = ""
+    """LaTeX, shown in notebooks."""
+
+    def plain(self) -> str:
+        """The card as text."""
+        rows = {label: cut(value) for label, value in self.facts.items() if value}
+        width = max(map(len, rows), default=0)
+        lines = [self.caption, *(f"  {label:{width}}  {value}" for label, value in rows.items()), self.text]
+        return "\n".join(filter(None, lines))
+
+    def html(self, figure: Figure | None = None) -> str:
+        """The card as HTML, with a figure below."""
+        cell = '<td style="text-align:left">'
+        rows = "".join(
+            f"<tr>{cell}<b>{html.escape(label)}</b></td>{cell}{html.escape(cut(value))}</td></tr>"
+            for label, value in self.facts.items()
+            if value
+        )
+        parts = [
+            f"<b>{html.escape(self.caption)}</b>" if self.caption else "",
+            f"$\\displaystyle {html.escape(self.formula)}$" if self.formula else "",
+            f"<table>{rows}</table>" if rows else "",
+            f"<pre>{html.escape(self.text)}</pre>" if self.text else "",
+            _picture(figure),
+        ]
+        return "<div>" + "".join(f"<div>{part}</div>" for part in parts if part) + "</div>"
+
+
+class Shown:
+    """An object that has a card; with a `preview`, drawn in notebooks once matplotlib is loaded."""
+
+    def card(self) -> Card:
+        """Return what is shown of the object."""
+        raise NotImplementedError
+
+    def preview(self) -> Figure | None:
+        """Return the figure that a notebook shows with it; None if there is none."""
+        return None
+
+    def __repr__(self) -> str:
+        return self.card().plain()
+
+    def _repr_html_(self) -> str:
+        figure = None
+        if "matplotlib" in sys.modules:
+            with suppress(Exception), np.errstate(all="ignore"):  # the table is shown without it
+                figure = self.preview()
+        return self.card().html(figure)
+
+
+def _picture(figure: Figure | None) -> str:
+    if figure is None:
+        return ""
+    import base64
+
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=80)
+    return f'<img src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+
+
+def cut(text: str, longest: int = LONGEST) -> str:
+    """A text in one line, cut at its end."""
+    line = " ".join(text.split())
+    return line if len(line) <= longest else f"{line[: longest - 2]} …"
+
+
+def numbers(values: Any, most: int = 8) -> str:
+    """An array in a row, to six digits; the shape of one with many entries."""
+    array = np.asarray(values)
+    if array.size > most:
+        return f"array of shape {array.shape}"
+    return f"{array:.6g}" if array.ndim == 0 else "[" + ", ".join(f"{x:.6g}" for x in array.reshape(-1)) + "]"

@@ -1,0 +1,122 @@
+"""Figures of trajectories: orbits, phase planes and energy errors, of solutions, flows, ensembles and data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sympflow.show.style import TEXT, dress, filled, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+KINDS = ("orbit", "phase", "energy")
+MOST_LINES, MOST_POINTS = 16, 20_000
+"""Trajectories of a batch that are drawn, and points of each."""
+MANY = 12
+"""Degrees of freedom from which the orbit is a map of q over time."""
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F3C8D", "#666666")
+
+
+def trajectory_figure(
+    t: np.ndarray,
+    y: np.ndarray,
+    energy_error: np.ndarray | None,
+    title: str,
+    kinds: Sequence[str] = KINDS,
+    marker: str = "",
+) -> Figure:
+    """Panels of trajectories side by side.
+
+    Parameters
+    ----------
+    t : ndarray (n,) or (N, n)
+    y : ndarray (N, 2d, n)
+    energy_error : ndarray (N, n) or None
+        Relative; without it there is no panel "energy".
+    title : str
+    kinds : sequence of str
+        Of "orbit": q₁ against q₂, or q over t of one degree of freedom, or a map of all q of many; "phase": q₁ against
+        p₁; "energy": the energy error over t.
+    marker : str
+        Of points, where states are samples.
+    """
+    unknown = [kind for kind in kinds if kind not in KINDS]
+    if unknown or not kinds:
+        raise ValueError(f"`kinds` must be some of {', '.join(map(repr, KINDS))}; got {list(kinds)!r}.")
+    panels = [kind for kind in dict.fromkeys(kinds) if kind != "energy" or energy_error is not None]
+    figure = new_figure(3.6 * max(1, len(panels)), 3.3)
+    draw = {"orbit": _orbit, "phase": _phase, "energy": _energy}
+    every = max(1, -(-t.shape[-1] // MOST_POINTS))
+    error = np.empty((0, t.shape[-1])) if energy_error is None else energy_error
+    for kind, ax in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0] if panels else (), strict=True):
+        draw[kind](ax, t[..., ::every], y[:MOST_LINES, :, ::every], error[:MOST_LINES, ::every], marker)
+    figure.suptitle(filled(title, 3.4 * max(1, len(panels)), 10), fontsize=10, color=TEXT)
+    return figure
+
+
+def _lines(ax: Axes, x: np.ndarray, y: np.ndarray, marker: str = "") -> None:
+    thin = 0.9 if x.shape[-1] > 2000 else 1.2
+    for k, (a, b) in enumerate(zip(np.broadcast_to(x, y.shape), y, strict=True)):
+        ax.plot(a, b, marker or "-", ms=2.5, lw=thin, alpha=0.85, color=COLOURS[k % len(COLOURS)])
+
+
+def _orbit(ax: Axes, t: np.ndarray, y: np.ndarray, error: np.ndarray, marker: str) -> None:
+    d = y.shape[1] // 2
+    if d == 1:
+        _lines(ax, t, y[:, 0], marker)
+        dress(ax, "t", "q")
+    elif d < MANY:
+        _lines(ax, y[:, 0], y[:, 1], marker)
+        dress(ax, "q₁", "q₂")
+        ax.set_aspect("equal", "datalim")
+    else:
+        q = y[0, :d]
+        largest = float(np.nanmax(np.abs(q), initial=0.0)) or 1.0
+        shown = ax.pcolormesh(
+            t if t.ndim == 1 else t[0],
+            np.arange(1, d + 1),
+            q,
+            cmap="RdBu_r",
+            vmin=-largest,
+            vmax=largest,
+            rasterized=True,
+        )
+        ax.figure.colorbar(shown, ax=ax, shrink=0.8).set_label("q", color=TEXT)
+        dress(ax, "t", "coordinate")
+
+
+def _phase(ax: Axes, t: np.ndarray, y: np.ndarray, error: np.ndarray, marker: str) -> None:
+    d = y.shape[1] // 2
+    _lines(ax, y[:, 0], y[:, d], marker)
+    dress(ax, *(("q", "p") if d == 1 else ("q₁", "p₁")))
+
+
+def _energy(ax: Axes, t: np.ndarray, y: np.ndarray, error: np.ndarray, marker: str) -> None:
+    _lines(ax, t, np.where(error == 0, np.nan, np.abs(error)))
+    dress(ax, "t", "|energy error|, relative")
+    if np.isfinite(error).any() and np.any(error):
+        ax.set_yscale("log")
+
+
+def histogram_figure(values: dict[str, np.ndarray], title: str) -> Figure:
+    """Histograms of numbers, a panel for each name."""
+    figure = new_figure(3.6 * len(values), 3.0)
+    for ax, (name, array) in zip(figure.subplots(1, len(values), squeeze=False)[0], values.items(), strict=True):
+        ax.hist(array[np.isfinite(array)], bins=40, color=COLOURS[0])
+        dress(ax, name, "orbits")
+    figure.suptitle(filled(title, 3.4 * len(values), 10), fontsize=10, color=TEXT)
+    return figure
+
+
+def points_figure(x: np.ndarray, y: np.ndarray, labels: tuple[str, str], title: str) -> Figure:
+    """Points (N,) in a plane."""
+    figure = new_figure(4.2, 3.8)
+    ax = figure.subplots()
+    ax.plot(x, y, ".", ms=max(1.0, min(5.0, 200 / np.sqrt(max(1, x.size)))), alpha=0.6, color=COLOURS[0], mew=0)
+    dress(ax, *labels)
+    figure.suptitle(filled(title, 4.0, 10), fontsize=10, color=TEXT)
+    return figure

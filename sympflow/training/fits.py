@@ -1,0 +1,645 @@
+"""Fits of flows and their solvers: the fields of these frozen dataclasses are the options of `train`.
+
+    train(system, PrimedFit(stages=3, processor=6), solver=GaussNewton(restarts=24), budget=15)
+
+A fit says which flow is made and what it is compared with, a solver how its numbers are found. None stands for a choice
+that is left open. With the seed both determine the trained numbers. `from_keywords` makes them of plain keywords.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from functools import partial
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from sympflow.arguments import plain
+from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.mlp import MLPFlow, matching_widths
+from sympflow.flow.primed import PrimedFlow
+from sympflow.flow.scaling import Scaling
+from sympflow.flow.split import SplitFlow
+from sympflow.flow.sympflow import SympFlow
+from sympflow.hamiltonian.domain import Domain
+from sympflow.hamiltonian.system import HamiltonianSystem
+
+Data = tuple[ArrayLike, ArrayLike, ArrayLike]
+Resolved = Any
+"""A fit or a solver in which no choice is left open."""
+Which = bool | tuple[int, ...]
+
+SCHEDULES = ("one-cycle", "cosine", "constant")
+LOSSES = ("residual", "matching", "labels")
+WEIGHTS = ("residual_weight", "matching_weight", "label_weight")
+
+
+# checks ---------------------------------------------------------------------------------------------------------
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def check_counts(**values: Any) -> None:
+    """Positive integers, or None where a choice is left open."""
+    for name, value in values.items():
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+            raise ValueError(f"`{name}` must be a positive integer; got {value!r}: give 1 or more, or leave it out.")
+
+
+def check_positive(**values: Any) -> None:
+    """Positive finite numbers, or None where a choice is left open."""
+    for name, value in values.items():
+        if value is not None and not (is_number(value) and 0 < value < math.inf):
+            raise ValueError(f"`{name}` must be positive and finite; got {value!r}: leave it out for the default.")
+
+
+def check_weights(**weights: Any) -> None:
+    """Weights of the losses, of which some may be 0, but not all."""
+    for name, value in weights.items():
+        if not (is_number(value) and 0 <= value < math.inf):
+            raise ValueError(f"`{name}` must be finite and at least 0; got {value!r}: 0 leaves the loss out.")
+    if not any(weights.values()):
+        *most, last = (f"`{name}`" for name in weights)
+        raise ValueError(f"{', '.join(most)} and {last} are all 0: give one of them a positive value.")
+
+
+def check_of(name: str, value: Any, known: Iterable[str]) -> None:
+    """One of the known names."""
+    if value not in known:
+        raise ValueError(f"`{name}` {value!r} is unknown: choose one of {', '.join(known)}.")
+
+
+class _Options:
+    """A frozen dataclass of options, with NumPy's numbers as Python's, which a checkpoint can compare."""
+
+    COUNTS: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for f in fields(self):  # type: ignore[arg-type]
+            object.__setattr__(self, f.name, plain(getattr(self, f.name)))
+        check_counts(**{name: getattr(self, name) for name in self.COUNTS})
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """The names of the options."""
+        return [f.name for f in fields(cls)]  # type: ignore[arg-type]
+
+    def given(self) -> list[str]:
+        """The options that have another value than their default."""
+        return [f.name for f in fields(self) if getattr(self, f.name) is not f.default != getattr(self, f.name)]  # type: ignore[arg-type]
+
+    def but(self, **values: Any) -> Self:
+        """The same with other values where a choice was left open."""
+        return replace(self, **{n: v for n, v in values.items() if getattr(self, n) is None})  # type: ignore[type-var]
+
+
+# solvers --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class GaussNewton(_Options):
+    """Damped Gauss–Newton steps on residuals; it stops by itself.
+
+    Parameters
+    ----------
+    steps : int, optional
+        The most steps: by default 1000 of each fit of a primed flow, 150 of a split one, 200 of a network.
+    restarts : int, optional
+        Starts of the search for a primed or a split flow: the flow as it is, then random tables. By default 24 and 8;
+        72 for a primed flow in up to three degrees of freedom of which nothing else is said.
+    refresh, validate_every, checkpoint_every : int
+        Of other flows, in steps: how long points are kept, None for the whole run; how often held-out figures are
+        taken, and a checkpoint is written.
+    """
+
+    steps: int | None = None
+    restarts: int | None = None
+    refresh: int | None = None
+    validate_every: int = 5
+    checkpoint_every: int = 10
+
+    name: ClassVar[str] = "gauss-newton"
+    COUNTS: ClassVar[tuple[str, ...]] = ("steps", "restarts", "refresh", "validate_every", "checkpoint_every")
+    POINTS: ClassVar[int] = 1500
+    STEPS: ClassVar[int] = 200
+
+
+@dataclass(frozen=True)
+class Adam(_Options):
+    """Adam (Kingma & Ba 2015), one gradient step on fresh points at a time.
+
+    Parameters
+    ----------
+    steps : int
+    learning_rate : float
+        The largest of the schedule.
+    schedule : {"one-cycle", "cosine", "constant"}
+        Cosine up over the first 5 % and down to 1e-3 of the peak; only down; or none.
+    clip : float or None
+        Largest norm of the gradient.
+    refresh, validate_every, checkpoint_every
+        See `GaussNewton`.
+    """
+
+    steps: int = 20_000
+    learning_rate: float = 5e-3
+    schedule: str = "one-cycle"
+    clip: float | None = 1.0
+    refresh: int | None = 1
+    validate_every: int = 500
+    checkpoint_every: int = 1000
+
+    name: ClassVar[str] = "adam"
+    COUNTS: ClassVar[tuple[str, ...]] = ("steps", "refresh", "validate_every", "checkpoint_every")
+    POINTS: ClassVar[int] = 700
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_of("schedule", self.schedule, SCHEDULES)
+        check_positive(learning_rate=self.learning_rate, clip=self.clip)
+
+    def rate(self, step: int) -> float:
+        """The learning rate of a step."""
+        if self.schedule == "constant":
+            return self.learning_rate
+        rise = 0.05 if self.schedule == "one-cycle" else 0.0
+        x = (step + 1) / self.steps
+        if x < rise:
+            return self.learning_rate * (0.04 + 0.96 * (1 - math.cos(math.pi * x / rise)) / 2)
+        fall = (1 + math.cos(math.pi * (x - rise) / (1 - rise))) / 2
+        return self.learning_rate * (1e-3 + (1 - 1e-3) * fall)
+
+
+@dataclass(frozen=True)
+class BFGS(_Options):
+    """BFGS with a dense matrix, 20 iterations in each of `steps` on the points of the step: see `GaussNewton`."""
+
+    steps: int = 200
+    refresh: int | None = None
+    validate_every: int = 5
+    checkpoint_every: int = 5
+
+    name: ClassVar[str] = "bfgs"
+    COUNTS: ClassVar[tuple[str, ...]] = ("steps", "refresh", "validate_every", "checkpoint_every")
+    POINTS: ClassVar[int] = 4000
+
+
+@dataclass(frozen=True)
+class LBFGS(BFGS):
+    """Limited-memory BFGS, likewise; for networks of more than 8000 parameters."""
+
+    steps: int = 500
+
+    name: ClassVar[str] = "lbfgs"
+
+
+Solver = GaussNewton | Adam | BFGS
+SOLVERS: dict[str, type[Solver]] = {cls.name: cls for cls in (Adam, BFGS, LBFGS, GaussNewton)}
+"""The solvers by the names that the keyword `optimizer` takes."""
+
+
+def _checksum(data: Data) -> str:
+    """The checksum of labels."""
+    content = hashlib.sha256()
+    for array in data:
+        content.update(np.ascontiguousarray(array).tobytes())
+    return content.hexdigest()
+
+
+# fits -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Fit(_Options):
+    """The options that all fits have.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Δt of a new flow, the longest time of its map.
+    points : int, optional
+        Number of states, drawn from the domain.
+    label_times : int
+        Number of times in (0, Δt] at which states are labelled by the exact flow.
+    seed : int
+        Of the points, the starts, and the initial weights.
+    reference_states : int
+        Held-out states of the figures.
+    """
+
+    dt: float | None = None
+    _: KW_ONLY
+    points: int | None = None
+    label_times: int = 8
+    seed: int = 0
+    reference_states: int = 100
+
+    kind: ClassVar[str]
+    COUNTS: ClassVar[tuple[str, ...]] = ("points", "label_times", "reference_states")
+    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt",)
+    """The options that describe the new flow."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f"`seed` must be a non-negative integer; got {self.seed!r}: give 0 or more.")
+        if self.dt is not None and not (is_number(self.dt) and 0 < self.dt < math.inf):
+            raise ValueError(f"`dt` must be a positive finite number; got {self.dt!r}: leave it out for the default.")
+
+    @property
+    def of_a_given_flow(self) -> Self:
+        """The same without what describes the new flow."""
+        described: Any = {f.name: f.default for f in fields(self) if f.name in self.OF_FLOW and f.name != "runs"}
+        return replace(self, **described)
+
+    def flow(self, system: HamiltonianSystem, domain: Domain, earlier: FlowMap | None = None) -> Any:
+        """The untrained flow; `earlier` is one that was trained before, whose numbers it may take over."""
+        raise NotImplementedError
+
+    @property
+    def losses(self) -> str:
+        """The losses that are fitted, joined by +."""
+        return "labels"
+
+    def record(self, solver: Solver) -> dict[str, Any]:
+        """The record of a recipe and a checkpoint: what determines the trained numbers."""
+        mine = {name: getattr(self, name) for name in self.names() if name not in (*self.OF_FLOW, "data", "loss")}
+        data = getattr(self, "data", None)
+        mine |= {name: getattr(solver, name) for name in solver.names()}
+        mine |= {"data": None if data is None else _checksum(data)}
+        found = {"optimizer": solver.name, "loss": self.losses, **mine}
+        return {name: value for name, value in found.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LossFit(Fit):
+    """The options of fits by losses at points."""
+
+    loss: str | None = None
+    residual_weight: float | None = None
+    matching_weight: float | None = None
+    label_weight: float | None = None
+    matching_times: int = 10
+    data: Data | None = field(default=None, repr=False, compare=False)
+
+    COUNTS: ClassVar[tuple[str, ...]] = (*Fit.COUNTS, "matching_times")
+
+    def _named(self, loss: Any) -> dict[str, Any]:
+        """The weights of the losses that are named, 0 for those that are left out."""
+        if self.data is not None and isinstance(loss, str) and "labels" not in loss.split("+"):
+            raise ValueError(
+                f"`data` has labels, which `loss` {loss!r} does not use: add +labels to it, or leave `data` out."
+            )
+        names = loss.split("+") if isinstance(loss, str) else []
+        if not names or not set(names) <= set(LOSSES):
+            raise ValueError(f"`loss` {loss!r} is unknown: join some of residual, matching and labels by +.")
+        if len(set(names)) < len(names):
+            raise ValueError(
+                f"`loss` {loss!r} names a loss twice: name it once, and give it more weight by its `_weight`."
+            )
+        given = dict(zip(LOSSES, (getattr(self, weight) for weight in WEIGHTS), strict=True))
+        each = {name: (1.0 if value is None else value) if name in names else 0.0 for name, value in given.items()}
+        return dict(zip(WEIGHTS, each.values(), strict=True))
+
+    @property
+    def losses(self) -> str:
+        weights = dict(zip(LOSSES, (getattr(self, weight) for weight in WEIGHTS), strict=True))
+        return "+".join(name for name in ("labels", "residual", "matching") if weights[name])
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrimedFit(_LossFit):
+    """A primed flow: the system's own V and T times functions of t, fitted to the exact flow.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Δt; by default what suits the system's frequencies on Ω, or what short trials find best.
+    stages, processor, curvature, polynomial, first, scheme, force_gradient, dtype, device
+        Of the new flow, see `SympFlow.primed`. By default 3 kicks, or as many as a given `dt` needs, and a processor of
+        6, if no trials choose them.
+    points : int, optional
+        Labelled states: by default 250, fewer for more than 4 degrees of freedom.
+    label_times : int
+        Number of equidistant times in (0, Δt] at which they are labelled.
+    frozen_weight : float
+        Weight of the residuals at t = Δt, which alone are composed over many steps; those at other times have 1.
+    energy_weight : float
+        Weight of the labels' errors in the energy, (∇H·δ)² in units of the spread of H over Ω, beside those of the
+        coordinates; 1000 for runs of which only the energy matters, 0 for none.
+    loss : str, optional
+        Some of "residual", "matching" and "labels", joined by "+"; "labels" by default.
+    residual_weight, matching_weight, label_weight : float, optional
+        Weights of ‖d/dt ψ̄_t(x) − J∇H‖², of (𝓗 − H − c(t))² and of the labels, of the losses that are named: 1.
+    loss_points, matching_times : int
+        Points of each of the first two, and the number of times in the second.
+    data : (array (n,), array (n, 2d), array (n, 2d)), optional
+        Labels of your own: times in [0, Δt], states, and where the exact flow takes them.
+    runs : int, optional
+        Of a lattice: after the search the numbers are fitted further to the energy errors of so many long runs of a
+        larger ring; 48 is usual.
+    seed, reference_states
+        See `Fit`.
+    """
+
+    stages: int | None = None
+    processor: int | None = None
+    curvature: Which = False
+    polynomial: int | None = None
+    first: str = "drift"
+    scheme: str | None = None
+    force_gradient: Which | None = None
+    dtype: torch.dtype = torch.float64
+    device: torch.device | str | None = None
+    frozen_weight: float = 1.0
+    energy_weight: float = 10.0
+    loss_points: int = 300
+    runs: int | None = None
+
+    kind: ClassVar[str] = "primed"
+    COUNTS: ClassVar[tuple[str, ...]] = (*_LossFit.COUNTS, "loss_points", "runs")
+    SHAPE: ClassVar[tuple[str, ...]] = ("curvature", "polynomial", "first", "scheme", "force_gradient")
+    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "stages", "processor", *SHAPE, "dtype", "device", "runs")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(frozen_weight=self.frozen_weight)
+        if not (is_number(self.energy_weight) and 0 <= self.energy_weight < math.inf):
+            raise ValueError(
+                f"`energy_weight` must be finite and at least 0; got {self.energy_weight!r}: 0 leaves the energy out."
+            )
+        if self.loss is None:
+            for name in (name for name in WEIGHTS if getattr(self, name) is not None):
+                raise TypeError(
+                    f"`{name}` is not an option of primed flows without a `loss`: leave it out, or name the losses."
+                )
+        check_weights(**{name: self.weights[name] for name in sorted(WEIGHTS)})
+
+    @property
+    def weights(self) -> dict[str, Any]:
+        """The weights of the losses."""
+        return self._named("labels" if self.loss is None else self.loss)
+
+    @property
+    def resolved(self) -> PrimedFit:
+        """The same with numbers for all weights."""
+        return replace(self, loss="labels" if self.loss is None else self.loss, **self.weights)
+
+    @property
+    def levels(self) -> list[int]:
+        """The terms of each kick of a step, see `sympflow.schemes.Scheme.level`; one that steps share counts once."""
+        stages = 3 if self.stages is None else self.stages
+        n = stages + (self.first == "kick")
+
+        def having(which: Which | None) -> Iterable[int]:
+            return which if isinstance(which, tuple) else range(n if which or which is None else 0)
+
+        levels = [(i in having(self.force_gradient)) * (1 + (i in having(self.curvature))) for i in range(n)]
+        return levels if self.first == "drift" else levels[:-1]
+
+    def flow(self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None) -> Any:
+        shape = {name: getattr(self, name) for name in (*self.SHAPE, "dtype", "device")}
+        flow = SympFlow.primed(
+            system,
+            (3 if self.stages is None else self.stages) if self.scheme is None else None,
+            dt=1.0 if self.dt is None else float(self.dt),
+            processor=6 if self.processor is None else self.processor,
+            **shape,
+        )
+        if earlier is not None:
+            assert isinstance(earlier, PrimedFlow)
+            flow.take_over(earlier)
+        return flow
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitFit(Fit):
+    """A split flow of a stiff system, of the exact flows of the parts of H, fitted to the exact flow.
+
+    The label times Δt sin(πj/2J) are dense towards Δt, where polynomials between labels are worst.
+
+    Parameters
+    ----------
+    dt, turn : float
+        Δt, or, where it is left out, Δt times the fastest frequency.
+    stages, terms, force_gradient
+        Of the new flow, see `SympFlow.split`.
+    frozen_weight : float
+        Weight of the residuals at t = Δt; those at other times have 1.
+    points, label_times, seed, reference_states
+        See `Fit`.
+    """
+
+    points: int | None = 150
+    label_times: int = 16
+    turn: float = 10.0
+    stages: int = 4
+    terms: int = 8
+    force_gradient: Which | None = None
+    frozen_weight: float = 30.0
+
+    kind: ClassVar[str] = "split"
+    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "turn", "stages", "terms", "force_gradient")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(frozen_weight=self.frozen_weight, turn=self.turn)
+
+    def flow(self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None) -> Any:
+        dt = self.turn / float(system.linear_part.frequencies.max()) if self.dt is None else self.dt
+        return SympFlow.split(system, self.stages, dt=dt, terms=self.terms, force_gradient=self.force_gradient)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossFit(_LossFit):
+    """Any flow, trained further by losses at points, step by step: `train(system, LossFit(), flow=flow)`.
+
+    Parameters
+    ----------
+    points : int, optional
+        Collocation points of each of the first two losses, in a step; by default 700 for Adam, 1500 for Gauss–Newton,
+        4000 for BFGS.
+    loss : str, optional
+        Some of "residual", "matching" and "labels", joined by "+": those that are left out get the weight 0.
+    residual_weight, matching_weight, label_weight : float, optional
+        Weights of the residual of the flow, Hamiltonian matching, and labels; 0 leaves a loss out. The defaults are 1,
+        1 (0 for Gauss–Newton and for a baseline, which has no Hamiltonian), and 0, 1 with `data`.
+    matching_times : int
+        Number of distinct times in the second, each with points / matching_times states (to remove 𝓗's free c(t)).
+    label_times : int
+        Number of equidistant times in (0, Δt] at which as many states as there are points are labelled; each step
+        takes `points` of these labels.
+    data : (array (n,), array (n, 2d), array (n, 2d)), optional
+        Labels of your own, of which a tenth is held out.
+    validation_points : int
+        Held-out points of the losses.
+    seed, reference_states
+        See `Fit`.
+    """
+
+    validation_points: int = 2000
+
+    kind: ClassVar[str] = "losses"
+    COUNTS: ClassVar[tuple[str, ...]] = (*_LossFit.COUNTS, "validation_points")
+
+    def resolved(self, solver: Solver, kind: str) -> LossFit:
+        """The same with numbers for what is left open, of a flow of that kind."""
+        if self.loss is not None:
+            weights = self._named(self.loss)
+        else:
+            matched = kind != "mlp" and not isinstance(solver, GaussNewton)
+            defaults = 1.0, float(matched), float(self.data is not None)
+            given = (getattr(self, name) for name in WEIGHTS)
+            weights = {n: d if w is None else w for n, w, d in zip(WEIGHTS, given, defaults, strict=True)}
+        if kind == "mlp" and weights["matching_weight"]:
+            raise ValueError("`matching_weight` needs a Hamiltonian, which an MLP flow has not: leave it out.")
+        check_weights(**weights)
+        found = replace(self, points=self.points or solver.POINTS, loss=None, **weights)
+        if found.matching_times > min(found.points or 0, found.validation_points) // 2:
+            raise ValueError("`matching_times` must leave two points for each time: make it at most half of `points`.")
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkFit(LossFit):
+    """A new SympFlow with MLP potentials, or the unconstrained baseline, trained on losses at points.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Δt, 1 by default.
+    pairs, hidden, activation, dtype, device
+        See `SympFlow`; a baseline has as many parameters as the SympFlow that they describe.
+    baseline : bool
+        True for an `MLPFlow`.
+    points, loss, residual_weight, matching_weight, label_weight, matching_times, label_times, data, validation_points,
+    seed, reference_states
+        See `LossFit`.
+    """
+
+    pairs: int = 3
+    hidden: Sequence[int] = (10, 10)
+    activation: str = "tanh"
+    dtype: torch.dtype = torch.float64
+    device: torch.device | str | None = None
+    baseline: bool = False
+
+    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "pairs", "hidden", "activation", "dtype", "device", "baseline")
+
+    @property
+    def kind(self) -> str:  # type: ignore[override]
+        return "mlp" if self.baseline else "sympflow"
+
+    def network(self, system: HamiltonianSystem, dt: float, scaling: Scaling) -> FlowMap:
+        """The network in these units.
+
+        Raises
+        ------
+        ValueError
+            If no baseline has as many parameters.
+        """
+        make = partial(SympFlow, system.ndof) if system.autonomous else partial(SympFlow.timed, system)
+        like: Any = {"dtype": self.dtype, "device": self.device, "seed": self.seed, "scale": scaling}
+        flow = make(self.pairs, hidden=self.hidden, activation=self.activation, dt=dt, **like)
+        if not self.baseline:
+            return flow
+        if matching_widths(flow.ndof, flow.n_parameters) is None:
+            raise ValueError(
+                f"`hidden` and `pairs` describe a SympFlow of only {flow.n_parameters} parameters, which no "
+                "MLPFlow matches within 2 %: give wider layers or more pairs."
+            )
+        return MLPFlow.matching(flow, self.seed, scaling, self.activation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockedFit(Fit):
+    """A splitting scheme on the logarithmic Hamiltonian, with a trained clock: see `sympflow.flow.clocked`.
+
+    Parameters
+    ----------
+    dt : float, optional
+        The physical length of the longest step, as the `dt` of methods by the clock "logarithmic"; 1 by default.
+    scheme, terms
+        See `ClockedFlow`.
+    points, label_times : int
+        Seeded states of the domain, and steps at which each is labelled.
+    seed, reference_states
+        See `Fit`.
+    """
+
+    points: int | None = 100
+    label_times: int = 12
+    scheme: str = "leapfrog"
+    terms: int = 10
+
+    kind: ClassVar[str] = "clocked"
+    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "scheme", "terms")
+
+
+# plain keywords -------------------------------------------------------------------------------------------------
+
+KINDS: dict[str, type[Fit]] = {"primed": PrimedFit, "sympflow": NetworkFit, "mlp": NetworkFit}
+"""The fits of new flows, by the names that the keyword `kind` takes."""
+
+FITTED: tuple[tuple[type[FlowMap], type[Fit]], ...] = ((PrimedFlow, PrimedFit), (SplitFlow, SplitFit))
+"""The fits of given flows by Gauss–Newton; any other flow is trained on losses."""
+
+DEFAULTS: dict[str, Any] = {
+    **{"residual_weight": 1.0, "matching_times": 10, "learning_rate": 5e-3, "schedule": "one-cycle", "clip": 1.0},
+    **{"seed": 0, "validation_points": 2000, "reference_states": 100},
+}
+"""Values that mean the same as a keyword that is left out, for every fit and solver."""
+
+OF_NETWORKS, OF_PRIMED = ("pairs", "hidden", "activation"), ("stages", "processor", *PrimedFit.SHAPE)
+OF_SEARCHES = ("restarts", "frozen_weight", "energy_weight", "runs")
+
+
+def keywords() -> list[str]:
+    """All keywords that some fit or solver takes."""
+    of_fits = [name for cls in (PrimedFit, NetworkFit) for name in cls.names() if name != "baseline"]
+    return list(dict.fromkeys(["kind", "optimizer", *of_fits, *(n for cls in SOLVERS.values() for n in cls.names())]))
+
+
+def said(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The keywords that say something: not those that are None, or what is so without them."""
+    nothing = object()
+    plainly = {name: plain(value) for name, value in options.items()}
+    kept = {name: value for name, value in plainly.items() if value is not None or name == "clip"}
+    return {n: v for n, v in kept.items() if not (is_number(v) or isinstance(v, str)) or v != DEFAULTS.get(n, nothing)}
+
+
+def from_keywords(options: Mapping[str, Any], kind: str, by: str | None, flow: FlowMap | None) -> tuple[Fit, Solver]:
+    """The fit and the solver, named `by` the keyword `optimizer`, of a new flow of a kind, or of a given one.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If they do not take a keyword, or its value.
+    """
+    searches = by in (None, GaussNewton.name)
+    made = KINDS[kind] if flow is None else LossFit
+    if searches and flow is not None:
+        made = next((fit for family, fit in FITTED if isinstance(flow, family)), LossFit)
+    elif not searches and kind == "primed":
+        made = LossFit
+    search = issubclass(made, PrimedFit | SplitFit)
+    name = by or (GaussNewton.name if search else Adam.name)
+    check_of("optimizer", name, SOLVERS)
+    solver = SOLVERS[name]
+    of_solver = ["steps", "restarts"] if search else [n for n in solver.names() if n != "restarts"]
+    of_fit = [n for n in made.names() if n != "baseline"]
+    what = f"the optimizer {name!r} for {f'{kind} flows' if search else f'flows of kind {kind!r}'}"
+    for each in (n for n in options if n not in (*of_fit, *of_solver)):
+        raise TypeError(
+            f"`{each}` is not an option of {what}: leave it out. There are {', '.join(of_solver + of_fit)}."
+        )
+    more = {"baseline": True} if kind == "mlp" and flow is None else {}
+    fit = made(**{n: v for n, v in options.items() if n in of_fit}, **more)
+    return fit, solver(**{n: v for n, v in options.items() if n in of_solver})

@@ -1,0 +1,116 @@
+"""Objects as text, as HTML and as figures."""
+
+import warnings
+
+import matplotlib  # noqa: F401
+import numpy as np
+import pytest
+
+import sympflow
+from sympflow import HamiltonianSystem, systems
+from sympflow.learning.trajectories import Trajectories
+from sympflow.systems.user_files import factory
+
+HH = systems.henon_heiles()
+T = np.linspace(0, 5, 21)
+
+
+def orbits(system=HH, **options):
+    return sympflow.solve(system, "verlet", (0, 5), dt=0.1, **options)
+
+
+RESULTS = {
+    "system": (lambda: HH, ["henon_heiles", "2 degrees of freedom"]),
+    "solution": (orbits, ["Hénon–Heiles", "verlet, dt = 0.1", "51 times, 0 … 5", "(4, 51)", "e-03, relative"]),
+    "batch": (lambda: orbits(y0=HH.domain.sample(3)), ["(3, 4, 51)"]),
+    "driven": (lambda: orbits(systems.get("duffing")()), ["duffing"]),
+    "flow": (lambda: sympflow.shipped_flows(HH)[0].load(HH), ["PrimedFlow of henon_heiles", "dt=0.82"]),
+    "comparison": (lambda: sympflow.compare(HH, ["verlet", "leapfrog"], t_span=(0, 2)), ["Hénon–Heiles", "leapfrog"]),
+    "work and precision": (
+        lambda: sympflow.work_precision(HH, ["verlet"], t_span=(0, 2), batch=None, repeats=1),
+        ["energy error", "step"],
+    ),
+    "section": (lambda: sympflow.poincare_section(HH, "verlet", (0, 30)), ["trajectory", "q2"]),
+    "ensemble": (
+        lambda: sympflow.ensemble(HH, "verlet", (0, 5), HH.domain, n=20, reduce="final"),
+        ["Hénon–Heiles", "verlet, dt = 0.05", "20", "final (20, 4)"],
+    ),
+    "numbers of an ensemble": (
+        lambda: sympflow.ensemble(HH, "verlet", (0, 5), HH.domain, n=20, reduce=lambda t, y: y[0].max()),
+        ["20"],
+    ),
+    "trajectories": (lambda: Trajectories.read([(T, np.stack([np.sin(T), np.cos(T)]))]), ["1 trajectories", "21"]),
+    "indicator": (lambda: sympflow.lyapunov(HH, "verlet", (0, 5)), ["value", "reached"]),
+}
+
+
+@pytest.mark.parametrize(("make", "told"), RESULTS.values(), ids=RESULTS)
+def test_results_are_shown_as_text_html_and_figures(make, told, tmp_path):
+    result = make()
+    shown, html = repr(result), result._repr_html_()
+    for words in told:
+        assert words in shown
+    assert html.startswith("<div>")
+    assert html.endswith("</div>")
+    assert ("<img" in html) == (result.preview() is not None)
+    if hasattr(result, "plot"):
+        figure = result.plot(path=tmp_path / "figure.png")
+        assert (tmp_path / "figure.png").stat().st_size > 1000
+        assert any(ax.lines or ax.collections or ax.patches for ax in figure.axes)
+
+
+@pytest.mark.parametrize(
+    ("system", "panels"),
+    [
+        (systems.pendulum(), ["q", "p", "|energy error|, relative"]),
+        (HH, ["q₂", "p₁", "|energy error|, relative"]),
+        (HamiltonianSystem.lattice(shape=16, bond="r**2/2", y0=np.eye(32)[0]), ["coordinate", "p₁"]),
+        (systems.get("duffing")(), ["q", "p"]),
+    ],
+    ids=["one", "two", "many", "driven"],
+)
+def test_panels_of_a_solution(system, panels):
+    labels = [ax.get_ylabel() for ax in orbits(system).plot().axes]
+    assert labels[: len(panels)] == panels
+    assert [ax.get_ylabel() for ax in orbits(system).plot(["phase"]).axes] == [panels[1]]
+
+
+def test_kinds_of_panels_are_checked():
+    with pytest.raises(ValueError, match="`kinds` must be some of 'orbit', 'phase', 'energy'"):
+        orbits().plot(["oribt"])
+
+
+def test_showing_warns_of_nothing():
+    sol = orbits(HamiltonianSystem.from_sympy("p**2/2 - q**2/2", y0=[1, 1]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert "Solution of H = " in repr(sol)
+
+
+def test_h_is_typeset():
+    assert r"\frac{p_{1}^{2}}{2}" in HH._repr_html_()
+
+
+def test_systems_list_what_users_need():
+    names = dir(HH)
+    assert len(names) <= 32
+    assert {"hamiltonian", "from_sympy", "with_params", "params", "y0", "domain"} <= {*names}
+    assert all(hasattr(HH, name) for name in names)
+
+
+def test_numbers_are_rounded_where_they_are_shown():
+    system = HamiltonianSystem.from_sympy("p**2/2 + k*q**2", params={"k": 4.8000000000000007}, y0=[1, 0])
+    sol = sympflow.solve(system, "verlet", (0, 1), dt=0.1 + 1e-17)
+    assert "00000" not in repr(system) + repr(sol) + system._repr_html_()
+
+
+def test_a_system_of_a_file_is_called_by_its_file(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(
+        "from sympflow import HamiltonianSystem\n"
+        "def morse(D=1.0) -> HamiltonianSystem:\n"
+        "    return HamiltonianSystem.from_sympy('p**2/2 + D*(1 - exp(-q))**2', params={'D': D}, y0=[0.5, 0])\n"
+    )
+    system = factory(path, "morse")()
+    assert system.title == "own.py:morse, D = 1"
+    assert orbits(system).plot().get_suptitle().startswith("own.py:morse")
