@@ -235,7 +235,10 @@ def _is_transformed(x: Any) -> bool:
     import torch
     from torch.autograd import forward_ad
 
-    if torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x) or _is_symbolic(x):
+    functorch = torch._C._functorch
+    if torch.compiler.is_compiling() or functorch.is_functorch_wrapped_tensor(x) or _is_symbolic(x):
+        return True
+    if functorch.is_legacy_batchedtensor(x):  # cotangents side by side, of torch.autograd.grad(is_grads_batched=True)
         return True
     return forward_ad.unpack_dual(x).tangent is not None
 

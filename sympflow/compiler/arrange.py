@@ -21,7 +21,6 @@ __all__ = ["Arranged", "Arrangement"]
 
 MOST_TERMS = 64  # of a product that is multiplied out
 MOST_TRIED = 10  # terms of a polynomial for which all ways to nest it are compared
-MOST_RICH = 5  # terms for which products are tried that only letters share
 MOST_SEARCHED = 1000  # polynomials, and parts of these, for which they are
 
 Monomial = tuple[tuple[int, int], ...]
@@ -39,13 +38,10 @@ class Arranged(NamedTuple):
         From the constants of a run to the numbers that `body` reads.
     body : Program
         From the states and the outputs of `table` to the results.
-    plain : Program
-        The same up to rounding, with results that may be made of one another: shorter, and soon differentiated.
     """
 
     table: Program
     body: Program
-    plain: Program
 
 
 class Polynomial(Number):
@@ -91,8 +87,6 @@ class Arrangement:
         Names of what does not change in a run.
     expand : bool
         False leaves products of sums (`times`) as they are.
-    squares : bool
-        True takes out squares first, which several polynomials may share, where that costs as much.
 
     Attributes
     ----------
@@ -100,14 +94,8 @@ class Arrangement:
         The numbers, to be calculated with.
     """
 
-    def __init__(
-        self,
-        states: Sequence[tuple[str, int]],
-        constants: Sequence[str] = (),
-        expand: bool = True,
-        squares: bool = False,
-    ) -> None:
-        self._expand, self._squares = expand, squares
+    def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = (), expand: bool = True) -> None:
+        self._expand = expand
         self._table, self._body = Recording(), Recording()
         self._constants = [self._table.input(name) for name in constants]
         self._known: dict[int, int] = {}
@@ -125,13 +113,10 @@ class Arrangement:
         self.states = [self.letter(node) for node in self._states]
         self.constants = [Polynomial(self, {(): x}) for x in self._constants]
 
-    def finish(self, outputs: Sequence[Any], plain: Sequence[Any] | None = None) -> Arranged:
+    def finish(self, outputs: Sequence[Any]) -> Arranged:
         """Return the programs of outputs: numbers of `body`, see `written`."""
-        inputs = [*self._states, *self._entries.values()]
-        body = Program(inputs, outputs)
-        return Arranged(
-            Program(self._constants, self._from_table), body, body if plain is None else Program(inputs, plain)
-        )
+        body = Program([*self._states, *self._entries.values()], outputs)
+        return Arranged(Program(self._constants, self._from_table), body)
 
     # polynomials --------------------------------------------------------------------------------------------------
 
@@ -353,12 +338,10 @@ class Arrangement:
                     for y, _ in m[i + 1 :]:
                         counts[(x, 1), (y, 1)] = counts.get(((x, 1), (y, 1)), 0) + 1
         if few:
-            rich = len(terms) <= MOST_RICH
-            shared = [m for m, n in counts.items() if n > 1 or (rich and all(counts[(x, 1),] > 1 for x, _ in m))]
+            shared = [m for m, n in counts.items() if n > 1]
             alone = [m for m in terms if m and not any(_divides(factor, m) for factor in shared)]
             last = max(((self._known[x], x) for m in alone for x, _ in m), default=None)
-            squares = [((x, 2),) for m in terms for x, e in m if e > 1] if self._squares else []
-            return [*squares, *shared, *([] if last is None else [((last[1], 1),)])]
+            return [*shared, *([] if last is None else [((last[1], 1),)])]
         return sorted((m for m in counts if m[0][1] == 1), key=lambda m: -counts[m])[:1]
 
     def _nested(self, terms: Terms, factor: Monomial) -> Iterator[Plan]:
@@ -451,7 +434,3 @@ def _without(m: Monomial, factor: Monomial) -> Monomial:
 
 def _is_one(c: Any) -> bool:
     return isinstance(c, float) and c == 1.0
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, float) and x == 0.0

@@ -219,8 +219,8 @@ def _checked_values(name: str, given: Any) -> np.ndarray:
     if is_tensor(given):
         if transformed(given):
             raise TypeError(
-                f"`params` has {name} that torch.func, forward mode or torch.compile follows, which solve does not take: "
-                "use torch.autograd.grad, or detach it."
+                f"`params` has {name} that torch.func, forward mode or torch.compile follows, which solve does not "
+                "take: use torch.autograd.grad, or detach it."
             )
         given = given.detach().cpu().numpy()
     try:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 import sympy as sp
 
-from sympflow.compiler.arrange import Arranged, Arrangement
+from sympflow.compiler.arrange import Stage, Arrangement
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
 from sympflow.compiler.functions import added, apply
 from sympflow.compiler.machine import address, host
@@ -47,7 +47,7 @@ CHUNKS, WORTH_CHUNKS = 8, 100_000
 threads wait for each other after each sum."""
 
 
-def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Arranged:
+def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Stage:
     """The derivatives of V by s, those of `kinds` with factors 2ᵏ: a program of s, columns of both bodies, constants.
 
     A number that is known for a body is multiplied before those of its partners.
@@ -224,11 +224,11 @@ class FewSplitting(Splitting):
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
 
-    def kinds(self) -> Sequence[Arranged | WithinRange]:
+    def kinds(self) -> Sequence[Stage | WithinRange]:
         _check_level(self.level)
         return super().kinds()
 
-    def _arranged(self, terms: int) -> Arranged:
+    def _arranged(self, terms: int) -> Stage:
         return FewShape(self, terms, True).arranged()[1]
 
 

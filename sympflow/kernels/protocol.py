@@ -241,6 +241,10 @@ class Kernel:
         """`runs` of which cotangents can be pulled back."""
         raise NotImplementedError
 
+    def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of tensors, with `values` of the parameters, by tensor operations."""
+        raise NotImplementedError
+
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The `step` from each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d); None where they are not compiled."""
         return None

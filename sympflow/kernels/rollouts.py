@@ -114,6 +114,13 @@ class Rollouts:
         """Raise a ValueError, with the reason, where there is none."""
         raise ValueError("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
 
+    def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of length h at t from tensors (..., 2d), by tensor operations.
+
+        `numbers` (n, m) are those of the columns of a step of length 1, `values` those of the parameters.
+        """
+        raise NotImplementedError
+
     def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
         """From cotangents (m, size, …) of the numbers of columns to those of the numbers of a table (n, m, …)."""
         raise NotImplementedError
@@ -162,15 +169,16 @@ class Rollouts:
         """Compile the function of a name: "run", "kept", "reverse", "slopes", each " own" too, or "map"."""
         memory, (what, _, own_tables) = self.place, name.partition(" ")
         if what in ("reverse", "slopes"):
-            given = self.n_values, self.n_out, self.size, self.adjoint, width, bool(own_tables), what == "slopes"
-            return reverse_function(*given)
+            sizes = self.n_values, self.n_out, self.size
+            return reverse_function(*sizes, self.adjoint, width, bool(own_tables), what == "slopes")
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
         own, kept = bool(own_tables), what == "kept"
         over = self.over if self.chunked and not kept else None
-        given = self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing
-        return run_function(*given, over, kept)
+        return run_function(
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over, kept
+        )
 
     def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
         """Call the compiled function of a name with arrays and integers."""

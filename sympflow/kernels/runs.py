@@ -211,7 +211,7 @@ def reverse_function(
     with code.over(groups(code, n_rows, width)) as group:
         begin, length = group * width, (link + 2) * (size * width)
         place = code.at(table, group * length) if own else table
-        column = ColumnStage(code, place, kinds, size, width if own else 1, width, adjoint)
+        column = ColumnStage(code, place, kinds, size, width if own else 1, width, _no_stage)
         found = code.at(derivatives, group * length)
         history = _History(code, kept, group, (n_steps - first) * link, n_values, width)
         cotangents = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
@@ -663,6 +663,10 @@ def _state(
     if memory is None:
         return _Registers(code, n_values, n_out, width)
     return memory(code, width, arguments, before)
+
+
+def _no_stage(*_: Any) -> Any:
+    """The stage of a column of which the numbers alone are asked for."""
 
 
 def groups(code: Code, n_rows: Value, width: int) -> Value:

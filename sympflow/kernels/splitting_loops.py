@@ -384,7 +384,6 @@ class SplittingKernel(Kernel):
         return Recorded(self._functions(), table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
 
     def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
-        """A step of tensors, with `values` of the parameters, by tensor operations."""
         rows = self.loops.rows(replace(step_table(self.scheme), more=None))[..., 0]
         return self._functions().stepped(rows, y, h, t, values)
 

@@ -11,11 +11,11 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sympflow.compiler.arrange import Arranged, Arrangement
+from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import Type, Value, Variable
 from sympflow.compiler.functions import FUNCTIONS, added, times
 from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
@@ -98,7 +98,7 @@ class Splitting:
         """Terms of the kicks of each kind of stage: one, two, …; a polynomial has all of its own."""
         return [1, 2, 3][: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0)]
 
-    def kinds(self) -> Sequence[Arranged | WithinRange]:
+    def kinds(self) -> Sequence[Stage | WithinRange]:
         """The stages, those with the fewest terms first."""
         return [self._within_range(terms) if self.ranges else self._arranged(terms) for terms in self.terms]
 
@@ -113,7 +113,7 @@ class Splitting:
             known[x.order] = ready + FUNCTIONS[x.name].cost
         return max(known.values(), default=0) + len(body) / 2
 
-    def _within_range(self, terms: int) -> Arranged | WithinRange:
+    def _within_range(self, terms: int) -> Stage | WithinRange:
         """The stage as a polynomial in its range, if there is one."""
         near = on_interval(_of_kick(self.symbols, terms), self.symbols.q[0], *self.ranges[0])
         if near is None:
@@ -121,13 +121,24 @@ class Splitting:
         arranged = NearShape(self, terms, near).arranged()[1]
         return WithinRange(arranged, self._arranged(terms), near.low, near.high)
 
-    def _arranged(self, terms: int) -> Arranged:
+    def _arranged(self, terms: int) -> Stage:
         """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
         cost, shape = Shape(self, terms, True).arranged()
         if terms > 1 and len(shape.body) > LONG:
             other_cost, other = Shape(self, terms, False).arranged()
             return shape if cost <= other_cost else other
         return shape
+
+
+class Stage(NamedTuple):
+    """A kick and a drift as programs: see `Arranged`.
+
+    In `plain`, which is the same up to rounding, results may be made of one another: it is the one to differentiate.
+    """
+
+    table: Program
+    body: Program
+    plain: Program
 
 
 class Shape:
@@ -149,7 +160,7 @@ class Shape:
         self.values = [self.number[s.name] for s in symbols.parameters]
         self.plain: list[Any] = []
 
-    def arranged(self) -> tuple[int, Arranged]:
+    def arranged(self) -> tuple[int, Stage]:
         """The cost of the stage, and its programs."""
         made, d = self.made, self.d
         errors: list[Any] = []
@@ -162,8 +173,9 @@ class Shape:
         else:
             positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
-        arranged = made.finish(outputs, [*self.plain, *momenta, *errors] if self.plain else None)
-        return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
+        table, body = made.finish(outputs)
+        plain = Program(body.inputs, [*self.plain, *momenta, *errors]) if self.plain else body
+        return 2 * max(made.depth(x) for x in outputs) + 3 * len(body), Stage(table, body, plain)
 
     def _kicked(self) -> list[Any]:
         """The momenta after a kick, numbers of the body."""
@@ -275,12 +287,12 @@ class WithinRange:
 
     Attributes
     ----------
-    near : Arranged
+    near : Stage
     table : callable
         From the constants of a run to the numbers that both read.
     """
 
-    def __init__(self, near: Arranged, exact: Arranged, low: float, high: float) -> None:
+    def __init__(self, near: Stage, exact: Stage, low: float, high: float) -> None:
         self.near, self._exact, self._low, self._high = near, exact, low, high
         self.table = _Both(near.table, exact.table)
 
@@ -389,7 +401,7 @@ class SplittingCode(Rollouts):
         return SplittingCode, (self._splitting,)
 
     @cached_property
-    def _kinds(self) -> Sequence[Arranged | WithinRange]:
+    def _kinds(self) -> Sequence[Any]:
         return self._splitting.kinds()
 
     @cached_property
@@ -441,7 +453,7 @@ class SplittingCode(Rollouts):
         end = self.size - self._own
         return slice(end - CLOCK, end)
 
-    def _lettered(self, time: Value, given: Sequence[Value]) -> list[Any]:
+    def _lettered(self, time: Any, given: Sequence[Any]) -> list[Any]:
         """The numbers of a column of a driven system, of those that are given, with its letters at a time."""
         driving, clock = self._splitting.driving, self._clock
         assert driving is not None
@@ -451,19 +463,25 @@ class SplittingCode(Rollouts):
     # the reverse --------------------------------------------------------------------------------------------------
 
     @cached_property
+    def _plain(self) -> list[Stage]:
+        """The stages of each kind, to be differentiated."""
+        kinds = [kind for kind in self._kinds if isinstance(kind, Stage)]
+        if len(kinds) < len(self._kinds):
+            raise NotImplementedError("its kicks are no plain programs.")
+        return kinds
+
+    @cached_property
     def _adjoints(self) -> list[Program]:
         """Of the stage of each kind: the state, the numbers of a column, the time if it counts, and the cotangents."""
-        if any(isinstance(kind, WithinRange) for kind in self._kinds):
-            raise NotImplementedError("kicks that are polynomials in a range of positions have no reverse.")
         if not self.timed:
-            return [adjoint(kind.plain) for kind in self._kinds]
+            return [adjoint(kind.plain) for kind in self._plain]
         names = [f"x_{i}" for i in range(self.n_values)], [f"number_{i}" for i in range(self.size)]
 
-        def stage(body: Arranged, numbers: Sequence[Any]) -> list[Any]:
+        def stage(body: Any, numbers: Sequence[Any]) -> list[Any]:
             state, given, time = numbers[: self.n_values], numbers[self.n_values : -1], numbers[-1]
             return body.plain(*state, *body.table(*self._lettered(time, given)))
 
-        return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._kinds]
+        return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._plain]
 
     def check_reverse(self) -> None:
         try:
@@ -504,13 +522,9 @@ class SplittingCode(Rollouts):
 
     @cached_property
     def _of_tables(self) -> list[Program]:
-        return [adjoint(kind.table) for kind in self._kinds]
+        return [adjoint(kind.table) for kind in self._plain]
 
     def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
-        """A step of length h at t from tensors (..., 2d), by tensor operations.
-
-        `numbers` (n, m) are those of the columns of a step of length 1, `values` those of the parameters.
-        """
         import torch
 
         state = [*y.unbind(-1), *[torch.zeros_like(y[..., 0])] * (self.n_values - self.n_out)]
@@ -524,7 +538,7 @@ class SplittingCode(Rollouts):
                 )
             else:
                 given += values
-            state = self._kinds[k].plain(*state, *self._kinds[k].table(*given))
+            state = self._plain[k].plain(*state, *self._plain[k].table(*given))
         return torch.stack([x.expand(y.shape[:-1]) for x in state[: self.n_out]], dim=-1)
 
     @property
