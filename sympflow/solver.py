@@ -37,8 +37,8 @@ from sympflow.integrators.domain_exit import (
     warn_of_leap,
     warn_of_loss,
 )
-from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event, warn_of_jumps
-from sympflow.integrators.impulses import run_between_impulses
+from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
+from sympflow.integrators.impulses import landings, run_in_pieces
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, get, naming_plugin
 from sympflow.solution import Solution, StoredSolution, energy_change, joined
@@ -314,18 +314,14 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     check_applies(integrator, between, y_start)
     integrator.check_library(y_start)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
+    able = problem.store is None and problem.letters is None
+    told, jumps = landings(integrator, between, problem.t0, problem.t1, able)
+    if told:
+        warnings.warn(told, RuntimeWarning, stacklevel=4)
     if between is not system:
         _check_impulses(problem, integrator)
-        run = partial(run_between_impulses, _run)
-    elif not system.autonomous:
-        warn_of_jumps(
-            system,
-            problem.t0,
-            problem.t1,
-            integrator.step_length(system),
-            integrator.label if integrator.forces_at_ends(system) else None,
-            stacklevel=4,
-        )
+    if between is not system or jumps:
+        run = partial(run_in_pieces, partial(_run_diagnosed, rows), jumps=jumps)
     if problem.t1 in (math.inf, -math.inf):
         run = _run_endless
     elif problem.store is not None:
@@ -341,15 +337,9 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
-    passed = False
-    if (system.poles is not None or problem.letters is not None) and problem.diagnosed and problem.store is None:
-        if stopped is None and readable(outcome.y) and np.any(np.asarray(outcome.status) >= 0):
-            passed = note_poles(outcome, integrator, problem, rows, stacklevel=4 + (rows is not None))
-        if stopped is None and problem.letters is None and readable(outcome.y):
-            warn_of_cancelling(outcome, problem, stacklevel=4)
+    if stopped is None:
+        _diagnose(outcome, integrator, problem, rows, stacklevel=5)
     failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
-    if failed and stopped is None and problem.diagnosed and problem.letters is None and readable(y_start):
-        note_singularities(outcome, integrator, problem, passed)
     if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
         warn_of_leap(outcome, system, y_start, stacklevel=4)
     if system.functions_given and readable(outcome.y):
@@ -471,6 +461,31 @@ def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
     if search is None or integrator.finds_events:
         return integrator.run(problem), problem
     return run_and_search(integrator, problem, search), problem
+
+
+def _run_diagnosed(rows: ParameterRows | None, integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
+    """The outcome of a piece of a run, and its problem."""
+    outcome, problem = _run(integrator, problem)
+    _diagnose(outcome, integrator, problem, rows, stacklevel=7)
+    return outcome, problem
+
+
+def _diagnose(
+    outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None, stacklevel: int
+) -> None:
+    """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
+    if not problem.diagnosed:
+        return
+    passed = False
+    looked = problem.system.poles is not None or problem.letters is not None
+    if looked and problem.store is None and readable(outcome.y):
+        if np.any(np.asarray(outcome.status) >= 0):
+            passed = note_poles(outcome, integrator, problem, rows, stacklevel=stacklevel + (rows is not None))
+        if problem.letters is None:
+            warn_of_cancelling(outcome, problem, stacklevel=stacklevel)
+    failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
+    if failed and problem.letters is None and readable(problem.y0):
+        note_singularities(outcome, integrator, problem, passed)
 
 
 def _check_impulses(problem: Problem, integrator: Integrator) -> None:

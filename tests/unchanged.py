@@ -398,7 +398,7 @@ def sloped(run: Callable[..., Solution], y0: Any, dtype: torch.dtype = torch.flo
 # every method -----------------------------------------------------------------------------------------------------
 
 
-METHODS = sympflow.available()
+METHODS = [m for m in sympflow.available() if getattr(sympflow.get(m), "splitting", "") != "kepler"]
 FLOWS = ("sympflow", "mlp")
 SLOW = ("adaptive_heun", "fehlberg2", "bosh3")  # at their usual tolerances
 

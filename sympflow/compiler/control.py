@@ -283,11 +283,6 @@ class Code:
         given = ", ".join(f"{a.type} {a.name}" for a in args)
         return self._new(result, f"call {result or 'void'} {address.name}({given})")
 
-    def call_at(self, address: Value, args: Sequence[Value], result: Type | None = None) -> Value:
-        """Write a call of a function at an address."""
-        given = ", ".join(f"{a.type} {a.name}" for a in args)
-        return self._new(result, f"call {result or 'void'} {address.name}({given})")
-
     def outlined(
         self,
         name: str,

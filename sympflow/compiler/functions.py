@@ -6,7 +6,7 @@ be traced. Derivatives are written with numbers of any kind.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from sympflow.compiler.numbers import Number
 
-__all__ = ["FUNCTIONS", "Function", "apply", "fma", "times", "where"]
+__all__ = ["FUNCTIONS", "Function", "added", "apply", "dot", "fma", "times", "where"]
 
 
 @dataclass(frozen=True)
@@ -192,6 +192,14 @@ def fma(x: Any, y: Any, z: Any) -> Any:
 def times(x: Any, y: Any) -> Any:
     """Return x·y, a product of sums that may be multiplied out."""
     return apply("times", x, y)
+
+
+def dot(x: Iterable[Any], y: Iterable[Any]) -> Any:
+    """Return Σ xᵢ yᵢ of as many as there are of both, products that may be multiplied out."""
+    total: Any = 0.0
+    for a, b in zip(x, y, strict=False):
+        total = total + times(a, b)
+    return total
 
 
 def where(condition: Any, x: Any, y: Any) -> Any:

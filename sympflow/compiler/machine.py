@@ -84,9 +84,10 @@ def compiled(text: str, name: str, signature: Any) -> Any:
 
 def address(array: Any) -> int:
     """Return where the numbers of a NumPy array lie in memory, of an empty one too, where code may look."""
-    if array.size and array.flags.writeable:
+    try:
         return ctypes.addressof(_BYTE(array))  # a third of the time of what follows
-    return int(array.ctypes.data)
+    except (TypeError, ValueError, BufferError):  # not to be written, or empty
+        return int(array.ctypes.data)
 
 
 _BYTE = ctypes.c_char.from_buffer

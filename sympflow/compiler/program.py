@@ -89,7 +89,7 @@ def _difference(a: Any, b: Any) -> Any:
     return a if _is(b, 0.0) else -b if _is(a, 0.0) else 0.0 if a is b else None
 
 
-def _product(a: Any, b: Any) -> Any:
+def _product(a: Any, b: Any, name: str = "mul") -> Any:
     for x, y in ((a, b), (b, a)):
         if isinstance(x, float):
             if x in (0.0, 1.0):
@@ -97,12 +97,12 @@ def _product(a: Any, b: Any) -> Any:
             if x == -1.0:
                 return -y
             if isinstance(y, Traced) and y.name == "neg":
-                return -x * y.args[0]
+                return apply(name, -x, y.args[0])
             factor = y.args[0] if isinstance(y, Traced) and y.name == "mul" else None
             if isinstance(factor, float) and (_halves(x) or _halves(factor)):  # exact
                 return (x * factor) * y.args[1]
         if isinstance(x, Traced) and x.name == "neg":
-            return -(x.args[0] * y)
+            return -apply(name, x.args[0], y)
     return None
 
 
@@ -147,7 +147,7 @@ _SIMPLER: dict[str, Callable[..., Any]] = {
     "add": _sum,
     "sub": _difference,
     "mul": _product,
-    "times": _product,
+    "times": lambda a, b: _product(a, b, "times"),
     "div": _quotient,
     "neg": _negative,
     "pow": _power,

@@ -13,6 +13,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, KernelStepper, Stepper
 from sympflow.integrators.contract import Failure, Integrator, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.impulses import landings
 from sympflow.kernels.protocol import Carry
 from sympflow.solver import solve
 
@@ -99,8 +100,11 @@ class Chunk:
 
     @cached_property
     def _stepper(self) -> Stepper | None:
-        """A run with fixed steps; None with a method that chooses them, and with impulses between them."""
-        if not isinstance(self.integrator, FixedStep) or self.system.between_impulses is not self.system:
+        """A run with fixed steps; None with a method that chooses them, and of one in pieces."""
+        system = self.system
+        if not isinstance(self.integrator, FixedStep) or system.between_impulses is not system:
+            return None
+        if landings(self.integrator, system, *self.t_span)[1]:
             return None
         return self.integrator.stepper(Problem(self.system, *self.t_span, self.y0[:1], backend=self.backend))
 

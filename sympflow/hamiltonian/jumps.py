@@ -25,8 +25,8 @@ MISMATCH = 1e-6
 often written with seven figures."""
 PERIOD_TOLERANCE = 1e-9
 """Share of itself by which a period may differ from a multiple of that of a term."""
-MOST_POINTS = 2**14
-"""Times at which a function that is neither linear nor periodic is looked at for its zeros."""
+MOST_POINTS = 2**20
+"""Times at which a function that is neither a polynomial nor periodic is looked at for its zeros."""
 MOST_IMPULSES = 1_000_000
 POINTS_A_PERIOD = 4096
 LONGEST_MULTIPLE = 64
@@ -309,11 +309,15 @@ class Zeros:
 
     def within(self, low: float, high: float, step: float, most: int = MOST_TURNS) -> np.ndarray:
         """Return the zeros between two times, of a periodic g those of the first `most` periods."""
-        period = None if self.root is not None else self._period
         if self.root is not None:
             found = np.array([self.root])
-        elif period is None:
-            found = self._sign_changes(low + step * np.arange(min(MOST_POINTS, math.ceil((high - low) / step)) + 1))
+        elif self.g.is_polynomial(self.time):
+            roots = np.roots([float(c) for c in sp.Poly(self.g, self.time).all_coeffs()]).real
+            aside = 1e-4 * np.maximum(np.abs(roots), step)
+            near = np.concatenate([[low, high], roots - aside, roots + aside])
+            found = self._sign_changes(np.unique(np.clip(near, low, high)))
+        elif (period := self._period) is None:
+            found = self._sign_changes(np.linspace(low, high, min(MOST_POINTS, math.ceil((high - low) / step)) + 1))
         else:
             first = math.floor(low / period)
             turns = np.arange(first - 1, min(math.ceil(high / period), first + most) + 1)

@@ -418,6 +418,77 @@ class HamiltonianSystem(Hamiltonian, Shown):
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
         return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
 
+    @classmethod
+    def planets(
+        cls,
+        masses: ArrayLike,
+        *,
+        elements: Mapping[str, ArrayLike] | ArrayLike | None = None,
+        y0: ArrayLike | None = None,
+        G: float | None = None,
+        units: str | Sequence[str] | None = None,
+        coordinates: str = "jacobi",
+        encounter: float | None = 1.0,
+        name: str = "planets",
+        domain: Domain | None = None,
+        t_span: tuple[float, float] | None = None,
+        dt: float | None = None,
+        energy_scale: float | None = None,
+    ) -> HamiltonianSystem:
+        """Planets about a star: H = Σ_i |p_i|²/(2 m_i) − G Σ_{i<j} m_i m_j/r_ij, for methods of the splitting "kepler".
+
+        States are inertial, y = [q, p]; ``q.reshape(n, 3)`` are the places of the bodies, the star first. The methods
+        "wisdom_holman" and "kepler_aba864" have coordinates of their own inside of a run only. All other methods take
+        the system as one of `pairs`.
+
+        Parameters
+        ----------
+        masses : array_like of shape (n,)
+            The star's first, which is the heaviest.
+        elements : mapping of str to array_like of shape (n − 1,), or array_like of shape (n − 1, 6)
+            Heliocentric orbital elements of the planets: "a", "e", "inc", "node" (ascending), "peri" (the argument of
+             the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Of hyperbolas
+            e > 1 and a < 0. The centre of mass is at rest at the origin.
+        y0 : array_like of shape (6n,)
+            In place of elements: the initial state.
+        G : float, optional
+            The gravitational constant, by default 1.
+        units : str or sequence of 3 str, optional
+            In place of G: names of a length ("AU", "km", "m"), a time ("day", "year", "s") and a mass ("solar mass",
+            "Jupiter mass", "Earth mass", "kg"), such as "AU, day, solar mass".
+        coordinates : {"jacobi", "democratic"}
+            Inside of a run: each planet as seen from the centre of mass of all inside of its orbit, or, democratic
+            heliocentric, from the star, where kicks hold the motion of the star and are less accurate.
+        encounter : float or None
+            Two planets that come closer to each other than so many Hill radii end a run of the splitting "kepler", with
+            status −1, their numbers and the time. None for no such end.
+        name, domain, energy_scale
+            As for the class.
+        t_span : (float, float), optional
+            By default a thousand of the longest periods.
+        dt : float, optional
+            By default a twentieth of the shortest period.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an argument is wrong, or the star is not the heaviest body.
+
+        Examples
+        --------
+        >>> system = HamiltonianSystem.planets([1.0, 1e-3, 3e-4], elements={"a": [5.2, 9.6], "e": 0.05})
+        >>> system.ndof
+        9
+        """
+        from sympflow.hamiltonian.planets import FEWEST_STEPS, PlanetsHamiltonian, checked_planets
+
+        masses, G, start = checked_planets(masses, elements, y0, G, units)
+        local = PlanetsHamiltonian(masses, G, start, coordinates, encounter)
+        periods = local.frame.periods
+        end = (0.0, 1000 * float(periods.max())) if t_span is None else t_span
+        step = float(periods.min()) / FEWEST_STEPS if dt is None else dt
+        return cls._of_pieces(local, None, name, domain, start, end, step, energy_scale)
+
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
     ) -> HamiltonianSystem:

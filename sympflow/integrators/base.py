@@ -41,6 +41,7 @@ from sympflow.integrators.contract import (
     interrupted,
 )
 from sympflow.integrators.grid import Grid, distinct
+from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.windows import MOST_SAVED, Pace, Pieces, Saved, first_window
 from sympflow.kernels.carry import Carry
 
@@ -148,20 +149,21 @@ class FixedStep(Integrator):
         return GridRun(self, problem).outcome()
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
-        grid = Grid(*t_span, self.step_length(system))
-        stepper = self.stepper(Problem(system, *t_span, y0))
-        chunk, y, k = 256, y0, 0
-        while k < grid.n_steps:
-            n = min(chunk, grid.n_steps - k)
-            states, finite = stepper.rollout(y, grid.h, n, np.arange(n + 1), grid.time(k))
-            good = int(finite.max()) if finite.max() < n else n
-            if good:
-                yield grid.t0 + np.arange(k, k + good) * grid.h, states[:good], np.full(good, grid.h)
-            if good < n:
-                return
-            y, k = states[n], k + n
-        if grid.remainder:
-            yield np.array([grid.time(k)]), y[None], np.array([grid.remainder])
+        stepper, chunk, y = self.stepper(Problem(system, *t_span, y0)), 256, y0
+        for piece in pieces_of(self, system, *t_span):
+            grid, k = Grid(*piece, self.step_length(system)), 0
+            while k < grid.n_steps:
+                n = min(chunk, grid.n_steps - k)
+                states, finite = stepper.rollout(y, grid.h, n, np.arange(n + 1), grid.time(k))
+                good = int(finite.max()) if finite.max() < n else n
+                if good:
+                    yield grid.t0 + np.arange(k, k + good) * grid.h, states[:good], np.full(good, grid.h)
+                if good < n:
+                    return
+                y, k = states[n], k + n
+            if grid.remainder:
+                yield np.array([grid.time(k)]), y[None], np.array([grid.remainder])
+                y = y if grid.t1 == t_span[1] else stepper.shorter_from(grid.time(k), y, grid.remainder)
 
 
 @dataclass(frozen=True)
@@ -342,7 +344,7 @@ class KernelStepper(Stepper):
             return rolled_out(self, y0, h, n_steps, save, t0, carry)
         if y0.ndim == 1:
             states, last, iterations = self.kernel.run(h, y0, n_steps, save, carry, t0)
-            self.iterations += iterations
+            self.iterations, self.remark = self.iterations + iterations, self.kernel.remark
             return states, np.asarray(last)
         rows = y0.reshape(-1, y0.shape[-1])
         states, finite, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)

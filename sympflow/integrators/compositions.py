@@ -20,11 +20,13 @@ from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_st
 from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, linear_and_rest, map_evaluations
+from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import rollout
-from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, scheme_evaluations
+from sympflow.integrators.contract import Failure
+from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, scheme_evaluations
 
 if TYPE_CHECKING:
     from sympflow.kernels.carry import Carry
@@ -64,6 +66,8 @@ class Composition(ABC):
     """True if one of the parts holds the friction of a damped system."""
     takes_driving: ClassVar[bool] = False
     """True if the time moves with one of the parts, of a system that depends on it."""
+    breakdown: ClassVar[Failure | None] = None
+    """The reason for which runs end that cannot go on; None for that of all methods."""
     takes_extended: ClassVar[bool] = False
     """True if the parts stay as they are with E, the momentum of the time, as one more momentum."""
 
@@ -610,6 +614,98 @@ class TwoCopies(SolvableParts):
         return distance(x, self.scale)
 
 
+class KeplerInteraction(Composition):
+    """H of planets about a star: Kepler's motion of each, exactly | all else, their interaction.
+
+    In Jacobi's coordinates the interaction is a potential, so that every scheme keeps its order. In democratic
+    heliocentric ones it holds the motion of the star too, half before a kick and half after, which is of order 2.
+    """
+
+    breakdown: ClassVar[Failure | None] = Failure.ENCOUNTER
+
+    def __init__(
+        self,
+        method: str,
+        scheme: Scheme,
+        system: HamiltonianSystem,
+        parts: tuple[str, ...] | None = None,
+        corrector: int | None = None,
+    ) -> None:
+        super().__init__(method, scheme, system)
+        if scheme.level:
+            raise ValueError(
+                f"`splitting` 'kepler' has plain kicks, and the scheme of method {method!r} has force gradients: use "
+                "'leapfrog', 'aba864' or another scheme without them."
+            )
+        if system.friction is not None:
+            self.check_friction(0.0)
+        self.frame = frame_of(method, system.name, system.local, system.y0)
+        self.frame.check(method)
+        self.substeps = _paired([(s.kind, s.one) for s in scheme.substeps])
+        self.before: list[tuple[float, float]] = []
+        self.after: list[tuple[float, float]] = []
+        if corrector is not None:
+            if [s[:2] for s in scheme.substeps] != [("drift", 0.5), ("kick", 1.0), ("drift", 0.5)]:
+                raise ValueError(
+                    f"`corrector` goes with the steps of 'wisdom_holman', and method {method!r} makes other ones: "
+                    "leave it out."
+                )
+            self.before, self.after = (_paired(corrector_maps(corrector, sign)) for sign in (1, -1))
+
+    def force_times(self) -> list[float]:
+        return []
+
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        return self._moved(y, h, [*self.before, *self.substeps, *self.after])
+
+    def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        maps = [*self.before, *self.substeps, *self.after]
+        kicks, drifts = [-b for b, _ in maps[::-1]], [-a for _, a in maps[::-1]]
+        back = zip([0.0, *kicks], [*drifts, 0.0], strict=True)
+        return self._moved(y, h, [*back], -1.0)
+
+    def _moved(self, y: Array, h: Any, maps: Sequence[tuple[float, float]], sign: float = 1.0) -> Array:
+        frame = self.frame
+        h = like(np.asarray(h, dtype=float), y) if isinstance(h, int | float) else h
+        x, v, Q, U = frame.into(y)
+        for kick, drift in maps:
+            if kick:
+                x, v = frame.kick(x, v, kick * h)
+            if drift:
+                x, v = frame.drift(x, v, drift * h)
+        return frame.out(x, v, Q + sign * h[..., None] * U, U)
+
+    def kernel(self, compensated: bool) -> Kernel:
+        from sympflow.kernels.kepler import KeplerKernel, KeplerLoops
+
+        known = _KEPLER.setdefault(self.frame, {})
+        if "loops" not in known:
+            known["loops"] = KeplerLoops(self.frame)
+        return KeplerKernel(known["loops"], self.substeps, self.before, self.after)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        counts = scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
+        processed = (n_saved if backend == "compiled" else 2 * n_steps) + 2 * n_extra
+        counts["force_evaluations"] += sum(kick != 0 for kick, _ in self.before) * processed
+        return counts
+
+
+_KEPLER: WeakKeyDictionary[Frame, dict[str, Any]] = WeakKeyDictionary()
+
+
+def _paired(maps: Sequence[tuple[str, float]]) -> list[tuple[float, float]]:
+    """Kicks, each with the drift after it."""
+    pairs: list[tuple[float, float]] = []
+    for kind, c in maps:
+        if kind == "kick":
+            pairs.append((c, 0.0))
+        elif pairs and not pairs[-1][1]:
+            pairs[-1] = pairs[-1][0], c
+        else:
+            pairs.append((0.0, c))
+    return pairs
+
+
 SPLITTINGS: dict[str, type[Composition]] = {
     "kinetic": KineticPotential,
     "linear": LinearRest,
@@ -617,5 +713,6 @@ SPLITTINGS: dict[str, type[Composition]] = {
     "midpoint": MidpointLinearRest,
     "parts": SolvableParts,
     "copies": TwoCopies,
+    "kepler": KeplerInteraction,
 }
 """The splittings by the name that the option `splitting` takes."""

@@ -20,7 +20,8 @@ Its duties:
    that is none of H, which only `vector_field` holds.
 11. `takes_driving` is False, and a driven system, H(t, q, p), is refused before the integrator sees it; or the method
    takes H and its derivatives at the times of its stages, t + c·h, as `system.vector_field(y, t + c * h)` does. Where
-   c is 0 or 1, `forces_at_ends(system)` says so, and a jump of H that the steps meet is warned of.
+   c is 0 or 1, `forces_at_ends(system)` says so, and a run is cut at the jumps of H; where c lies outside of these,
+   `forces_beyond(system)` says so, and the jumps are warned of.
 
 `FixedStep`, in `sympflow.integrators.base`, does 4, 5, 6 and 8 for any integrator that has a step: a new one needs
 duties 1 to 3 only, and its forces are counted. Whatever a run changes, such as its kernel and its counts, belongs to a
@@ -95,6 +96,11 @@ class Failure(Enum):
     NON_FINITE = "The solution became non-finite", "Reduce `dt`"
     UNSOLVED = "The implicit step could not be solved: Newton's iteration did not converge", "Reduce `dt`"
     CLOCK = "T + B or c − V ceased to be positive and finite", "Reduce `dt`, or raise `shift` above the energy"
+    ENCOUNTER = (
+        "Two planets came closer to each other than `encounter` Hill radii, where they are no longer on orbits about "
+        "the star",
+        "Follow the encounter with the splitting 'kinetic', such as method 'dop853' or 'srkn11b' with short steps",
+    )
     STALLED = (
         "After {n_steps} steps time hardly advances any more, as before a collision",
         "End `t_span` earlier, or raise `dt`",
@@ -236,6 +242,10 @@ class Integrator:
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
         """Return True if a step takes a force at its end or beyond it, of first order where H jumps there in t."""
+        return False
+
+    def forces_beyond(self, system: HamiltonianSystem) -> bool:
+        """Return True if a step takes a force at a time outside of it, so that it meets jumps beyond its ends."""
         return False
 
     def check(self, system: HamiltonianSystem) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import numpy as np
 
@@ -29,33 +28,30 @@ def no_event(n_steps: int, t: float) -> str:
     )
 
 
-def warn_of_jumps(
-    system: HamiltonianSystem, t0: float, t1: float, dt: float | None, method: str | None, stacklevel: int
-) -> bool:
-    """Warn, and return True, where H jumps within a step, or at the end of one at which the `method` takes a force."""
-    if dt is None or not math.isfinite(t1) or t0 == t1:
-        return False
+def jumps_met(
+    system: HamiltonianSystem, t0: float, t1: float, dt: float, method: str | None
+) -> tuple[str, list[float]]:
+    """Words where H jumps within a step, or at the end of one at which the `method` takes a force; and all jumps."""
     times = system.jump_times(min(t0, t1), max(t0, t1), dt / 4)
     x = (times - t0) / dt
     within = np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(times)) / dt)
+    ends = [] if method is None else [t for t in (t0, t1) if _jumps_into(system, t, t0, t1, dt)]
+    met = sorted([*ends, *times.tolist()], reverse=t1 < t0)
     if within.any():
         first = times[within][0 if t1 > t0 else -1]
-        text = (
+        said = (
             f"`dt` {dt:g}: H of {system.name!r} jumps within a step, at t = {first:.6g}, where every method is of "
             "first order. Choose a `dt` that divides all pieces between jumps from t0 on, or solve from jump to jump."
         )
+    elif method is None or not met:
+        return "", []
     else:
-        known = [] if method is None else sorted({t0, *times.tolist(), t1})
-        met = [t for t in known if t0 != t != t1 or _jumps_into(system, t, t0, t1, dt)]
-        if not met:
-            return False
-        text = (
+        said = (
             f"`method` {method!r} takes forces at the ends of its steps, and H of {system.name!r} jumps at one, at "
-            f"t = {met[0] if t1 > t0 else met[-1]:.6g}: it is of first order there. Use one that takes none, such as "
-            "'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
+            f"t = {met[0]:.6g}: it is of first order there. Use one that takes none, such as 'leapfrog', 'kahan_li8' "
+            "or 'gauss_legendre6'."
         )
-    warnings.warn(text, RuntimeWarning, stacklevel=stacklevel + 1)
-    return True
+    return said, met
 
 
 def _jumps_into(system: HamiltonianSystem, t: float, t0: float, t1: float, dt: float) -> bool:

@@ -1,48 +1,87 @@
-"""Runs of a system with impulses: between them by any method, and at them by kicks."""
+"""Runs in pieces, by any method: from each jump of H in t to the next, and between impulses, which are kicks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, join
+from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Interrupted, Outcome, Problem, finished, interrupted
-from sympflow.integrators.grid import EPS, warn_of_jumps
+from sympflow.integrators.grid import EPS, jumps_met
 
 Run = Callable[[Integrator, Problem], tuple[Outcome, Problem]]
+MOST_LANDINGS = 2000
+"""Jumps at which a run is cut; one with more is not, and warns."""
+ASIDE = 64 * EPS
+"""Share of the times between which a run goes on from a jump, or ends before it, so that H is that of one side."""
 
 
-def run_between_impulses(run: Run, integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
-    """The outcome of a problem of a system with impulses, by runs from each to the next, and the problem."""
+def landings(
+    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True
+) -> tuple[str, list[float]]:
+    """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut."""
+    if system.autonomous or not math.isfinite(t1) or t0 == t1:
+        return "", []
+    dt, label = integrator.step_length(system), integrator.label if integrator.forces_at_ends(system) else None
+    step, said = (dt or system.dt) / 4, ""
+    if dt is None:  # its steps may be longer than a pulse
+        times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
+    else:
+        said, times = jumps_met(system, t0, t1, dt, label)
+    able = able and len(times) <= MOST_LANDINGS and not integrator.keeps and not integrator.forces_beyond(system)
+    # all times are known, of which the first ones may be listed
+    if able and times and not len(system.jump_times(max(times), max(t0, t1), step)):
+        return "", times
+    return said, []
+
+
+def spans(t0: float, t1: float, ends: Collection[float], jumps: Sequence[float]) -> list[tuple[float, float, float]]:
+    """The intervals that end at certain times and at jumps of H in t, within which it does not jump; and their ends."""
+    aside = math.copysign(ASIDE * max(abs(t0), abs(t1)), t1 - t0)
+    fixed = [t0, *ends, t1]
+    met = {next((t for t in fixed if abs(t - jump) <= 4 * abs(aside)), jump) for jump in jumps}
+    times = [t0, *sorted({*ends, *(met - {t0, t1})}, reverse=t1 < t0), t1]
+    return [(a + aside * (a in met), b - aside * (b in met), b) for a, b in pairwise(times)]
+
+
+def pieces_of(integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float) -> list[tuple[float, float]]:
+    """The pieces of a run of a system without impulses."""
+    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1)[1])]
+
+
+def run_in_pieces(
+    run: Run, integrator: Integrator, problem: Problem, jumps: Sequence[float]
+) -> tuple[Outcome, Problem]:
+    """The outcome of a problem by runs from each impulse, or jump of H in t, to the next, and the problem."""
     t0, t1, times, search = problem.t0, problem.t1, problem.t_eval, problem.events
     low, high = min(t0, t1), max(t0, t1)
-    near = 8 * EPS * max(abs(low), abs(high))
-    kicks = [
-        kick for kick in problem.system.kicks(low - 2 * near, high + 2 * near) if low + near < kick.t <= high + near
-    ]
-    sign, stages = (1, kicks) if t1 >= t0 else (-1, kicks[::-1])
-    piece = replace(problem, system=problem.system.between_impulses, progress=None, diagnosed=False)
-    ends = [*(min(kick.t, high) for kick in stages), t1]
+    near, sign = 8 * EPS * max(abs(low), abs(high)), 1 if t1 >= t0 else -1
+    kicks = {
+        min(kick.t, high): kick
+        for kick in problem.system.kicks(low - 2 * near, high + 2 * near)
+        if low + near < kick.t <= high + near
+    }
+    piece = replace(problem, system=problem.system.between_impulses, progress=None)
     found: list[Outcome] = []
-    warned, stopped, start, done = False, None, t0, 0
-    for i, end in enumerate(ends):
-        last = i == len(ends) - 1
+    stopped, done, since, pieces = None, 0, t0, spans(t0, t1, kicks, jumps)
+    for i, (start, end, stop) in enumerate(pieces):
+        last = i == len(pieces) - 1
         piece = replace(piece, t0=start, t1=end)
         if times is not None:
-            beyond = (times[done:] - end) * sign > (near if sign < 0 else -near)
+            beyond = (times[done:] - stop) * sign > (near if sign < 0 else -near)
             due = len(times) if last else done + (int(beyond.argmax()) if beyond.any() else len(beyond))
             asked = np.clip(times[done:due], min(start, end), max(start, end))
             piece = replace(piece, t_eval=asked if len(asked) and asked[-1] == end else np.append(asked, end))
-        if not (warned or piece.system.autonomous):
-            dt, at_ends = integrator.step_length(piece.system), integrator.forces_at_ends(piece.system)
-            warned = warn_of_jumps(piece.system, start, end, dt, integrator.label if at_ends else None, stacklevel=5)
         try:
             outcome, _ = run(integrator, piece)
-        except Interrupted as stop:
-            outcome, stopped = stop.outcome, stop
+        except Interrupted as interruption:
+            outcome, stopped = interruption.outcome, interruption
         y, first, stop_at = outcome.y, 0, len(outcome.t)
         if times is not None:
             stop_at = min(stop_at, due - done)
@@ -51,22 +90,25 @@ def run_between_impulses(run: Run, integrator: Integrator, problem: Problem) -> 
             stop_at -= 1
         elif sign < 0 and i:
             first = 1
-        found.append(replace(outcome, t=outcome.t[first:stop_at], y=y[first:stop_at]))
+        t = np.where(outcome.t == start, since, np.where(outcome.t == end, stop, outcome.t))
+        found.append(replace(outcome, t=t[first:stop_at], y=y[first:stop_at]))
         if stopped is not None or last or (np.ndim(outcome.status) == 0 and outcome.status != 0):
             break
-        state = stages[i](y[-1], sign)
-        if search is not None:
-            search.values = [event.value(end, state) for event in search.events]
-        piece, start = replace(piece, y0=state), end
+        state = y[-1]
+        if stop in kicks:
+            state = kicks[stop](state, sign)
+            if search is not None:
+                search.values = [event.value(stop, state) for event in search.events]
+        piece, since = replace(piece, y0=state), stop
         if problem.progress is not None:
-            problem.progress(abs(end - t0))
-    merged = _merged(found, problem, np.array([t0, *ends[: len(found)]]))
+            problem.progress(abs(stop - t0))
+    merged = _merged(found, problem, pieces, sum(stop in kicks for *_, stop in pieces[: len(found) - 1]))
     if stopped is not None:
         raise interrupted(merged, stopped.outcome.stats["interrupted_at"])
     return merged, replace(problem, diagnosed=False)
 
 
-def _merged(found: list[Outcome], problem: Problem, ends: np.ndarray) -> Outcome:
+def _merged(found: list[Outcome], problem: Problem, pieces: list[Any], impulses: int) -> Outcome:
     """The outcomes of runs one after the other as one: counts are added, and what failed first is told."""
     t = np.concatenate([each.t for each in found])
     if problem.t_eval is not None:
@@ -87,26 +129,33 @@ def _merged(found: list[Outcome], problem: Problem, ends: np.ndarray) -> Outcome
         if np.ndim(status):
             status = np.where(np.asarray(each.status) < 0, each.status, status)
     failed = next((each for each in found if np.any(np.asarray(each.status) < 0)), None)
-    stats["impulses"] = len(found) - 1
+    if problem.system.between_impulses is not problem.system:
+        stats["impulses"] = impulses
+    if impulses < len(found) - 1:
+        stats["jumps"] = len(found) - 1 - impulses
     message = finished(problem) if not np.any(np.asarray(status)) else (failed or last).message
     outcome = Outcome(t, join([each.y for each in found]), status, message, stats)
     if problem.dense_output:
-        outcome.sol = BetweenImpulses(tuple(each.sol for each in found if each.sol is not None), ends)
+        solutions = tuple(each.sol for each in found if each.sol is not None)
+        outcome.sol = Pieces(solutions, np.array(pieces)[: len(found), :2])
     return outcome
 
 
 @dataclass(frozen=True)
-class BetweenImpulses:
-    """The dense output of a run with impulses: that of the piece in which t lies, at an impulse the later one."""
+class Pieces:
+    """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one.
+
+    `spans` (n, 2) are their ends, which decrease in a run back in time.
+    """
 
     pieces: tuple[Callable[[Any], Array], ...]
-    times: np.ndarray
+    spans: np.ndarray
 
     def __call__(self, t: Any) -> Array:
-        sign = 1 if self.times[-1] >= self.times[0] else -1
-        ends, pieces = self.times[::sign], self.pieces[::sign]
-        index = np.searchsorted(ends[1:-1] - 8 * EPS * np.abs(ends).max(), t, side="right")
-        inside = np.clip(t, ends[index], ends[index + 1])
+        sign = 1 if self.spans[-1, 1] >= self.spans[0, 0] else -1
+        ends, pieces = np.sort(self.spans[::sign], axis=1), self.pieces[::sign]
+        index = np.searchsorted(ends[1:, 0] - 8 * EPS * np.abs(ends).max(), t, side="right")
+        inside = np.clip(t, *ends[index].T)
         if np.ndim(t) == 0:
             return pieces[int(index)](float(inside))
         return concatenate([pieces[i](s)[..., None] for i, s in zip(index.tolist(), inside.tolist(), strict=True)])

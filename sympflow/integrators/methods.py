@@ -44,6 +44,11 @@ _COPIES = (
     "; on two coupled copies of phase space, for any H: M. Tao, Phys. Rev. E 94 (2016) 043303; P. Pihajoki, Celest. "
     "Mech. Dyn. Astron. 121 (2015) 211–231"
 )
+_KEPLER = (
+    "J. Wisdom and M. Holman, Symplectic maps for the n-body problem, Astron. J. 102 (1991) 1528–1538; H. Rein, D. "
+    "Tamayo and G. Brown, High-order symplectic integrators for planetary dynamics and their implementation in "
+    "REBOUND, Mon. Not. R. Astron. Soc. 489 (2019) 4632–4640"
+)
 _LOGARITHMIC = (
     "S. Mikkola and K. Tanikawa, Celest. Mech. Dyn. Astron. 74 (1999) 287–295; M. Preto and S. Tremaine, Astron. J. "
     "118 (1999) 2532–2541"
@@ -69,6 +74,11 @@ TRIPLES: dict[str, Triple] = {
         f"linear_{name}": Triple(name, "linear", source=_of(name, f", with the exact linear flow; {_LINEAR}"))
         for name in LINEAR
     },
+    "wisdom_holman": Triple("leapfrog", "kepler", source=_KEPLER),
+    **{
+        f"kepler_{name}": Triple(name, "kepler", source=_of(name, f", on Kepler's motion | interaction; {_KEPLER}"))
+        for name in ("aba104", "aba864", "aba1064")
+    },
     "strang_parts": Triple(
         "verlet", "parts", source="G. Strang, SIAM J. Numer. Anal. 5 (1968) 506–517, for any number of parts"
     ),
@@ -85,8 +95,9 @@ TRIPLES: dict[str, Triple] = {
         for name in ("leapfrog", "blanes_moan4", "kahan_li8")
     },
 }
-"""The splitting methods. `linear_*` have the exact linear flow, `*_parts` any number of parts, `tao*` are for any H, on
-two copies of phase space, `log_*` have steps that are equal on the logarithmic Hamiltonian."""
+"""The splitting methods. `wisdom_holman` and `kepler_*` are for planets, `linear_*` have the exact linear flow,
+`*_parts` any number of parts, `tao*` are for any H, on two copies of phase space, `log_*` have steps that are equal on
+the logarithmic Hamiltonian."""
 
 CLASSES: dict[str, str] = {
     "rk45": "scipy_methods:RK45",

@@ -56,6 +56,9 @@ class Projected(FixedStep):
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
         return self.inner.forces_at_ends(system)
 
+    def forces_beyond(self, system: HamiltonianSystem) -> bool:
+        return self.inner.forces_beyond(system)
+
     def check(self, system: HamiltonianSystem) -> None:
         system.as_doubled()
         check_applies(self.inner, system)

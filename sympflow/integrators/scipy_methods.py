@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,6 +20,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Recorder
 from sympflow.integrators.contract import ENDED, FINISHED, Interrupted, Outcome, Problem, Steps, interrupted
 from sympflow.integrators.grid import MOST_OPEN_STEPS, Grid
+from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.runge_kutta import RungeKutta, hopeless
 
 MOST_STEPS = 10_000_000
@@ -200,9 +202,17 @@ class _Scipy(RungeKutta):
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         """The realised steps. In a batch the trajectories advance in parallel; one that has ended waits with h = 0."""
+        y, going = np.array(y0, dtype=float), np.full(y0.shape[:-1], t_span[0] != t_span[1]).reshape(-1)
+        for piece in pieces_of(self, system, *t_span):
+            y = yield from self._steps(system, piece, y, going)
+
+    def _steps(
+        self, system: HamiltonianSystem, t_span: tuple[float, float], y0: np.ndarray, going: np.ndarray
+    ) -> Generator[tuple[np.ndarray, np.ndarray, np.ndarray], None, np.ndarray]:
+        """The steps of trajectories that have not ended, `going`; and the states at the end."""
         batch = y0.shape[:-1]
-        starts = np.asarray(y0, dtype=float).reshape(-1, y0.shape[-1])
-        solvers = [self._start(system, *t_span, y) if t_span[0] != t_span[1] else None for y in starts]
+        starts = y0.reshape(-1, y0.shape[-1])
+        solvers = [self._start(system, *t_span, y) if on else None for y, on in zip(starts, going, strict=True)]
         t = np.full(len(starts), t_span[0], dtype=float)
         y, n_steps, most = starts.copy(), 0, self.most_steps(t_span[1], y0.shape[-1])
         made: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
@@ -226,6 +236,8 @@ class _Scipy(RungeKutta):
             t, y, n_steps = t + h, y_next, n_steps + 1
         if made:
             yield _together(made)
+        going[:] = [solver is not None for solver in solvers]
+        return y.reshape(y0.shape)
 
 
 TOGETHER = 4096  # numbers of states of the steps that are told at once

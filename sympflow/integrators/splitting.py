@@ -20,7 +20,7 @@ from sympflow.integrators.compositions import SPLITTINGS, Composition
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, differentiated, forward_tangent, in_blocks
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.schemes import SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
+from sympflow.schemes import CORRECTORS, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
     from sympflow.kernels.carry import Carry
@@ -97,6 +97,14 @@ class OfClock:
         return getattr(CLOCKS[cls.clock if method is None else method.clock], self.name)
 
 
+class Breakdown(OfClock):
+    """The reason for which runs end that cannot go on: that of the splitting, where it has one."""
+
+    def __get__(self, method: Splitting | None, cls: type[Splitting]) -> Failure:
+        own = SPLITTINGS[(cls if method is None else method).splitting].breakdown
+        return super().__get__(method, cls) if own is None else own
+
+
 class OfGrid:
     """True if a peer can drive the steps: equal ones in t, of the state y alone."""
 
@@ -128,7 +136,8 @@ class Splitting(OwnStepper):
         within SciPy's `solve_ivp`, and where the metrics execute it again.
     splitting : str
         The parts: "kinetic" | potential; "linear" | rest, the exact flow of the quadratic part of H in place of the
-        drifts, with the kicks filtered ("mollified") or the implicit midpoint rule's angles ("midpoint"); any solvable
+        drifts, with the kicks filtered ("mollified") or the implicit midpoint rule's angles ("midpoint"); "kepler", the
+        exact motion of each planet about a star | their interaction; any solvable
         "parts" of H; or, for any H, two coupled "copies" of phase space, H(q, y) + H(x, p) + ω(|q − x|² + |p − y|²)/2.
         The last two are for schemes that are compositions of Strang steps.
     clock : str
@@ -143,6 +152,10 @@ class Splitting(OwnStepper):
         and p comparable. The default is the largest |λ| of J∇²H at the system's y0. Weaker, the copies may drift apart,
         of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the copies; a run
         keeps both, and is symplectic in their phase space [3]_.
+    corrector : int, optional
+        For the splitting "kepler" and drift–kick–drift steps, as of "wisdom_holman": the order of a symplectic
+        corrector, 3, 5, … 17, which is applied at the start, and its inverse to each output. It removes errors of
+        first order in the masses of the planets, and costs nothing in between.
     shift : float, optional
         For the logarithmic clock: c, above the energy; default E + |E|, which is 0 for a bound system.
 
@@ -164,6 +177,7 @@ class Splitting(OwnStepper):
     parts: tuple[str, ...] | None = None
     shift: float | None = None
     omega: float | None = None
+    corrector: int | None = None
 
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
@@ -174,7 +188,7 @@ class Splitting(OwnStepper):
     in_another_time: ClassVar[Any] = OfClock()
     arrays_only: ClassVar[Any] = OfClock()
     tangent_holds: ClassVar[Any] = OfClock()
-    breakdown: ClassVar[Any] = OfClock()
+    breakdown: ClassVar[Any] = Breakdown()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -183,7 +197,7 @@ class Splitting(OwnStepper):
             self.compensated is False
             and self.splitting is cls.splitting
             and self.clock is cls.clock
-            and (self.parts is None and self.shift is None and self.omega is None)
+            and (self.parts is None and self.shift is None and self.omega is None and self.corrector is None)
         ):
             return
         check_flag("compensated", self.compensated)
@@ -203,6 +217,11 @@ class Splitting(OwnStepper):
                 raise ValueError("`omega` is for the splitting 'copies': leave it out.")
             if not self.omega > 0:
                 raise ValueError(f"`omega` must be positive; got {self.omega!r}.")
+        if self.corrector is not None:
+            if isinstance(self.corrector, bool) or self.corrector not in CORRECTORS:
+                raise ValueError(f"`corrector` must be an order, 3, 5, … 17; got {self.corrector!r}: take 17.")
+            if self.splitting != "kepler":
+                raise ValueError("`corrector` is for the splitting 'kepler': leave it out.")
         if self.parts is None:
             return
         sequence = isinstance(self.parts, list | tuple)
@@ -218,7 +237,7 @@ class Splitting(OwnStepper):
 
     def composed(self, system: HamiltonianSystem) -> Composition:
         """Return the scheme × the splitting on a system."""
-        more = {} if self.omega is None else {"omega": self.omega}
+        more = {n: value for n in ("omega", "corrector") if (value := getattr(self, n)) is not None}
         return SPLITTINGS[self.splitting](self.name, self.scheme, system, self.parts, **more)
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
@@ -320,8 +339,14 @@ class Splitting(OwnStepper):
                 )
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
-        times = [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
-        return any(not END < c < 1 - END for c in times)
+        return any(not END < c < 1 - END for c in self._force_times(system))
+
+    def forces_beyond(self, system: HamiltonianSystem) -> bool:
+        return any(not -END < c < 1 + END for c in self._force_times(system))
+
+    def _force_times(self, system: HamiltonianSystem) -> list[float]:
+        """The times of the forces in a step of length 1, of a driven system."""
+        return [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         clock = self.on_clock(system)

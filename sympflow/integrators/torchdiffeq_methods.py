@@ -31,6 +31,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, KernelStepper, Recorder, Stepper, compiled_loops
 from sympflow.integrators.contract import ENDED, ByVectorField, Integrator, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
@@ -365,6 +366,9 @@ class Adaptive(Watched, RungeKutta):
         options: dict[str, Any] = {"max_num_steps": most}
         if trace.system.shortest_piece < math.inf:
             options["max_step"] = trace.system.shortest_piece
+        symbols = trace.system.symbols
+        if not trace.system.autonomous and symbols is not None and symbols.jumps:
+            options["step_t"] = s[1:]  # the last step would be longer, and meet a jump beyond
         atol = self.tolerance_of(trace.system, y)
         try:
             odeint(trace, y, s, rtol=self.rtol, atol=atol, method=self.name, options=options)
@@ -385,7 +389,9 @@ class Adaptive(Watched, RungeKutta):
             steps.append(step)
             return False
 
-        self.watch(system, t_span, y0, visit)
+        for piece in pieces_of(self, system, *t_span):
+            self.watch(system, piece, y0, visit)
+            y0 = steps[-1](piece[1]) if steps else y0
         for step in steps:
             yield np.array([step.t0]), step.y0[None], np.full((1, *y0.shape[:-1]), step.t1 - step.t0)
 

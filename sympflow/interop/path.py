@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from sympflow.arrays import differentiable, one_lane, readable, to_numpy, unfoll
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem, rollout
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
 
 MAX_EVENT_STEPS = 1_000_000
@@ -90,7 +92,11 @@ class Path:
         far = float(np.abs(elapsed).max(initial=0.0))
         if self.driven:
             t0 = float(one_lane(self.start))
-            self.system.check_times(t0 + elapsed.min(initial=0.0), t0 + elapsed.max(initial=0.0))
+            span = float(t0 + elapsed.min(initial=0.0)), float(t0 + elapsed.max(initial=0.0))
+            self.system.check_times(*span)
+            told, _ = landings(self.integrator, self.system, *span, able=False)
+            if told:
+                warnings.warn(told, RuntimeWarning, stacklevel=3)
         Grid(0.0, math.copysign(far, self.h) or self.h, abs(self.h))  # refuses too many steps
         s = s.to(torch.float64)
         x = s.detach() / self.h

@@ -16,6 +16,7 @@ from sympflow.arguments import as_float
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem, Stepper
 from sympflow.integrators.grid import Grid, no_event, open_end
+from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.interop.matching import Comparison, fixed_step
 
@@ -140,6 +141,9 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         dt = self.integrator.step_length(system)
         if self._driven and math.isfinite(t_bound):
             system.check_times(t0, t_bound)
+            told, _ = landings(self.integrator, system, t0, t_bound, able=False)
+            if told:
+                warnings.warn(told, RuntimeWarning, stacklevel=4)
         self._grid = Grid(t0, open_end(t0, t_bound, dt), dt)
         self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, self._grid.t1, self.y))
         self._parts = max(1, math.ceil(abs(self._grid.h) / max_step * (1 - 1e-12)))

@@ -137,7 +137,7 @@ class Functions:
             room.store(float("nan"), i, out)  # what a function does not write ends the run
         address = code.load(room.data(0), which, POINTER)
         time = letters[0] if letters else code.constant(0.0)
-        code.call_at(address, [time, given[0], given[-1], out, d])
+        code.call_address(address, [time, given[0], given[-1], out, d])
 
     def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         code, M = room.code, self._mass

@@ -148,13 +148,10 @@ class Law:
 
     def __init__(self, form: Form, keys: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> None:
         states = [(f"{kind}{i}", ALWAYS if kind == "column" else 0) for kind, i in keys]
-        shapes = []
-        for squares in (False, True):
-            made = Arrangement(states, [s.name for s in form.c], squares=squares)
-            found = outputs(made, dict(zip(keys, made.states, strict=True)), made.constants)
-            shapes.append(made.finish(list(found.values())))
+        made = Arrangement(states, [s.name for s in form.c])
+        found = outputs(made, dict(zip(keys, made.states, strict=True)), made.constants)
         self._keys, self.results = keys, list(found)
-        self.table, self._body = min(shapes, key=lambda shape: len(shape.body))
+        self.table, self._body = made.finish(list(found.values()))
         self.operations = sum(FUNCTIONS[x.name].cost // 3 for x in self._body.operations)
         used = {x.order for x in reached(self._body.outputs)}
         self._reads = [x.order in used for x in self._body.inputs]

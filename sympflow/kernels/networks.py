@@ -184,23 +184,16 @@ class _NetworkRollouts(Rollouts):
 
     def prepared(self, table: Any) -> Columns:
         """The columns of steps of a length h: signs and times."""
-        columns, kinds = self._columns(table, np.array([[abs(table)]]))
-        return columns[0], kinds
+        entries, kinds = self.own_entries(table, np.array([[abs(table)]]))
+        return entries[0], kinds
 
-    def own_columns(self, table: Any, values: np.ndarray, width: int) -> Columns:
-        """The columns of trajectories with their own |h|, and the sign of `table`."""
-        groups = -(-len(values) // width)
-        times = np.concatenate([values[:, 0], np.repeat(values[-1:, 0], groups * width - len(values))])
-        return self._columns(table, times.reshape(groups, width))
-
-    def _columns(self, h: float, t: np.ndarray) -> Columns:
-        """The columns (groups, layers + 2, 2, width) of times (groups, width)."""
-        kinds = self._kinds[::-1] if h < 0 else self._kinds
+    def own_entries(self, table: Any, values: np.ndarray) -> Columns:
+        """The columns (N, layers + 2, 2) of trajectories with their own |h|, and the sign of `table`."""
+        kinds = self._kinds[::-1] if table < 0 else self._kinds
         kinds = np.concatenate([kinds, kinds[:1], kinds[:1]])
-        columns = np.empty((len(t), len(kinds), 2, t.shape[1]))
-        columns[:, :, 0] = np.where(kinds % 2 == (h < 0), 1.0, -1.0)[:, None]
-        columns[:, :, 1] = t[:, None]
-        return columns, kinds
+        entries = np.empty((len(values), len(kinds), 2))
+        entries[:, :, 0], entries[:, :, 1] = np.where(kinds % 2 == (table < 0), 1.0, -1.0), values
+        return entries, kinds
 
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         """One layer, in place."""

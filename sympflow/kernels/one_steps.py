@@ -184,7 +184,7 @@ class OneStepKernel(Kernel):
     def _numbers(self, h: np.ndarray, t: np.ndarray) -> np.ndarray:
         """The numbers (n, size) of steps of lengths h (n,), at the times t (n,) less those of whole steps before."""
         values = self._code.lettered.symbols.values
-        numbers = [h[:, None], np.broadcast_to(values, (len(h), len(values)))]
+        numbers = [h[:, None], np.array([values]).repeat(len(h), axis=0)]
         if self._code.driven:
             numbers.append(t[:, None])
         if self._more is not None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 import sympy as sp
 
-from sympflow.compiler.arrange import Stage, Arrangement
+from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
 from sympflow.compiler.functions import added, apply
 from sympflow.compiler.machine import address, host
@@ -26,7 +26,7 @@ from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room, finished
-from sympflow.kernels.splittings import Shape, Splitting, WithinRange
+from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
 from sympflow.kernels.teams import Member, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
@@ -47,7 +47,7 @@ CHUNKS, WORTH_CHUNKS = 8, 100_000
 threads wait for each other after each sum."""
 
 
-def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Stage:
+def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Arranged:
     """The derivatives of V by s, those of `kinds` with factors 2ᵏ: a program of s, columns of both bodies, constants.
 
     A number that is known for a body is multiplied before those of its partners.

@@ -210,13 +210,10 @@ class PartsCode(Rollouts):
     def prepared(self, table: Columns) -> Columns:
         return table
 
-    def own_columns(self, table: Columns, values: np.ndarray, width: int) -> Columns:
-        """The columns (n, m, size) of the rows whose numbers are `values` (n, 1), for every `width` of them."""
+    def own_entries(self, table: Columns, values: np.ndarray) -> Columns:
+        """The columns (n, m, size) of the rows whose numbers are `values` (n, 1)."""
         entries, kinds = table
-        own = entries[values[:, 0].astype(int)]
-        groups = -(-len(own) // width)
-        full = np.concatenate([own, np.repeat(own[-1:], groups * width - len(own), axis=0)])
-        return np.ascontiguousarray(full.reshape(groups, width, *own.shape[1:]).transpose(0, 2, 3, 1)), kinds
+        return entries[values[:, 0].astype(int)], kinds
 
     def columns(self, groups: Sequence[Sequence[int]], entries: np.ndarray) -> Columns:
         """The columns (n, k, size) of groups of maps, whose numbers are (n, m, size), and their kinds (k,)."""

@@ -184,10 +184,13 @@ class Kernel:
         True if all states that a run saves up to its last finite step are finite numbers.
     backend : str
         The name of what runs, of `stats["backend"]`.
+    remark : str
+        A sentence on the end of the last run of a single state that could not go on.
     """
 
     saves_finite = True
     backend = "compiled"
+    remark = ""
 
     def run(
         self,

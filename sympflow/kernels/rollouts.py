@@ -144,6 +144,13 @@ class Rollouts:
 
     def own_columns(self, table: Any, values: np.ndarray, width: int) -> Columns:
         """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
+        entries, kinds = self.own_entries(table, values)
+        groups = -(-len(entries) // width)
+        full = np.concatenate([entries, entries[-1:].repeat(groups * width - len(entries), axis=0)])
+        return np.ascontiguousarray(full.reshape(groups, width, *entries.shape[1:]).transpose(0, 2, 3, 1)), kinds
+
+    def own_entries(self, table: Any, values: np.ndarray) -> Columns:
+        """The numbers (N, m, size) of the columns of each, and their kinds (m,)."""
         raise NotImplementedError
 
     @property
@@ -180,12 +187,16 @@ class Rollouts:
             self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over, kept
         )
 
+    @cached_property
+    def _places(self) -> np.ndarray:
+        """The addresses of the data."""
+        return np.array([*map(address, self.data)], dtype=np.int64)
+
     def call(self, name: str, width: int, *arguments: Any, n_out: int | None = None) -> None:
         """Call the compiled function of a name with arrays and integers."""
         if self.room is not None:
             work = aligned((3 * self.n_values + self.room) * width)
-            places = np.array([*map(address, self.data)], dtype=np.int64)
-            arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, places
+            arguments = *arguments, self.n_values, self.n_out if n_out is None else n_out, work, self._places
         self.function(name, width)(*[address(x) if isinstance(x, np.ndarray) else x for x in arguments])
 
     def run(self, table: Any, batch: Batch, closed: bool = True) -> None:

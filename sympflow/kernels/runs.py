@@ -469,105 +469,6 @@ class _History:
         return [self.code.load(start, i * self._width, type) for i in range(self._n)]
 
 
-class _Chunks:
-    """The same of many trajectories: in memory, from which a stage takes one chunk after the other into registers.
-
-    A chunk need not wait for the one before, whose chain of operations goes on meanwhile.
-    """
-
-    def __init__(self, code: Code, n_values: int, n_out: int, width: int, own: bool, over: Over) -> None:
-        self.code, self.width, self.type, self._n, self._n_out = code, width, Type("double", width), n_values, n_out
-        self._over = None if own else over
-        self.chunks = min(max(FAST_MEMORY // (16 * n_values * width), 1), MOST_CHUNKS)
-        self._state, self._end = (code.memory(n_values * self.chunks, self.type) for _ in range(2))
-        self._watch = code.memory(self.chunks, self.type)
-        self._used = code.constant(0, INT)
-
-    def block(self, every: int) -> Value:
-        return self.code.constant(every, INT)
-
-    def open(self, rows: Value, begin: Value, n_rows: Value) -> None:
-        code, n = self.code, self._n
-        left = groups(code, n_rows - begin, self.width)
-        self._used = code.apply("min", (left, code.constant(self.chunks, INT)))
-        with code.over(self._used) as c:
-            code.store(code.constant(0.0, self.type), self._watch, c * self.width)
-            with code.over(code.constant(self.width, INT)) as lane:
-                row = code.apply("min", (begin + c * self.width + lane, n_rows - 1))
-                start, place = code.at(rows, row * n), code.at(self._state, c * (n * self.width) + lane)
-                with code.over(code.constant(n, INT)) as i:
-                    code.store(code.load(start, i), place, i * self.width)
-
-    def _each(self, place: Value, body: Callable[[list[Value], Value], Sequence[Value]]) -> None:
-        code, n, width = self.code, self._n, self.width
-        with code.over(self._used) as c:
-            start = code.at(place, c * (n * width))
-            for i, x in enumerate(body([code.load(start, i * width, self.type) for i in range(n)], c)):
-                code.store(x, start, i * width)
-
-    def change(self, column: ColumnStage, j: Value, step: Value, end: bool = False) -> None:
-        place = self._end if end else self._state
-        if self._over is None:
-            self._each(place, lambda x, c: column(j, x, step, c))
-        else:
-            each = lambda body: self._each(place, lambda x, _: body(x))  # noqa: E731
-            self._over(each, column.numbers(j), column.kind(j), step)
-
-    def look(self, look: Callable[[Any], Any]) -> None:
-        self._each(self._state, lambda x, _: look(x))
-
-    def remember(self) -> None:
-        """A single trajectory alone goes back."""
-
-    restore = remember
-
-    def end(self) -> None:
-        with self.code.over(self._used * self._n) as i:
-            x = self.code.load(self._state, i * self.width, self.type)
-            self.code.store(x, self._end, i * self.width)
-
-    def finite(self) -> Value:
-        """True if a trajectory was finite up to now."""
-        code, zero = self.code, self.code.constant(0.0, self.type)
-        alive = code.variable(code.constant(0, BOOL))
-        with code.over(self._used) as c:
-            total, start = (
-                code.load(self._watch, c * self.width, self.type),
-                code.at(self._end, c * (self._n * self.width)),
-            )
-            for i in range(self._n):
-                total = code.fma(code.load(start, i * self.width, self.type), zero, total)
-            code.store(total, self._watch, c * self.width)
-            alive.value = alive.value | code.any(code.apply("eq", (total, 0.0)))
-        return alive.value
-
-    def mark(self, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
-        """Write n for the trajectories that are alive, else −1."""
-        code = self.code
-        with code.over(self.there(begin, n_rows)) as i:
-            alive = code.apply("eq", (code.load(self._watch, i), 0.0))
-            code.store(code.select(alive, n, code.constant(-1, INT)), finite, begin + i)
-
-    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        self._write(self._end, self._n_out, out, begin, n_rows, stride, at)
-
-    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
-        one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
-        self._write(self._state, self._n, running, begin, n_rows, one, zero)
-
-    def there(self, begin: Value, n_rows: Value) -> Value:
-        return self.code.apply("min", (self._used * self.width, n_rows - begin))
-
-    def _write(self, place: Value, n: int, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        code, width = self.code, self.width
-        with code.over(self.there(begin, n_rows)) as row:
-            c = code.op("sdiv", INT, row, code.constant(width, INT))
-            source = code.at(place, c * ((self._n - 1) * width) + row)
-            start = code.at(out, ((begin + row) * stride + at) * n)
-            with code.over(code.constant(n, INT)) as i:
-                code.store(code.load(source, i * width), start, i)
-
-
 class Memory:
     """The same in memory: the state, its end, and the state before a block of steps.
 
@@ -577,6 +478,8 @@ class Memory:
     ----------
     at_once : int
         Numbers that are copied at a time: a state has a multiple of these.
+    count : Value
+        How many trajectories there may be.
     """
 
     at_once = 1
@@ -584,20 +487,25 @@ class Memory:
     def __init__(self, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
         self.code, self.width, self._remembers = code, width, before
         self.n_values, self.n_out, work, data = arguments
+        self.count = code.constant(width, INT)
         rooms = [code.at(work, self.n_values * (i * width)) for i in range(4)]
         self._running, self._end, self._before = (
             Room(code, width, x, rooms[3], self.n_values, data) for x in rooms[:3]
         )
+
+    def place(self, room: Room, k: Value) -> Value:
+        """The address of the first number of trajectory k."""
+        return self.code.at(room.state, k)
 
     def block(self, every: int) -> Value:
         return self.code.constant(every, INT)
 
     def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
         n = self.n_values if given is None else self.n_out
-        with self.code.over(self.code.constant(self.width, INT)) as lane:
-            start = self.code.at(rows, self.code.apply("min", (begin + lane, n_rows - 1)) * (n + own))
+        with self.code.over(self.count) as k:
+            start = self.code.at(rows, self.code.apply("min", (begin + k, n_rows - 1)) * (n + own))
             with self.code.over(n) as i:
-                self.code.store(self.code.load(start, i), self._running.state, i * self.width + lane)
+                self.code.store(self.code.load(start, i), self.place(self._running, k), i * self.width)
         if given is not None:
             with self.code.over(self.n_values - n) as i:
                 self._running.store(0.0, n + i)
@@ -645,10 +553,85 @@ class Memory:
         self._write(self._running, self.n_values, running, begin, n_rows, one, zero)
 
     def _write(self, room: Room, n: Value, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        with self.code.over(there(self.code, self.width, begin, n_rows)) as lane:
-            start = self.code.at(out, ((begin + lane) * stride + at) * n)
+        with self.code.over(self.code.apply("min", (self.count, n_rows - begin))) as k:
+            source, start = self.place(room, k), self.code.at(out, ((begin + k) * stride + at) * n)
             with self.code.over(n) as i:
-                self.code.store(self.code.load(room.state, i * self.width + lane), start, i)
+                self.code.store(self.code.load(source, i * self.width), start, i)
+
+
+class _Chunks(Memory):
+    """Many trajectories in memory, from which a stage takes one chunk after the other into registers.
+
+    A chunk need not wait for the one before, whose chain of operations goes on meanwhile.
+    """
+
+    def __init__(self, code: Code, n_values: int, n_out: int, width: int, own: bool, over: Over) -> None:
+        self.code, self.width, self.type, self._n, self._over = code, width, Type("double", width), n_values, over
+        self._own, self.n_values, self.n_out = own, code.constant(n_values, INT), code.constant(n_out, INT)
+        self.chunks = min(max(FAST_MEMORY // (16 * n_values * width), 1), MOST_CHUNKS)
+        self._running, self._end = (
+            Room(code, width, place, place, self.n_values, place)
+            for place in (code.memory(n_values * self.chunks, self.type) for _ in range(2))
+        )
+        self._watch = code.memory(self.chunks, self.type)
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        code, chunks = self.code, self.code.constant(self.chunks, INT)
+        self._used = code.apply("min", (groups(code, n_rows - begin, self.width), chunks))
+        self.count = self._used * self.width
+        with code.over(self._used) as c:
+            code.store(code.constant(0.0, self.type), self._watch, c * self.width)
+        super().open(rows, begin, n_rows, given, own)
+
+    def place(self, room: Room, k: Value) -> Value:
+        c = self.code.op("sdiv", INT, k, self.code.constant(self.width, INT))
+        return self.code.at(room.state, c * ((self._n - 1) * self.width) + k)
+
+    def _each(self, room: Room, body: Callable[[list[Value], Value], Sequence[Value]]) -> None:
+        code, n, width = self.code, self._n, self.width
+        with code.over(self._used) as c:
+            start = code.at(room.state, c * (n * width))
+            for i, x in enumerate(body([code.load(start, i * width, self.type) for i in range(n)], c)):
+                code.store(x, start, i * width)
+
+    def change(self, column: ColumnStage, j: Value, step: Value, end: bool = False) -> None:  # type: ignore[override]
+        room = self._end if end else self._running
+        if self._own:
+            self._each(room, lambda x, c: column(j, x, step, c))
+        else:
+            each = lambda body: self._each(room, lambda x, _: body(x))  # noqa: E731
+            self._over(each, column.numbers(j), column.kind(j), step)
+
+    def look(self, look: Callable[[Any], Any]) -> None:
+        self._each(self._running, lambda x, _: look(x))
+
+    def remember(self) -> None:
+        """A single trajectory alone goes back."""
+
+    @contextmanager
+    def _blocks(self) -> Iterator[tuple[Value, Type]]:
+        with self.code.over(self._used * self._n) as i:
+            yield i * self.width, self.type
+
+    def finite(self) -> Value:
+        """True if a trajectory was finite up to now."""
+        code, zero = self.code, self.code.constant(0.0, self.type)
+        alive = code.variable(code.constant(0, BOOL))
+        with code.over(self._used) as c:
+            total = code.load(self._watch, c * self.width, self.type)
+            start = code.at(self._end.state, c * (self._n * self.width))
+            for i in range(self._n):
+                total = code.fma(code.load(start, i * self.width, self.type), zero, total)
+            code.store(total, self._watch, c * self.width)
+            alive.value = alive.value | code.any(code.apply("eq", (total, 0.0)))
+        return alive.value
+
+    def mark(self, n: Value, finite: Value, begin: Value, n_rows: Value) -> None:
+        """Write n for the trajectories that are alive, else −1."""
+        code = self.code
+        with code.over(code.apply("min", (self.count, n_rows - begin))) as i:
+            alive = code.apply("eq", (code.load(self._watch, i), 0.0))
+            code.store(code.select(alive, n, code.constant(-1, INT)), finite, begin + i)
 
 
 def _state(

@@ -85,7 +85,6 @@ class SplittingLoops:
         self._driving: Driving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Rollouts]
-        self._codes: dict[Any, Rollouts] = {}
         self._longs: dict[int, bool] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
@@ -221,33 +220,25 @@ class SplittingLoops:
         self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges | None
     ) -> Rollouts:
         if not self.traced:
-            more: dict[str, Any] = {"varied": True} if varied else {}
-            return self._compile(level, compensated, monomials, **more)
-        return self._traced(level, compensated, monomials, varied, ranges or ())
+            return self._compile(level, compensated, monomials)
+        if not varied and self._long(level):
+            from sympflow.kernels.array_splittings import term_code
+
+            return term_code(self.splitting(level, monomials, compensated, parametric=False))
+        from sympflow.kernels.splittings import SplittingCode, shared
+
+        splitting = self.splitting(level, monomials, compensated, ranges or ())
+        return shared(splitting.key, lambda: SplittingCode(splitting))
 
     def _long(self, level: int) -> bool:
         """True of stages that are loops over the terms of H."""
         if not self._large or not self.traced:
             return False
-        from sympflow.kernels.terms import is_long
-
         if level not in self._longs:
+            from sympflow.kernels.terms import is_long
+
             self._longs[level] = is_long(self._form, level)
         return self._longs[level]
-
-    def _traced(self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges) -> Rollouts:
-        """The functions over traced numbers, which serve batches with own values too."""
-        from sympflow.kernels.splittings import SplittingCode, shared
-
-        key = level, compensated, monomials, ranges
-        if not varied and self._long(level):
-            from sympflow.kernels.array_splittings import term_code
-
-            return term_code(self.splitting(level, monomials, compensated, parametric=False))
-        if key not in self._codes:
-            splitting = self.splitting(level, monomials, compensated, ranges)
-            self._codes[key] = shared(splitting.key, lambda: SplittingCode(splitting))
-        return self._codes[key]
 
     def splitting(
         self,

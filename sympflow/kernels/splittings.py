@@ -17,7 +17,7 @@ import numpy as np
 
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import Type, Value, Variable
-from sympflow.compiler.functions import FUNCTIONS, added, times
+from sympflow.compiler.functions import FUNCTIONS, added, dot, times
 from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
@@ -98,6 +98,19 @@ class Splitting:
         """Terms of the kicks of each kind of stage: one, two, …; a polynomial has all of its own."""
         return [1, 2, 3][: 1 + {FORCE_GRADIENT: 1, CURVATURE: 2}.get(self.level, 0)]
 
+    def kick(self, terms: int, slopes: bool = False) -> Program:
+        """The change of p by a kick, from q, its numbers and the parameters; its slopes, row by row to the diagonal."""
+        symbols, n = self.symbols, self.symbols.ndof
+        names = [*(s.name for s in symbols.q), *self.kick_numbers, *(s.name for s in symbols.parameters)]
+
+        def changes(*numbers: Any) -> list[Any]:
+            q, kicks, values = numbers[:n], numbers[n:][: len(self.kick_numbers)], numbers[n + len(self.kick_numbers) :]
+            known = evaluator(dict(zip((*symbols.q, *symbols.parameters), (*q, *values), strict=True)))
+            found = _kick_changes(symbols, q, kicks, known, terms, self.monomials)
+            return [*found, *(x for i, y in enumerate(found if slopes else ()) for x in gradient(y, q)[: i + 1])]
+
+        return traced(changes, *names)
+
     def kinds(self) -> Sequence[Stage | WithinRange]:
         """The stages, those with the fewest terms first."""
         return [self._within_range(terms) if self.ranges else self._arranged(terms) for terms in self.terms]
@@ -144,18 +157,14 @@ class Stage(NamedTuple):
 class Shape:
     """One way to write a stage: products of sums multiplied out, or left."""
 
-    def __init__(self, splitting: Splitting, terms: int, expand: bool) -> None:
+    def __init__(self, splitting: Splitting, terms: int, expand: bool, vectors: int = 0) -> None:
         symbols = splitting.symbols
         self.splitting, self.symbols, self.terms, self.d = splitting, symbols, terms, symbols.ndof
-        errors = [f"error_{s}" for s in (*symbols.q, *symbols.p)] if splitting.compensated else []
-        states = [
-            *((s.name, 0) for s in symbols.q),
-            *((s.name, EARLY) for s in symbols.p),
-            *((e, EARLY) for e in errors),
-        ]
+        names = [(s.name, 0) for s in symbols.q] + [(s.name, EARLY) for s in symbols.p]
+        states = [(f"{name}_{i}" if i else name, ready) for i in range(1 + vectors) for name, ready in names]
+        states += [(f"error_{name}", EARLY) for name, _ in names if splitting.compensated]
         self.made = made = Arrangement(states, splitting.numbers, expand)
-        self.q, self.p = made.states[: self.d], made.states[self.d : 2 * self.d]
-        self.errors = made.states[2 * self.d :]
+        self.q, self.p, self.more = made.states[: self.d], made.states[self.d : 2 * self.d], made.states[2 * self.d :]
         self.number = dict(zip(splitting.numbers, made.constants, strict=True))
         self.values = [self.number[s.name] for s in symbols.parameters]
         self.plain: list[Any] = []
@@ -166,9 +175,9 @@ class Shape:
         errors: list[Any] = []
         if self.splitting.compensated:
             changes = [made.written(x) for x in self._changes()]
-            momenta, errors_p = self._compensated(self.p, changes, self.errors[d:])
+            momenta, errors_p = self._compensated(self.p, changes, self.more[d:])
             moves = [made.written(x) for x in self._velocity(momenta, self.number["a"])]
-            positions, errors_q = self._compensated(self.q, moves, self.errors[:d])
+            positions, errors_q = self._compensated(self.q, moves, self.more[:d])
             errors = [*errors_q, *errors_p]
         else:
             positions, momenta = self._drifted(self._kicked())
@@ -183,33 +192,17 @@ class Shape:
 
     def _changes(self) -> list[Any]:
         """The change of p by a kick."""
-        made, d, symbols = self.made, self.d, self.symbols
-        b, *more = (self.number[name] for name in self.splitting.kick_numbers)
-        orders = [made.number(x) for x in _slopes(symbols, self.terms)(*self.q, *self.values)]
-        slope, hessian = orders[:d], [orders[d + d * i :][:d] for i in range(d)]
-        changes = [-times(b, x) for x in slope]
-        if self.terms > 1:
-            v = self._by_mass(slope)
-            product = [_dot(row, v) for row in hessian]
-            changes = [x + times(more[0], y) for x, y in zip(changes, product, strict=True)]
-        if self.terms > 2:
-            third = np.array(orders[d + d * d :], dtype=object).reshape(d, d, d)
-            again, u = [_dot(row, self._by_mass(product)) for row in hessian], v
-            bent = [_dot([_dot(row, u) for row in rows], u) for rows in third]
-            changes = [x - times(more[1], y + 0.5 * z) for x, y, z in zip(changes, again, bent, strict=True)]
-        return self._with_monomials(changes)
+        return [self.made.number(x) for x in self._by_kick(self.splitting.kick(self.terms))]
 
-    def _with_monomials(self, changes: list[Any]) -> list[Any]:
-        letters, monomials = self.splitting.kick_numbers[1:], self.splitting.monomials
-        for e, powers in zip(letters if monomials else (), monomials, strict=True):
-            changes = [x - self.number[e] * _slope_of_monomial(powers, i, self.q) for i, x in enumerate(changes)]
-        return changes
+    def _by_kick(self, program: Program) -> list[Any]:
+        """The outputs of a program of positions, the numbers of a kick, and the parameters."""
+        return program(*self.q, *(self.number[name] for name in self.splitting.kick_numbers), *self.values)
 
     def _by_mass(self, v: Sequence[Any]) -> list[Any]:
         """M⁻¹v."""
         M, entry = self.symbols.inverse_mass, self._of_parameters
         assert M is not None
-        return [_dot([entry(M[i, j]) for j in range(self.d)], v) for i in range(self.d)]
+        return [dot([entry(M[i, j]) for j in range(self.d)], v) for i in range(self.d)]
 
     def _of_parameters(self, f: Any) -> Any:
         return evaluator(dict(zip(self.symbols.parameters, self.values, strict=True)))(f)
@@ -246,13 +239,15 @@ class Shape:
 
     def _damped(self, name: str, momenta: Sequence[Any]) -> list[Any]:
         """One of the two linear maps of a drift with friction."""
-        d, p = self.d, [self.made.letter(x) for x in momenta]
-        numbers = [x for key, x in self.number.items() if key.startswith(f"{name}_")]
-        if len(numbers) == d * d and self.splitting.friction == 2:
-            return [_dot(numbers[i * d : (i + 1) * d], p) for i in range(d)]
-        return [
-            self.made.number(x * (numbers[0] if self.splitting.friction == 0 else numbers[i])) for i, x in enumerate(p)
-        ]
+        p = [self.made.letter(x) for x in momenta]
+        return [self.made.number(dot(row, p)) for row in self._friction(name)]
+
+    def _friction(self, name: str) -> list[list[Any]]:
+        """One of these maps as a matrix."""
+        d, numbers = self.d, [x for key, x in self.number.items() if key.startswith(f"{name}_")]
+        if self.splitting.friction == 2:
+            return [numbers[i * d :][:d] for i in range(d)]
+        return [[numbers[i if self.splitting.friction else 0] if i == j else 0.0 for j in range(d)] for i in range(d)]
 
     def _compensated(
         self, x: Sequence[Any], changes: Sequence[Any], errors: Sequence[Any]
@@ -279,7 +274,7 @@ class NearShape(Shape):
         for k, column in enumerate(near.coefficients.T.tolist()):
             for sign, factor, c in zip((-1.0, 1.0, -1.0), factors, column, strict=False):
                 total = total + (sign * c) * factor * x**k
-        return self._with_monomials([total])
+        return [total]
 
 
 class WithinRange:
@@ -333,34 +328,31 @@ def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
     return [slope, product, (slope * M[0, 0] * product / 2).diff(symbols.q[0])][:terms]
 
 
-def _slopes(symbols: SymbolicHamiltonian, terms: int) -> Program:
-    """∇V, and its second and third derivatives, as many orders as there are terms; rows of the tensors one by one."""
-    given = (*symbols.q, *symbols.parameters)
-    potential = traced(
-        lambda *numbers: [evaluator(dict(zip(given, numbers, strict=True)))(symbols.V)], *(s.name for s in given)
-    )
-    q = potential.inputs[: symbols.ndof]
-    orders = [gradient(potential.outputs[0], q)]
-    for _ in range(1, terms):
-        orders.append([x for row in derivatives(orders[-1], q) for x in row])
-    return Program(potential.inputs, [x for order in orders for x in order])
+def _kick_changes(
+    symbols: SymbolicHamiltonian, q: Sequence[Any], kicks: Sequence[Any], known: Any, terms: int, monomials: Monomials
+) -> list[Any]:
+    """The change of p by a kick of so many terms, of recorded numbers; `known` evaluates expressions."""
+    slope, M, d = gradient(known(symbols.V), q), symbols.inverse_mass, len(q)
+    changes = [-times(kicks[0], x) for x in slope]
 
+    def by_mass(v: Sequence[Any]) -> list[Any]:
+        assert M is not None
+        return [dot([known(M[i, j]) for j in range(d)], v) for i in range(d)]
 
-def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
-    """Σ xᵢ yᵢ, products that may be multiplied out."""
-    total: Any = 0.0
-    for a, b in zip(x, y, strict=True):
-        total = total + times(a, b)
-    return total
-
-
-def _slope_of_monomial(powers: Sequence[int], i: int, q: Sequence[Any]) -> Any:
-    """∂/∂qᵢ of Π q^powers."""
-    value: Any = float(powers[i])
-    for j, n in enumerate(powers):
-        if powers[i] and n > (i == j):
-            value = value * q[j] ** (n - (i == j))
-    return value
+    if terms > 1:
+        hessian, v = derivatives(slope, q), by_mass(slope)
+        product = [dot(row, v) for row in hessian]
+        changes = [x + times(kicks[1], y) for x, y in zip(changes, product, strict=True)]
+    if terms > 2:
+        again = [dot(row, by_mass(product)) for row in hessian]
+        bent = [dot([dot(row, v) for row in derivatives(rows, q)], v) for rows in hessian]
+        changes = [x - times(kicks[2], y + 0.5 * z) for x, y, z in zip(changes, again, bent, strict=True)]
+    for e, powers in zip(kicks[1:] if monomials else (), monomials, strict=True):
+        monomial: Any = 1.0
+        for x, n in zip(q, powers, strict=True):
+            monomial = monomial * x**n
+        changes = [x - e * y for x, y in zip(changes, gradient(monomial, q), strict=True)]
+    return changes
 
 
 MOST_CODES = 64  # that are kept, of systems with other structures
@@ -605,14 +597,11 @@ class SplittingCode(Rollouts):
                 entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
         return entries
 
-    def own_columns(self, table: np.ndarray, values: np.ndarray, width: int) -> Columns:
-        """The columns of trajectories with their own values (N, n) of the parameters."""
+    def own_entries(self, table: np.ndarray, values: np.ndarray) -> Columns:
+        """The numbers of the columns of trajectories with their own values of the parameters."""
         kinds, n = self._kinds_of(table), len(table) - self._own
         rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
-        entries = self._entries(rows, kinds, (len(values),))
-        groups = -(-len(values) // width)
-        full = np.concatenate([entries, np.repeat(entries[..., -1:], groups * width - len(values), axis=-1)], axis=-1)
-        return np.ascontiguousarray(full.reshape(*full.shape[:2], groups, width).transpose(2, 0, 1, 3)), kinds
+        return np.moveaxis(self._entries(rows, kinds, (len(values),)), -1, 0), kinds
 
     def step_rows(
         self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
-from sympflow.compiler.functions import fma
+from sympflow.compiler.functions import dot, fma
 from sympflow.compiler.machine import address, host
 from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
 from sympflow.hamiltonian.friction import Friction
@@ -283,7 +283,7 @@ class _Maps:
                 again = tangent(slope, q, [*_product(M, along), *rest])
                 terms.append([0.5 * (x + y) for x, y in zip(tangent(along, q, v), again, strict=True)])
         forces = [[-x for x in term] for term in terms]
-        changes = [_dot(c, [force[i] for force in forces]) for i in range(width)]
+        changes = [dot(c, [force[i] for force in forces]) for i in range(width)]
         _check_length(len(reached(changes)))
         slopes = [gradient(change, q) for change in changes]
         return [*changes, *(x for force in forces for x in force), *(slopes[i][j] for i, j in self.pairs)]
@@ -307,16 +307,8 @@ def _check_length(n: int) -> None:
         raise ValueError(f"`system` has a kick of {n} operations.")
 
 
-def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
-    """Σ xᵢ yᵢ of as many as there are of both."""
-    total: Any = 0.0
-    for a, b in zip(x, y, strict=False):
-        total = total + a * b
-    return total
-
-
 def _product(A: Sequence[Sequence[Any]], x: Sequence[Any]) -> list[Any]:
-    return [_dot(row, x) for row in A]
+    return [dot(row, x) for row in A]
 
 
 class _Errors:

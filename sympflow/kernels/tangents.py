@@ -14,9 +14,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.compiler.arrange import Arranged, Arrangement
+from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, Value
-from sympflow.compiler.functions import fma, times
+from sympflow.compiler.functions import dot, fma
 from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.recorded import evaluator
@@ -24,10 +24,10 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, Task, run_states
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.kernels.splittings import EARLY, Splitting, SplittingCode, shared
+from sympflow.kernels.splittings import Shape, Splitting, SplittingCode, shared
 from sympflow.kernels.stages import StageTable, run_table
 from sympflow.kernels.threads import given
-from sympflow.schemes import FORCE_GRADIENT, POLYNOMIAL, Scheme
+from sympflow.schemes import FORCE_GRADIENT, Scheme
 
 __all__ = ["TangentCode", "TangentKernel", "TangentRun", "step_tangents", "tangent_kernel"]
 
@@ -60,106 +60,68 @@ class TangentRun(NamedTuple):
     whole: np.ndarray
 
 
-class Linearised:
-    """The stages of a splitting with their derivatives as programs, and what they do to a vector.
+class Linearised(Shape):
+    """A stage with its derivatives, and what these do to a vector; or with some vectors, moved in their place.
 
-    The outputs of a program are q' and p', then ∇k, row by row to the diagonal, the derivative of q' by the momenta
-    after the kick, and, with friction, that of p' by these.
+    The outputs are q' and p', then ∇k, row by row to the diagonal, the derivative of q' by the momenta after the kick,
+    and, with friction, that of p' by these.
     """
 
-    def __init__(self, splitting: Splitting) -> None:
-        self.splitting, self.d = splitting, splitting.symbols.ndof
+    def __init__(self, splitting: Splitting, terms: int, vectors: int) -> None:
+        super().__init__(splitting, terms, True, vectors)
 
-    def arranged(self, terms: int, vectors: int) -> Arranged:
-        """The stage with a kick of so many terms; of some vectors, these moved in place of the derivatives."""
-        splitting, symbols, d = self.splitting, self.splitting.symbols, self.d
-        names = [f"{name}{i}" for i in range(1 + vectors) for name in ("q", "p")]
-        states = [(f"{name}_{i}", 0 if name[0] == "q" else EARLY) for name in names for i in range(d)]
-        made = Arrangement(states, splitting.numbers)
-        q, p = made.states[:d], made.states[d : 2 * d]
-        number = dict(zip(splitting.numbers, made.constants, strict=True))
-        values = [number[s.name] for s in symbols.parameters]
-        kicks = [number[name] for name in splitting.kick_numbers]
-        found = self._kick(terms)(*q, *kicks, *values)
-        momenta = [made.written(x + y) for x, y in zip(p, found[:d], strict=True)]
+    def linearised(self) -> Arranged:
+        """The programs of the stage."""
+        made, symbols, d, q = self.made, self.symbols, self.d, self.q
+        found = self._by_kick(self.splitting.kick(self.terms, slopes=True))
+        momenta = [made.written(x + y) for x, y in zip(self.p, found[:d], strict=True)]
         bends = [made.written(made.number(x)) for x in found[d:]]
         after = [made.letter(x) for x in momenta]
         ends: list[Any] = []
-        if splitting.friction is not None:
-            mean, decay = (self._friction(number, name) for name in ("mean", "decay"))
-            factors = self._mass_times(mean, values)
+        if self.splitting.friction is not None:
+            mean, decay = map(self._friction, ("mean", "decay"))
+            factors = self._mass_times(mean)
             ends = [made.written(made.number(x)) for row in decay for x in row]
-            momenta = [made.written(made.number(_dot(row, after))) for row in decay]
+            momenta = [made.written(made.number(dot(row, after))) for row in decay]
         elif symbols.inverse_mass is not None:
-            unit = [[number["a"] if i == j else 0.0 for j in range(d)] for i in range(d)]
-            factors = self._mass_times(unit, values)
+            factors = self._mass_times([[self.number["a"] if i == j else 0.0 for j in range(d)] for i in range(d)])
         else:
-            slopes = self._drift()(*after, *values)
-            moves = [number["a"] * x for x in slopes[:d]]
-            factors = [[number["a"] * x for x in slopes[d * (i + 1) :][:d]] for i in range(d)]
+            slopes = self._drift()(*after, *self.values)
+            moves = [self.number["a"] * x for x in slopes[:d]]
+            factors = [[self.number["a"] * x for x in slopes[d * (i + 1) :][:d]] for i in range(d)]
         slants = [made.written(made.number(x)) for row in factors for x in row]
         if symbols.inverse_mass is None:
             positions = [made.written(x + y) for x, y in zip(q, moves, strict=True)]
         else:
-            positions = self._drifted(made, q, slants, after)
-        if not vectors:
-            return made.finish([*positions, *momenta, *bends, *slants, *ends])
+            positions = self._moved_by(q, slants, after)
         outputs = [*positions, *momenta]
-        for k in range(1, 1 + vectors):
-            x = made.states[2 * d * k : 2 * d * (k + 1)]
+        if not self.more:
+            return made.finish([*outputs, *bends, *slants, *ends])
+        for k in range(0, len(self.more), 2 * d):
+            x = self.more[k : k + 2 * d]
             kicked = [
-                made.letter(made.written(y + _dot([made.letter(bends[_place(i, j)]) for j in range(d)], x[:d])))
+                made.letter(made.written(y + dot([made.letter(bends[_place(i, j)]) for j in range(d)], x[:d])))
                 for i, y in enumerate(x[d:])
             ]
-            outputs += self._drifted(made, x[:d], slants, kicked)
+            outputs += self._moved_by(x[:d], slants, kicked)
             if ends:
                 rows = [[made.letter(y) for y in ends[d * i : d * (i + 1)]] for i in range(d)]
-                kicked = [_dot(row, kicked) for row in rows]
+                kicked = [dot(row, kicked) for row in rows]
             outputs += [made.written(made.number(y)) for y in kicked]
         return made.finish(outputs)
 
-    def _drifted(self, made: Arrangement, q: Sequence[Any], slants: Sequence[Any], p: Sequence[Any]) -> list[Any]:
+    def _moved_by(self, q: Sequence[Any], slants: Sequence[Any], p: Sequence[Any]) -> list[Any]:
         """q + ∇²T p, a number of the body for each."""
-        d, positions = self.d, [made.node(x) for x in q]
+        made, d, positions = self.made, self.d, [self.made.node(x) for x in q]
         for i in range(d):
             for j in range(d):
                 if not _is_zero(slants[d * i + j]):
                     positions[i] = made.moved(positions[i], slants[d * i + j], made.written(p[j]))
         return positions
 
-    def _kick(self, terms: int) -> Program:
-        """The change of p by a kick, and its derivatives by q, row by row to the diagonal."""
-        splitting, symbols, d = self.splitting, self.splitting.symbols, self.d
-        names = [*(s.name for s in symbols.q), *splitting.kick_numbers, *(s.name for s in symbols.parameters)]
-
-        def changes(*numbers: Any) -> list[Any]:
-            n = d + len(splitting.kick_numbers)
-            q, kicks, values = numbers[:d], numbers[d:n], numbers[n:]
-            known = evaluator(dict(zip((*symbols.q, *symbols.parameters), (*q, *values), strict=True)))
-            slope = gradient(known(symbols.V), q)
-            change = [-times(kicks[0], x) for x in slope]
-            if terms > 1:
-                hessian = derivatives(slope, q)
-                v = self._by_mass(slope, values)
-                product = [_dot(row, v) for row in hessian]
-                change = [x + kicks[1] * y for x, y in zip(change, product, strict=True)]
-            if terms > 2:
-                again = [_dot(row, self._by_mass(product, values)) for row in hessian]
-                bent = [_dot([_dot(row, v) for row in derivatives(rows, q)], v) for rows in hessian]
-                change = [x - kicks[2] * (y + 0.5 * z) for x, y, z in zip(change, again, bent, strict=True)]
-            if splitting.level == POLYNOMIAL:
-                for e, powers in zip(kicks[1:], splitting.monomials, strict=True):
-                    monomial = 1.0
-                    for x, n in zip(q, powers, strict=True):
-                        monomial = monomial * x**n
-                    change = [x - e * y for x, y in zip(change, gradient(monomial, q), strict=True)]
-            return [*change, *(x for i, y in enumerate(change) for x in gradient(y, q)[: i + 1])]
-
-        return traced(changes, *names)
-
     def _drift(self) -> Program:
         """∇T and ∇²T."""
-        symbols, d = self.splitting.symbols, self.d
+        symbols, d = self.symbols, self.d
 
         def slopes(*numbers: Any) -> list[Any]:
             p = numbers[:d]
@@ -169,36 +131,20 @@ class Linearised:
 
         return traced(slopes, *(s.name for s in (*symbols.p, *symbols.parameters)))
 
-    def _by_mass(self, v: Sequence[Any], values: Sequence[Any]) -> list[Any]:
-        """M⁻¹v."""
-        M, known = self.splitting.symbols.inverse_mass, self._known(values)
-        assert M is not None
-        return [_dot([known(M[i, j]) for j in range(self.d)], v) for i in range(self.d)]
-
-    def _mass_times(self, A: Sequence[Sequence[Any]], values: Sequence[Any]) -> list[list[Any]]:
+    def _mass_times(self, A: Sequence[Sequence[Any]]) -> list[list[Any]]:
         """M⁻¹A."""
-        columns = [self._by_mass(column, values) for column in zip(*A, strict=True)]
-        return [list(row) for row in zip(*columns, strict=True)]
+        return [list(row) for row in zip(*(self._by_mass(column) for column in zip(*A, strict=True)), strict=True)]
 
-    def _known(self, values: Sequence[Any]) -> Any:
-        return evaluator(dict(zip(self.splitting.symbols.parameters, values, strict=True)))
 
-    def _friction(self, number: dict[str, Any], name: str) -> list[list[Any]]:
-        """One of the two linear maps of a drift with friction, as a matrix."""
-        d, found = self.d, [x for key, x in number.items() if key.startswith(f"{name}_")]
-        if self.splitting.friction == 2:
-            return [found[d * i : d * (i + 1)] for i in range(d)]
-        return [[found[i if self.splitting.friction else 0] if i == j else 0.0 for j in range(d)] for i in range(d)]
-
-    def moved(self, derivatives: Sequence[Any], q: Sequence[Value], p: Sequence[Value]) -> tuple[list[Any], list[Any]]:
-        """A vector (q, p) after a stage, of the derivatives that its program gives after the state."""
-        d = self.d
-        n = d * (d + 1) // 2
-        bend, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
-
-        p = [_summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
-        q = [_summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
-        return q, [_summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
+def _vector_moved(
+    d: int, derivatives: Sequence[Any], q: Sequence[Value], p: Sequence[Value]
+) -> tuple[list[Any], list[Any]]:
+    """A vector (q, p) after a stage, of the derivatives that its program gives after the state."""
+    n = d * (d + 1) // 2
+    bend, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
+    p = [_summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
+    q = [_summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
+    return q, [_summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
 
 
 def _place(i: int, j: int) -> int:
@@ -208,13 +154,6 @@ def _place(i: int, j: int) -> int:
 
 def _is_zero(x: Any) -> bool:
     return isinstance(x, float) and x == 0.0
-
-
-def _dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
-    total: Any = 0.0
-    for a, b in zip(x, y, strict=True):
-        total = total + times(a, b)
-    return total
 
 
 def _summed(total: Any, factors: Sequence[Any], x: Sequence[Value]) -> Any:
@@ -239,7 +178,7 @@ class TangentCode(SplittingCode):
 
     def __init__(self, splitting: Splitting, vectors: int, grows: bool) -> None:
         super().__init__(splitting, chunked=False)
-        self.vectors, self._grows, self._linearised = vectors, grows, Linearised(splitting)
+        self.vectors, self._grows = vectors, grows
         self._d = d = splitting.symbols.ndof
         self.n_values = self.n_out = 2 * d * (1 + vectors) + (vectors if grows else 0)
         products = d * d + (d if splitting.symbols.inverse_mass is not None else d * d)
@@ -252,7 +191,7 @@ class TangentCode(SplittingCode):
     @cached_property
     def _kinds(self) -> list[Arranged]:
         vectors = self.vectors if self.room is None else 0
-        return [self._linearised.arranged(terms, vectors) for terms in self._splitting.terms]
+        return [Linearised(self._splitting, terms, vectors).linearised() for terms in self._splitting.terms]
 
     def stage(self, values: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         if not isinstance(values, Room):
@@ -274,7 +213,7 @@ class TangentCode(SplittingCode):
         with room.code.over(self._count(room)) as i:
             place = room.part((i + 1) * (2 * d))
             w = [room.load(m, place) for m in range(2 * d)]
-            q, p = self._linearised.moved(found[2 * d :], w[:d], w[d:])
+            q, p = _vector_moved(d, found[2 * d :], w[:d], w[d:])
             for m, x in enumerate([*q, *p]):
                 room.store(x, m, place)
         return None

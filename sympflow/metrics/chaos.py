@@ -10,6 +10,7 @@ References
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -23,6 +24,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import compiled_loops
 from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.show.cards import Card, Shown, numbers
@@ -315,12 +317,17 @@ def indicator(
     scale = weights(system)
     w0 = _deviations(deviations, vectors, scale, seed)
     length = integrator.step_length(system) if integrator.on_grid else None
+    told, jumps = landings(integrator, system, t0, t1, backend != "compiled")
+    if told:
+        warnings.warn(told, RuntimeWarning, stacklevel=4)
     if length is not None:
         grid = Grid(t0, t1, length)
         if grid.n_steps == 0:
             raise ValueError(f"`t_span` is shorter than one step of {abs(grid.h):g}: end it later, or reduce `dt`.")
         orbits = orbits._replace(t_span=(t0, grid.time(grid.n_steps)))
-        kernel = compiled_loops(lambda: integrator.tangent_kernel(system, vectors), orbits.y0, backend)
+        kernel = None
+        if not jumps:
+            kernel = compiled_loops(lambda: integrator.tangent_kernel(system, vectors), orbits.y0, backend)
         if kernel is not None:
             run = _compiled(kernel, grid, orbits, w0, scale, times, kind, below)
             return _reported(run, orbits, times, kind, below)

@@ -69,13 +69,9 @@ def stroboscopic(
     single = len(rows) == 1
     y0 = rows[0] if single else rows
     if isinstance(integrator, FixedStep) and integrator.on_grid and not integrator.trained:
-        dt = dividing_step(period, integrator.step_length(system))
-        fitted = replace(integrator, dt=dt)
-        every = round(period / dt)
-        sol = solve(system, fitted, (t0, t0 + n * turn), y0, save_every=every, on_domain_exit="ignore")
-    else:
-        times = t0 + turn * np.arange(n + 1)
-        sol = solve(system, integrator, (t0, times[-1]), y0, t_eval=times, on_domain_exit="ignore")
+        integrator = replace(integrator, dt=dividing_step(period, integrator.step_length(system)))
+    times = t0 + turn * np.arange(n + 1)
+    sol = solve(system, integrator, (t0, times[-1]), y0, t_eval=times, on_domain_exit="ignore")
     states = np.moveaxis(sol.y, -1, -2).reshape(len(rows), len(sol.t), -1)
     trajectory, k = np.nonzero(np.isfinite(states).all(-1))
     whole = np.rint((sol.t - t0) / turn)
@@ -135,18 +131,18 @@ class _Search:
     def run(self, t_span: tuple[float, float], rows: np.ndarray) -> Crossings:
         """Search all steps from `rows` (N, 2d)."""
         grid = Grid(*t_span, self.integrator.step_length(self.system))
-        y_end, n_searched = rows, 0
+        y_end, to_go = rows, grid.t1 - grid.t0
         held: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         for chunk in self.integrator.steps(self.system, t_span, rows):
             if held:
                 self.search(*held, np.concatenate([held[1][1:], chunk[1][:1]]))
             held = chunk
-            n_searched += len(chunk[1])
         if held:
             t, y, h = held
             y_end = self._end(grid, t, y, h)
             self.search(t, y, h, np.concatenate([y[1:], y_end[None]]))
-        reached = n_searched == grid.n_steps + bool(grid.remainder) and bool(np.isfinite(y_end).all())
+            to_go = grid.t1 - float(t[-1] + h[-1])
+        reached = abs(to_go) < abs(grid.h) / 2 and bool(np.isfinite(y_end).all())
         status, message = (np.zeros(len(rows), dtype=int), FINISHED) if reached else self._failure(t_span, rows)
         return Crossings(*self._located(rows.shape[-1], grid.h), status, message)
 

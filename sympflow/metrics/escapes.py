@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,6 +15,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.show.cards import Card, Shown, numbers
@@ -196,6 +198,9 @@ def escapes(orbits: Orbits, region: Outside, backend: str) -> tuple[np.ndarray, 
             f"`method` {integrator.name!r} has no fixed steps of the states, after which escapes are looked for: use "
             "a splitting method such as 'kahan_li8', or 'gauss_legendre6'."
         )
+    told, _ = landings(integrator, orbits.system, *orbits.t_span, able=False)
+    if told:
+        warnings.warn(told, RuntimeWarning, stacklevel=3)
     rows = orbits.rows
     most = max(1, MOST_VALUES // (WINDOW * rows.shape[1]))
     with naming_plugin(integrator):

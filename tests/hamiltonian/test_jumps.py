@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 import sympy as sp
 import torch
+from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import sympflow
 from sympflow import HamiltonianSystem, solve
 from sympflow.hamiltonian.times import check_period
+from sympflow.interop.scipy import as_scipy
+from sympflow.interop.torchdiffeq import odeint
 
 q, p, t = sp.symbols("q p t", real=True)
 PI = math.pi
@@ -288,6 +291,8 @@ def test_jumps_of_lattices_pairs_and_parameters():
         (sp.sin(t) * sp.sign(sp.sin(t)), []),
         (sp.Piecewise((t**2, t < 1.3), (1.69 + 2.6 * (t - 1.3), True)), []),
         (sp.exp(-sp.Abs(t - 2)), []),
+        (sp.Heaviside(t**3 - 8), [2]),
+        (sp.sign((t - 1) ** 2 * (t - 3)), [3]),
         (sp.cos(t), []),
     ],
 )
@@ -304,17 +309,20 @@ def test_jumps_at_states_and_times_of_any_size():
     distant = HamiltonianSystem.from_sympy(p**2 / 2 + sp.Heaviside(t - 1.03) * sp.Max(q - 1e9, 0) ** 2, time="t")
     assert distant.jump_times(0, 5, 0.01).tolist() == [1.03]
     assert driven(sp.Heaviside(t - 1e6)).symbols.jumps
+    np.testing.assert_allclose(driven(sp.Heaviside(t**3 - 1e12)).jump_times(0, 1e6, 1e-3), [1e4], rtol=1e-14)
     laser = driven(1e-20 * sp.sign(sp.cos(t * 1e15)))
     np.testing.assert_allclose(laser.jump_times(0, 5e-15, 1e-17), [PI / 2 * 1e-15, 3 * PI / 2 * 1e-15])
-    with pytest.warns(RuntimeWarning, match="jumps within a step, at t = 1.03"):
-        solve(wall, "kahan_li8", (0, 2), [5.0, 0.0], dt=0.1, backend="array")
+    sol = solve(wall, "kahan_li8", (0, 2), [5.0, 0.0], dt=0.1, backend="array")
+    assert sol.y[0, -1] == pytest.approx(3 + 2 * math.cos(math.sqrt(2) * (2 - 1.03)), rel=1e-13)
 
 
-SWITCHED = HamiltonianSystem.from_sympy(
-    p**2 / 2 + q**2 / 2 - q * sp.Piecewise((0, t < 1), (1, True)), time="t", y0=[0.5, 0.1]
-)
+def switched(t_jump: float, states: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """The errors of q along an orbit of an oscillator to whose force 1 is added at t_jump."""
+    since = np.maximum(times - t_jump, 0)
+    return np.abs(states - (0.5 * np.cos(times) + 0.1 * np.sin(times) + 1 - np.cos(since)))
 
 
+@pytest.mark.parametrize("t_jump", [1, sp.Rational(103, 100)])
 @pytest.mark.parametrize(
     ("method", "order"),
     [
@@ -322,48 +330,142 @@ SWITCHED = HamiltonianSystem.from_sympy(
         ("chin4c", 4),
         ("gauss_legendre4", 4),
         ("linear_aba864", None),
-        ("verlet", 1),
-        ("rk4", 1),
+        ("verlet", 2),
+        ("rk4", 4),
+        ("impulse", 2),
+        ("mollified_impulse", 2),
+        ("linear_srkn11b", None),
+        ("strang_parts", 2),
+        ("kahan_li8_parts", None),
         ("tao2", 1),
         ("tao8", 1),
-        ("impulse", 1),
-        ("mollified_impulse", 1),
-        ("linear_srkn11b", 1),
-        ("strang_parts", 1),
-        ("kahan_li8_parts", 1),
     ],
 )
-def test_a_method_keeps_its_order_at_the_jumps_that_its_steps_meet_or_warns(method, order):
-    """The measured order is 1 where a force is taken at the ends of steps, and then it is said."""
+def test_a_method_keeps_its_order_at_jumps_or_warns(method, order, t_jump):
+    """Runs land on them, whether their steps do or not. With copies of phase space the order is 1, which is said."""
+    system = HamiltonianSystem.from_sympy(
+        p**2 / 2 + q**2 / 2 - q * sp.Piecewise((0, t < t_jump), (1, True)), time="t", y0=[0.5, 0.1]
+    )
     errors = []
     for n in (8, 16):
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
-            sol = solve(SWITCHED, method, (0, 3), dt=1 / n, backend="array")
-        since = np.maximum(sol.t - 1, 0)
-        exact = 0.5 * np.cos(sol.t) + 0.1 * np.sin(sol.t) + 1 - np.cos(since)
-        errors.append(np.abs(sol.y[0] - exact).max())
-        assert [str(w.message)[:70] for w in told] == [
-            f"`method` {method!r} takes forces at the ends of its steps, and H of 'custom'"[:70]
-        ] * (order == 1)
-    assert errors[1] < 1e-13 if order is None else math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.15)
+            sol = solve(system, method, (0, 3), dt=1 / n, backend="array")
+        errors.append(switched(float(t_jump), sol.y[0], sol.t).max())
+        said = "`method` {!r} takes forces at the ends" if t_jump == 1 else "`dt` {:g}: H of 'custom' jumps within"
+        assert [str(w.message)[:35] for w in told] == [said.format(method if t_jump == 1 else 1 / n)[:35]] * (
+            order == 1
+        )
+    if order == 1:
+        assert errors[1] > 1e-4
+    else:
+        assert errors[1] < 1e-13 if order is None else math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
+
+
+LATE = HamiltonianSystem.from_sympy(
+    p**2 / 2 + q**2 / 2 - q * sp.Heaviside(t - sp.Symbol("c", real=True)),
+    time="t",
+    params={"c": 1.03},
+    y0=[0.5, 0.1],
+    t_span=(0, 3),
+    dt=0.1,
+)
 
 
 @pytest.mark.parametrize(
-    ("drive", "span", "warns"),
+    "options",
     [
-        (sp.Heaviside(t), (0, 2), True),  # ½ at t = 0
-        (sp.Piecewise((0, t < 0), (1, True)), (0, 2), False),
-        (sp.Piecewise((0, t < 2), (1, True)), (0, 2), True),
-        (sp.Piecewise((0, t < 2), (1, True)), (2, 0), True),
-        (sp.Piecewise((0, t <= 2), (1, True)), (2, 0), False),
+        {},
+        {"save_every": 7},
+        {"t_eval": [0, 0.5, 1.03, 1.031, 3]},
+        {"dense_output": True},
+        {"y0": np.array([[0.5, 0.1]] * 3)},
+        {"events": lambda t, y: y[0] - 0.9},
+        {"params": {"c": [1.03, 0.77, 2.0]}, "t_eval": [0, 1.5, 3]},
+        {"y0": torch.tensor([0.5, 0.1], dtype=torch.float64)},
+    ],
+    ids=str,
+)
+def test_what_a_run_gives_where_it_lands_on_jumps(options):
+    sol = solve(LATE, "kahan_li8", **options)
+    jumps = np.reshape(options.get("params", {"c": 1.03})["c"], (-1, 1))
+    assert switched(jumps, np.asarray(sol.y)[..., 0, :], sol.t).max() < 1e-13
+    if "dense_output" in options:
+        times = np.append(np.linspace(0, 3, 50), 1.03)
+        assert switched(1.03, sol.sol(times)[0], times).max() < 1e-13
+    if "events" in options:
+        [[at]] = sol.t_events
+        assert switched(1.03, 0.9, at) < 1e-13
+    back = solve(LATE, "kahan_li8", (3, 0), np.asarray(sol.y)[..., -1])
+    if "params" not in options:
+        np.testing.assert_allclose(back.y[..., -1] - [0.5, 0.1], 0, atol=1e-13)
+
+
+PULSE = HamiltonianSystem.from_sympy(
+    p**2 / 2 + q**2 / 200 - 100 * q * sp.Piecewise((1, (t > 50) & (t < sp.Rational(5001, 100))), (0, True)),
+    time="t",
+    y0=[0, 0],
+    t_span=(0, 100),
+    dt=0.1,
+)
+
+
+@pytest.mark.parametrize("method", ["dop853", "rk45", "dopri5", "bosh3", "kahan_li8", "explicit_adams"])
+def test_no_step_leaps_over_a_pulse(method):
+    exact = 1e4 * (math.cos(0.1 * 49.99) - math.cos(0.1 * 50))
+    sol = solve(PULSE, method, t_eval=[100.0])
+    assert sol.y[0, -1] == pytest.approx(exact, rel=1e-3)
+    assert sol.stats["jumps"] == 2
+    if method != "explicit_adams":
+        chunks = [*sol.integrator.steps(PULSE, (0.0, 100.0), sol.y0)]
+        y, h = np.concatenate([chunk[1] for chunk in chunks]), np.concatenate([chunk[2] for chunk in chunks])
+        assert h.sum() == pytest.approx(100)
+        swing = math.hypot(0.1 * y[-1, 0], y[-1, 1])
+        assert swing == pytest.approx(2000 * math.sin(0.0005), rel=1e-3)  # of the pulse, before the last step
+
+
+def test_metrics_of_a_run_that_lands_on_jumps_are_those_of_its_steps():
+    ensemble = sympflow.ensemble(LATE, "kahan_li8", y0=np.array([[0.5, 0.1]] * 3), t_eval=[3.0])
+    assert switched(1.03, ensemble.y[:, 0, 0], 3.0).max() < 1e-13
+    sol = solve(LATE, "rk4")
+    chunks = [*sol.integrator.steps(LATE, (0.0, 3.0), sol.y0)]
+    times, lengths = (np.concatenate([chunk[i] for chunk in chunks]) for i in (0, 2))
+    np.testing.assert_allclose(times, sol.t[:-1], atol=1e-12)
+    np.testing.assert_allclose(np.concatenate([chunk[1] for chunk in chunks]), sol.y[:, :-1].T, atol=1e-15)
+    assert lengths.sum() == pytest.approx(3, abs=1e-12)
+    assert sympflow.lyapunov(LATE, "kahan_li8", (0, 30)).value == pytest.approx(0, abs=0.05)
+
+
+def test_runs_that_do_not_land_on_jumps_warn(tmp_path):
+    fast = HamiltonianSystem.from_sympy(p**2 / 2 + q**2 / 2 - q * sp.sign(sp.sin(5000 * t)), time="t", y0=[0.5, 0.1])
+    for run in (
+        lambda: solve(LATE, "kahan_li8", store=tmp_path / "run.zarr"),
+        lambda: solve(fast, "leapfrog", (0, 10), dt=0.1),
+        lambda: solve(LATE, "mclachlan4"),  # whose forces lie beyond the ends of its steps
+        lambda: solve_ivp(LATE, (0, 3), [0.5, 0.1], method=as_scipy("kahan_li8", LATE)),
+        lambda: odeint(LATE, torch.tensor([0.5, 0.1]).double(), torch.tensor([0.0, 3.0]), method="kahan_li8"),
+        lambda: sympflow.escape_times(LATE, "kahan_li8", outside=5.0),
+    ):
+        with pytest.warns(RuntimeWarning, match="jumps within a step, at t ="):
+            run()
+
+
+@pytest.mark.parametrize(
+    ("drive", "span"),
+    [
+        (sp.Heaviside(t), (0, 2)),  # ½ at t = 0
+        (sp.Piecewise((0, t < 0), (1, True)), (0, 2)),
+        (sp.Piecewise((0, t < 2), (1, True)), (0, 2)),
+        (sp.Piecewise((0, t < 2), (1, True)), (2, 0)),
+        (sp.Piecewise((0, t <= 2), (1, True)), (2, 0)),
     ],
 )
-def test_the_value_of_a_jump_at_an_end_of_the_run(drive, span, warns):
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        solve(driven(drive, y0=[0.5, 0.1]), "verlet", span, dt=0.25, backend="array")
-    assert bool(told) == warns
+def test_the_value_of_a_jump_at_an_end_of_the_run(drive, span):
+    inside = float(drive.subs(t, 1))
+    steady = HamiltonianSystem.from_sympy(p**2 / 2 - q * inside, y0=[0.5, 0.1])
+    exact = solve(steady, "verlet", span, dt=0.25, backend="array")
+    sol = solve(driven(drive, y0=[0.5, 0.1]), "verlet", span, dt=0.25, backend="array")
+    np.testing.assert_allclose(sol.y, exact.y, atol=1e-13)
 
 
 # periods -------------------------------------------------------------------------------------------

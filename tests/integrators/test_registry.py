@@ -118,7 +118,7 @@ def test_all_built_in_methods_are_listed():
 def test_integrators_declare_what_they_are(name):
     integrator = get(name)(dt=0.1)
     assert (integrator.name, integrator.order, integrator.symplectic) == (name, SCHEMES[name].order, True)
-    assert integrator.options() == ("dt", "compensated", "splitting", "clock", "parts", "shift", "omega")
+    assert integrator.options() == ("dt", "compensated", "splitting", "clock", "parts", "shift", "omega", "corrector")
     assert repr(integrator) == f"{name}(dt=0.1)"
 
 

@@ -15,7 +15,11 @@ from sympflow.interop.scipy import as_scipy
 
 HH, OSCILLATOR, PENDULUM = systems.henon_heiles(), systems.harmonic_oscillator(), systems.pendulum()
 EPS = np.finfo(float).eps
-METHODS = [name for name in available() if issubclass(get(name), FixedStep) and get(name).on_grid]
+METHODS = [
+    name
+    for name in available()
+    if issubclass(get(name), FixedStep) and get(name).on_grid and getattr(get(name), "splitting", "") != "kepler"
+]
 OF_EACH_KIND = [name for name in METHODS if name in KINDS]
 TRAINED = ("sympflow", "mlp")
 BLOW_UP = [0.0, 0.0, 0.0, 0.7]

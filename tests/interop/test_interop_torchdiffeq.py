@@ -20,6 +20,7 @@ OURS = [
     name
     for name in available()
     if issubclass(get(name), FixedStep) and get(name).on_grid and name not in (*FIXED, "sympflow", "mlp")
+    if getattr(get(name), "splitting", "") != "kepler"  # of planets
 ]
 METHODS = [*OURS, "sympflow"]
 KINDS = ["verlet", "leapfrog", "chin4a", "gauss_legendre4", "mollified_impulse", "linear_omelyan4", "strang_parts"]

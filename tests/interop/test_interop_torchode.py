@@ -30,6 +30,7 @@ CLASSICAL = [
     name
     for name in available()
     if issubclass(get(name), FixedStep) and get(name).on_grid and name not in ("sympflow", "mlp")
+    if getattr(get(name), "splitting", "") != "kepler"  # of planets
 ]
 
 

@@ -1,0 +1,198 @@
+"""Kepler's motion about a centre, by universal variables, over numbers: arrays, tensors, traced numbers.
+
+With r = |x|, η = x·v and β = 2μ/r − v², the time is t = rX + ηG₂ + ζG₃, ζ = μ − βr, in the universal variable X, of
+which the Stumpff functions are Gₙ = Xⁿ Σₖ (−βX²)ᵏ/(n + 2k)!. Nothing here depends on the sign of the energy −β/2.
+
+References
+----------
+.. [1] K. Stumpff, "Himmelsmechanik", vol. I, Berlin 1959.
+.. [2] B. A. Conway, "An improved algorithm due to Laguerre for the solution of Kepler's equation", Celest. Mech. 39
+   (1986) 199–211.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sympflow.arrays import is_tensor
+from sympflow.compiler.functions import apply, where
+
+SHORT = 0.25  # βX² up to which a series of so many terms is exact to rounding
+TERMS = 7
+CLOSE = 1e-8  # of X: a step of Newton's or Laguerre's method after which the next one is below rounding
+MOST = 200  # steps of the solver, of which bisection takes a part where nothing else helps
+
+Numbers = list[Any]
+
+
+def dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+def series(X: Any, beta: Any, terms: int) -> tuple[Any, Any, Any, Any]:
+    """G₀ to G₃ of a small βX², by Horner's rule."""
+    square = X * X
+    z = square * beta
+    c2, c3 = (1.0 / math.factorial(n + 2 * terms - 2) for n in (2, 3))
+    for k in range(terms - 2, -1, -1):
+        c2, c3 = (1.0 / math.factorial(n + 2 * k) - z * c for n, c in ((2, c2), (3, c3)))
+    G2, G3 = square * c2, X * square * c3
+    return 1.0 - beta * G2, X - beta * G3, G2, G3
+
+
+def stumpff(X: Any, beta: Any) -> tuple[Any, Any, Any, Any]:
+    """G₀ to G₃ of any X: the series of X halved so often that it is short, and the theorem of the double argument."""
+
+    def halved(part: Any) -> tuple[Any, Numbers]:
+        large = apply("abs", beta * part * part) > SHORT
+        return large, [where(large, 0.5 * part, part)]
+
+    def doubled(part: Any, *G: Any) -> tuple[Any, Numbers]:
+        G0, G1, G2, G3 = G
+        less = apply("abs", part) < apply("abs", X)
+        twice = 2.0 * G1 * G1
+        new = 2.0 * part, 1.0 - beta * twice, 2.0 * G0 * G1, twice, 2.0 * (G3 + G1 * G2)
+        return less, [where(less, a, b) for a, b in zip(new, (part, *G), strict=True)]
+
+    (part,) = repeated(halved, [X])
+    _, *G = repeated(doubled, [part, *series(part, beta, TERMS)])
+    return tuple(G)
+
+
+def repeated(body: Callable[..., tuple[Any, Numbers]], values: Numbers) -> Numbers:
+    """Apply `body`, which gives a condition and new values, again while the condition holds anywhere."""
+    if hasattr(values[0], "code"):
+        code = values[0].code
+
+        def turn(given: Numbers) -> tuple[Any, Numbers]:
+            condition, new = body(*given)
+            return code.any(condition), new
+
+        return code.repeat(values, turn)
+    with np.errstate(all="ignore"):  # trials of the solver that overflow are taken back
+        for _ in range(4 * MOST):
+            condition, values = body(*values)
+            if not condition.any():
+                break
+    return values
+
+
+def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any) -> Any:
+    """The X of a time t ≥ 0 by Laguerre's method, kept between the ends that are known; nearly to rounding."""
+    bound = where(beta > 0.0, beta, 1.0)
+    most = where(beta > 0.0, (bound * t / mu) + 2.0 / apply("sqrt", bound), math.inf)  # E grows by nt + 2 at most
+
+    def turn(X: Any, low: Any, high: Any, going: Any) -> tuple[Any, Numbers]:
+        G0, G1, G2, G3 = stumpff(X, beta)
+        f = r * X + eta * G2 + zeta * G3 - t
+        slope, bend = r + eta * G1 + zeta * G2, eta * G0 + zeta * G1
+        before = f < 0.0
+        low, high = where(before, X, low), where(before, high, X)
+        root = apply("sqrt", apply("abs", 16.0 * slope * slope - 20.0 * f * bend))
+        new = X - 5.0 * f / (slope + root)
+        between = where(high < math.inf, 0.5 * (low + high), 2.0 * X)
+        new = where((low <= new) & (new <= high), new, between)
+        again = (CLOSE * apply("abs", new) < apply("abs", new - X)) & (going > 0.0)
+        return again, [where(going > 0.0, new, X), low, high, where(again, going - 1.0, 0.0)]
+
+    first = apply("min", t / r, most)
+    return repeated(turn, [first, 0.0 * first, most + 0.0 * first, 0.0 * first + float(MOST)])[0]
+
+
+def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta: Any, mu: Any, t: Any) -> Numbers:
+    """f − 1, g, f′ and g′ − 1 after one step of Newton's method from X, in which so small a step is linear; and it."""
+    G0, G1, G2, G3 = G
+    slope = 1.0 / (r + (eta * G1 + zeta * G2))
+    d = -((r * X + (eta * G2 + zeta * G3) - t) * slope)
+    end = slope * (1.0 - (slope * d) * (eta * G0 + zeta * G1))
+    G1, G2, G3 = G1 + d * G0, G2 + d * G1, G3 + d * G2
+    a = mu * G2
+    return [-(a * inverse), t - mu * G3, -(mu * G1 * inverse * end), -(a * end), d, r * G1 + eta * G2]
+
+
+def moved(x: Sequence[Any], v: Sequence[Any], c: Sequence[Any]) -> tuple[Numbers, Numbers]:
+    """Positions and velocities by these coefficients."""
+    f, g, df, dg = c
+    return (
+        [a + (f * a + g * b) for a, b in zip(x, v, strict=True)],
+        [b + (df * a + dg * b) for a, b in zip(x, v, strict=True)],
+    )
+
+
+def kepler_flow(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any) -> tuple[Numbers, Numbers]:
+    """Move x and v, three numbers each, over a time t of any sign, about a centre with μ = GM > 0.
+
+    Ellipses, parabolas and hyperbolas of any eccentricity, as exactly as their conditioning allows; whole periods are
+    left out first.
+    """
+    square = dot(x, x)
+    r = apply("sqrt", square)
+    inverse, eta = 1.0 / r, dot(x, v)
+    beta = 2.0 * mu * inverse - dot(v, v)
+    bound = where(beta > 0.0, beta, 1.0)
+    period = 2.0 * math.pi * mu / (bound * apply("sqrt", bound))
+    t = t - where(beta > 0.0, period * apply("floor", t / period + 0.5), 0.0)
+    sign = where(t < 0.0, 0.0 * t - 1.0, 1.0)
+    t, eta, zeta = t * sign, eta * sign, mu - beta * r
+    X = solved(*map(_still, (r, eta, zeta, beta, mu, t)))
+    f, g, df, dg, _, other = coefficients(X, stumpff(X, beta), r, inverse, eta, zeta, mu, t)
+    g = where(2.0 * apply("abs", t - g) < t, g, other)
+    return moved(x, v, [f, sign * g, sign * df, dg])
+
+
+def _still(x: Any) -> Any:
+    """Return the number without its derivatives: Newton's last step has those of the solution."""
+    return x.detach() if is_tensor(x) else x
+
+
+# elements ----------------------------------------------------------------------------------------------------------
+
+
+def elements_of(x: np.ndarray, v: np.ndarray, mu: Any) -> np.ndarray:
+    """Osculating elements (..., 6) of x and v (..., 3): a, e, inclination, node, argument of pericentre, M.
+
+    Angles are in radians, from 0 to 2π, the inclination to π. Where the node or the pericentre is not defined, the
+    angle is 0 and the next one is counted from there. Of a hyperbola a < 0 and M is the hyperbolic mean anomaly.
+    """
+    mu = np.asarray(mu, dtype=float)
+    h = np.cross(x, v)
+    r, size = np.linalg.norm(x, axis=-1), np.linalg.norm(h, axis=-1)
+    a = 1 / (2 / r - (v * v).sum(-1) / mu)
+    towards = np.cross(v, h) / mu[..., None] - x / r[..., None]
+    e = np.linalg.norm(towards, axis=-1)
+    inclination = np.arctan2(np.hypot(h[..., 0], h[..., 1]), h[..., 2])
+    flat = np.hypot(h[..., 0], h[..., 1]) < 1e-15 * size
+    node = np.where(flat, 0.0, np.arctan2(h[..., 0], -h[..., 1]))
+    along = np.stack([np.cos(node), np.sin(node), 0 * node], axis=-1)
+    across = np.cross(h / size[..., None], along)
+    round_ = e < 1e-14
+    peri = np.where(round_, 0.0, np.arctan2((towards * across).sum(-1), (towards * along).sum(-1)))
+    f = np.arctan2((x * across).sum(-1), (x * along).sum(-1)) - peri
+    with np.errstate(all="ignore"):
+        bound, root = e < 1, np.sqrt(np.abs(1 - e) / (1 + e)) * np.tan(f / 2)
+        E = np.where(bound, 2 * np.arctan(root), 2 * np.arctanh(np.where(np.abs(root) < 1, root, 0.0)))
+        M = np.where(bound, np.mod(E - e * np.sin(E), 2 * np.pi), e * np.sinh(E) - E)
+    turn = 2 * np.pi
+    return np.stack([a, e, inclination, np.mod(node, turn), np.mod(peri, turn), M], axis=-1)
+
+
+def states_of(elements: np.ndarray, mu: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities (..., 3) of elements (..., 6): the pericentre, moved by the time that M tells."""
+    a, e, inclination, node, peri, M = np.moveaxis(np.asarray(elements, dtype=float), -1, 0)
+    mu = np.asarray(mu, dtype=float) + 0 * a
+    q = a * (1 - e)
+    speed, zero = np.sqrt(mu * (1 + e) / q), 0 * q
+    x, v = kepler_flow([q, zero, zero], [zero, speed, zero], mu, M * np.sqrt(np.abs(a) ** 3 / mu))
+
+    def turned(u: Numbers) -> np.ndarray:
+        c, s = np.cos(peri), np.sin(peri)
+        along, across = c * u[0] - s * u[1], s * u[0] + c * u[1]
+        level, up = across * np.cos(inclination), across * np.sin(inclination)
+        c, s = np.cos(node), np.sin(node)
+        return np.stack([c * along - s * level, s * along + c * level, up], axis=-1)
+
+    return turned(x), turned(v)

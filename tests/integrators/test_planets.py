@@ -1,0 +1,250 @@
+"""Planets about a star: Kepler's motion | interaction, compiled and by arrays, correctors, encounters, elements."""
+
+import numpy as np
+import pytest
+import torch
+
+import sympflow
+from sympflow import HamiltonianSystem, compare, ensemble, solve, systems
+from sympflow.schemes import CORRECTORS, corrector_maps
+from sympflow.testing import check_integrator
+
+EPS = np.finfo(float).eps
+METHODS = ("wisdom_holman", "kepler_aba104", "kepler_aba864", "kepler_aba1064")
+ELEMENTS = {"a": [5.2, 9.55, 19.2], "e": [0.05, 0.06, 0.05], "inc": [0.02, 0.04, 0.01], "M": [0.3, 2.0, 4.0]}
+MASSES = [1.0, 1e-3, 3e-4, 5e-5]
+GAUSS = 0.01720209895**2
+
+
+def giants(**options):
+    return HamiltonianSystem.planets(MASSES, **{"elements": ELEMENTS, "G": GAUSS, **options})
+
+
+GIANTS = giants()
+MANY = HamiltonianSystem.planets(
+    [1.0, *[1e-6] * 11], elements={"a": 1.3 ** np.arange(11), "e": 0.02, "M": 2.0 * np.arange(11)}
+)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "system", [GIANTS, giants(coordinates="democratic"), MANY], ids=["jacobi", "democratic", "many"]
+)
+def test_compiled_steps_are_those_of_arrays(method, system):
+    y0 = system.y0 * np.linspace(1.0, 1.01, 3)[:, None]
+    t = np.array([0.0, 1.0, 7.3, 20.0]) * system.dt
+    runs = [solve(system, method, (0, t[-1]), y0=y0, t_eval=t, backend=b) for b in ("compiled", "array")]
+    scale = np.abs(system.y0).reshape(2, -1).max(-1).repeat(system.ndof)[:, None]
+    assert np.abs((runs[0].y - runs[1].y) / scale).max() < 40 * 20 * EPS
+    alone = solve(system, method, (0, t[-1]), y0=y0[1], t_eval=t)
+    assert np.array_equal(alone.y, runs[0].y[1])
+    tensors = solve(system, method, (0, t[-1]), y0=torch.as_tensor(y0), t_eval=t)
+    assert np.abs((tensors.y.numpy() - runs[1].y) / scale).max() < 40 * 20 * EPS
+
+
+def test_the_contract_of_integrators():
+    """A star with heavy companions, whose momenta are of the size of the differences that the checks make."""
+    orbits = {"a": [1.5, 9.0], "e": [0.1, 0.05], "inc": [0.02, 0.04], "M": [0.0, 2.0]}
+    system = HamiltonianSystem.planets([2.0, 0.5, 0.4], elements=orbits, t_span=(0, 60.0), dt=0.3, encounter=None)
+    system.domain = sympflow.Tube(solve(system, "srkn11b", (0, 300.0), dt=0.05, save_every=20).y.T, 0.02)
+    report = check_integrator(sympflow.get("wisdom_holman"), system)
+    assert set(report.skipped) == {"friction_is_in_the_steps", "the_drive_is_in_the_steps"}
+
+
+@pytest.mark.parametrize("factor", [1, 100])
+@pytest.mark.parametrize(("method", "power"), [("wisdom_holman", 2), ("kepler_aba104", 4), ("kepler_aba864", 4)])
+def test_the_error_grows_with_the_step_and_the_masses(method, power, factor):
+    """Of leading order ε dt² (Wisdom and Holman 1991), ε² dt⁴ with the high powers of dt that ε goes with above."""
+    masses = [1.0, *(factor * 1e-2 * np.array(MASSES[1:]))]
+    system = HamiltonianSystem.planets(masses, elements=ELEMENTS, G=GAUSS)
+    errors = []
+    for dt in (200.0, 100.0):
+        H = system.hamiltonian(solve(system, method, (0, 60_000.0), dt=dt).y.T)
+        errors.append(np.abs(H / H[0] - 1).max())
+    assert errors[0] < 1e-4 * factor
+    if errors[1] > 100 * EPS:
+        assert np.log2(errors[0] / errors[1]) > power - 0.7
+
+
+@pytest.mark.parametrize("order", CORRECTORS)
+def test_correctors_remove_errors_of_first_order_in_the_masses(order):
+    system = HamiltonianSystem.planets([1.0, 1e-6, 1e-6], elements={"a": [1.0, 1.6], "e": [0.05, 0.02], "M": [0, 2.0]})
+    errors = []
+    for dt in (0.2, 0.1):
+        sol = solve(system, "wisdom_holman", (0, 200.0), dt=dt, corrector=order)
+        H = system.hamiltonian(sol.y.T)
+        errors.append(np.abs(H / H[0] - 1).max())
+    plain = system.hamiltonian(solve(system, "wisdom_holman", (0, 200.0), dt=0.1).y.T)
+    assert errors[1] < 0.2 * np.abs(plain / plain[0] - 1).max()
+    assert errors[1] < 3e-14 or np.log2(errors[0] / errors[1]) > min(order, 7) - 1.2
+
+
+@pytest.mark.parametrize("order", CORRECTORS)
+def test_a_corrector_and_its_inverse(order):
+    there, back = corrector_maps(order), corrector_maps(order, -1)
+    assert sum(c for kind, c in there if kind == "kick") == pytest.approx(0, abs=1e-14)
+    assert np.allclose([-c for _, c in reversed(back)], [c for _, c in there], atol=1e-15)
+
+
+@pytest.mark.parametrize("options", [{}, {"corrector": 11}])
+def test_windows_stores_and_dense_outputs(options, tmp_path):
+    given = {"method": "wisdom_holman", "t_span": (0, 40_000.0), "dt": 50.0, **options}
+    whole = solve(GIANTS, save_every=20, **given)
+    stored = solve(GIANTS, save_every=20, store=tmp_path / "half", **{**given, "t_span": (0, 20_000.0)})
+    assert np.array_equal(stored.y, whole.y[:, : stored.y.shape[1]])
+    stored = solve(GIANTS, save_every=20, store=tmp_path / "half", resume=True, **given)
+    assert np.array_equal(stored.y, whole.y)
+    dense = solve(GIANTS, save_every=20, dense_output=True, **given)
+    assert np.array_equal(dense.sol(whole.t), whole.y)
+
+
+def test_momentum_and_angular_momentum_are_kept():
+    sol = solve(GIANTS, "kepler_aba864", (0, 400_000.0), dt=100.0, save_every=100)
+    q, p = (x.reshape(4, 3, -1) for x in (sol.y[:12], sol.y[12:]))
+    L = np.cross(q, p, axis=1).sum(0)
+    assert np.abs(p.sum(0)).max() < 1e-15 * np.abs(p).max() * 50
+    assert np.abs(L - L[:, :1]).max() < 1e-12 * np.linalg.norm(L[:, 0])
+    moving = GIANTS.y0 + np.concatenate([np.tile([1.0, 2.0, 3.0], 4), np.outer(MASSES, [1e-3, 0, 2e-3]).ravel()])
+    other = solve(GIANTS, "kepler_aba864", (0, 4000.0), dt=100.0, y0=moving)
+    still = solve(GIANTS, "kepler_aba864", (0, 4000.0), dt=100.0)
+    away = (other.y - still.y)[:12].reshape(4, 3, -1)
+    right = np.array([1.0, 2.0, 3.0])[:, None] + np.array([1e-3, 0, 2e-3])[:, None] * still.t
+    assert np.allclose(away, right, rtol=1e-11)
+
+
+def test_round_off_is_a_random_walk():
+    """After 4e5 steps the energy is off by rounding alone, beside ε² dt² of the corrected method."""
+    system = HamiltonianSystem.planets([1.0, 1e-9, 1e-9], elements={"a": [1.0, 1.7], "e": [0.1, 0.2], "M": [0, 2.0]})
+    H = system.hamiltonian(
+        solve(system, "wisdom_holman", dt=0.15, t_span=(0, 60_000.0), save_every=1000, corrector=17).y.T
+    )
+    assert np.abs(H / H[0] - 1).max() < 3 * np.sqrt(4e5) * EPS
+
+
+@pytest.mark.parametrize("backend", ["compiled", "array"])
+def test_an_encounter_ends_the_run(backend):
+    orbits = {"a": [1.0, 1.1], "M": [0.0, 1.0]}
+    system = HamiltonianSystem.planets([1.0, 1e-4, 1e-4], elements=orbits)
+    sol = solve(system, "wisdom_holman", (0, 2000.0), dt=0.2, save_every=100, backend=backend)
+    assert sol.status == -1
+    assert "`encounter` Hill radii" in sol.message
+    assert "splitting 'kinetic'" in sol.message
+    assert 0 < sol.stats["failed_at"] < 2000
+    if backend == "compiled":
+        assert "Bodies 1 and 2 were" in sol.message
+    free = HamiltonianSystem.planets([1.0, 1e-4, 1e-4], elements=orbits, encounter=None)
+    assert solve(free, "wisdom_holman", (0, 100.0), dt=0.2, backend=backend).status == 0
+
+
+def test_a_batch_reports_those_that_met():
+    system = HamiltonianSystem.planets([1.0, 1e-4, 1e-4], elements={"a": [1.0, 1.6], "M": [0.0, 1.0]})
+    close = HamiltonianSystem.planets([1.0, 1e-4, 1e-4], elements={"a": [1.0, 1.1], "M": [0.0, 1.0]})
+    sol = solve(system, "wisdom_holman", (0, 2000.0), dt=0.2, y0=np.stack([system.y0, close.y0]), save_every=1000)
+    assert sol.status.tolist() == [0, -1]
+
+
+def test_long_drifts_and_eccentric_orbits():
+    """Where the few corrections of the compiled drift do not do, the general solver does: as on arrays."""
+    system = HamiltonianSystem.planets(
+        [1.0, 1e-5, 1e-6], elements={"a": [1.0, 40.0], "e": [0.99, 0.9], "M": [3.0, 0.1]}
+    )
+    for dt in (0.1, 2.0, 40.0, -3.0):
+        t = np.sign(dt) * np.abs(dt) * np.arange(3)
+        runs = [
+            solve(system, "wisdom_holman", (0, t[-1]), dt=abs(dt), t_eval=t, backend=b).y for b in ("auto", "array")
+        ]
+        assert np.abs(runs[0] - runs[1]).max() < 1e-10
+
+
+OTHERS = ("srkn11b", "kahan_li8", "verlet", "dop853", "gauss_legendre6")
+
+
+@pytest.mark.parametrize("method", OTHERS)
+def test_other_methods_take_the_system_as_pairs(method):
+    pairs = HamiltonianSystem.pairs("-G*m1*m2/r", masses=MASSES, params={"G": GAUSS}, y0=GIANTS.y0, dt=50.0)
+    runs = [solve(s, method, (0, 3000.0), **({} if method == "dop853" else {"dt": 50.0})) for s in (GIANTS, pairs)]
+    assert np.array_equal(runs[0].y, runs[1].y)
+    near = solve(GIANTS, "kepler_aba1064", (0, 3000.0), dt=50.0).y[:, -1]
+    assert np.abs(runs[0].y[:, -1] - near)[:12].max() < (0.1 if method in ("verlet", "dop853") else 1e-6)
+
+
+def test_any_star_and_bodies_in_pairs_are_planets():
+    sol = solve(systems.outer_solar_system(), "kepler_aba864", (0, 20_000.0), dt=100.0)
+    assert np.abs(sol.energy_error()).max() < 1e-10
+
+
+def test_studies_and_ensembles(tmp_path):
+    report = compare(GIANTS, ["wisdom_holman", "srkn11b"], t_span=(0, 20_000.0))
+    assert {row.status for row in report.rows} == {"ok"}
+    y0 = GIANTS.y0 * np.linspace(1, 1.001, 5)[:, None]
+    found = ensemble(GIANTS, "wisdom_holman", y0=y0, t_span=(0, 5000.0), dt=50.0)
+    alone = solve(GIANTS, "wisdom_holman", (0, 5000.0), dt=50.0, y0=y0[3])
+    assert np.array_equal(np.asarray(found.y)[3][..., -1], alone.y[:, -1])
+    assert sympflow.symplecticity_defect(solve(GIANTS, "wisdom_holman", (0, 500.0), dt=50.0)) < 1e-9
+
+
+# bad input ---------------------------------------------------------------------------------------------------------
+
+BAD = [
+    ({"masses": [1e-3, 1.0]}, "`masses` must begin with the star"),
+    ({"masses": [1.0]}, "`masses` must be those of a star and one planet"),
+    ({"masses": [1.0, -1e-3, 1e-3, 0.1]}, "`masses` must be positive"),
+    ({"elements": None}, "`elements` or `y0`"),
+    ({"y0": np.zeros(24)}, "`elements` or `y0`"),
+    ({"elements": None, "y0": np.zeros(7)}, "`y0` must be a finite state"),
+    ({"elements": {"a": [1, 2, 3], "omega": 0.1}}, "`elements` has 'omega'"),
+    ({"elements": {"a": [1, 2]}}, "`elements` must give a, e, inc"),
+    ({"elements": {"a": [1, 2, 3], "e": [0.1, -0.2, 0]}}, "`elements` of planet 2 .* negative"),
+    ({"elements": {"a": [1, 2, 3], "e": [0.1, 1.2, 0]}}, "`elements` of planet 2 .* wrong sign"),
+    ({"elements": {"a": [1, 2, 3], "inc": [7.0, 0, 0]}}, "`elements` of planet 1 .* radians"),
+    ({"elements": {"a": [1, 2, np.nan]}}, "`elements` of planet 3 .* finite"),
+    ({"G": -1.0}, "`G` must be positive"),
+    ({"units": "AU, day, solar mass"}, "`units` tell what `G` is"),
+    ({"G": None, "units": "AU, day"}, "`units` must be names of a length"),
+    ({"G": None, "units": ("AU", "fortnight", "kg")}, "`units` has 'fortnight'"),
+    ({"coordinates": "heliocentric"}, "`coordinates` must be 'jacobi' or 'democratic'"),
+    ({"encounter": -1}, "`encounter` must be positive"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), BAD)
+def test_bad_arguments(options, message):
+    given = {"masses": MASSES, "elements": ELEMENTS, "G": GAUSS, **options}
+    with pytest.raises(ValueError, match=message):
+        HamiltonianSystem.planets(given.pop("masses"), **given)
+
+
+MOON = HamiltonianSystem.planets(
+    [1.0, 3e-6, 4e-8], elements={"a": [1.0, 1.0025], "M": [0.0, 0.0], "e": [0.0, 0.0317]}, G=GAUSS
+)
+
+
+@pytest.mark.parametrize(
+    ("system", "method", "options", "message"),
+    [
+        (systems.henon_heiles(), "wisdom_holman", {}, "`method` 'wisdom_holman' is for planets about a star"),
+        (systems.three_body(), "kepler_aba864", {}, "is for planets about a star"),
+        (GIANTS, "wisdom_holman", {"corrector": 4}, "`corrector` must be an order"),
+        (GIANTS, "kepler_aba864", {"corrector": 17}, "`corrector` goes with the steps of 'wisdom_holman'"),
+        (GIANTS, "leapfrog", {"corrector": 17}, "`corrector` is for the splitting 'kepler'"),
+        (GIANTS, "wisdom_holman", {"compensated": True}, "`compensated` sums are for the splitting 'kinetic'"),
+        (GIANTS, "chin4a", {"splitting": "kepler"}, "`splitting` 'kepler' has plain kicks"),
+    ],
+)
+def test_where_the_splitting_has_no_meaning(system, method, options, message):
+    with pytest.raises(ValueError, match=message):
+        solve(system, method, (0, 10.0), **options)
+
+
+@pytest.mark.parametrize(
+    ("units", "G"),
+    [
+        ("AU, day, solar mass", 2.959122082856e-4),
+        (("AU", "year", "solar mass"), 39.476926421373),
+        ("m, s, kg", 6.67430e-11),
+        ("km, s, Earth mass", 3.986004e5),
+    ],
+)
+def test_units(units, G):
+    system = HamiltonianSystem.planets([10.0, 1.0], elements={"a": 1.0}, units=units)
+    assert system.params["G"] == pytest.approx(G, rel=1e-8)
