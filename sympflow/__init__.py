@@ -52,6 +52,10 @@ _HOME = {
     "poincare_section": "studies.poincare",
     "energy_error": "metrics.energy",
     "max_energy_error": "metrics.energy",
+    "angular_momentum": "metrics.elements",
+    "elements": "metrics.elements",
+    "momentum": "metrics.elements",
+    "states_of_elements": "metrics.elements",
     "energy_drift": "metrics.energy",
     "energy_growth": "metrics.energy",
     "energy_balance_error": "metrics.energy_balance",
@@ -116,6 +120,10 @@ if TYPE_CHECKING:
     from sympflow.metrics.chaos import gali as gali
     from sympflow.metrics.chaos import lyapunov as lyapunov
     from sympflow.metrics.chaos import sali as sali
+    from sympflow.metrics.elements import angular_momentum as angular_momentum
+    from sympflow.metrics.elements import elements as elements
+    from sympflow.metrics.elements import momentum as momentum
+    from sympflow.metrics.elements import states_of_elements as states_of_elements
     from sympflow.metrics.energy import energy_drift as energy_drift
     from sympflow.metrics.energy import energy_error as energy_error
     from sympflow.metrics.energy import energy_growth as energy_growth

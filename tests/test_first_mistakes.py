@@ -91,7 +91,7 @@ ANSWERED = {
     ),
     "yoshida": (lambda: sympflow.get("yoshida"), ValueError, "'yoshida4' or 'yoshida6'"),
     "ruth3": (lambda: sympflow.get("ruth3"), ValueError, "'yoshida4'"),
-    "whfast": (lambda: sympflow.get("whfast"), ValueError, "'log_kahan_li8'"),
+    "whfast": (lambda: sympflow.get("whfast"), ValueError, "'wisdom_holman'"),
     "Radau": (lambda: sympflow.get("Radau"), ValueError, "'gauss_legendre6', which is implicit"),
     "LSODA": (lambda: sympflow.get("LSODA"), ValueError, "'gauss_legendre6', which is implicit"),
     "kinds": (lambda: sympflow.get("nothing"), ValueError, r"(?s)unknown.*separable H +'verlet'.*Runge–Kutta .*'rk45'"),

@@ -32,6 +32,16 @@ def test_a_verlet_solve_loads_sympy_only(backend):
     assert loaded_after(code) == {"sympy"}
 
 
+def test_traced_functions_of_numpy_load_nothing_heavy():
+    code = (
+        "import sympflow\nimport numpy as np\n"
+        "system = sympflow.HamiltonianSystem(lambda q: np.cos(q).sum(-1), ndof=2, y0=[0.1, 0.2, 0.3, 0.4])\n"
+        "for method in ('verlet', 'srkn11b', 'gauss_legendre4', 'rk4'):\n"
+        "    assert sympflow.solve(system, method, (0, 1), dt=0.1).stats['backend'] == 'compiled'"
+    )
+    assert loaded_after(code) == set()
+
+
 @pytest.mark.parametrize(
     "code",
     [

@@ -88,4 +88,15 @@ class Number:
     def __bool__(self) -> bool:
         raise TypeError("a number that is traced has no value yet: write where(condition, a, b) in place of a branch.")
 
-    __float__ = __int__ = __index__ = __bool__
+    def __float__(self) -> float:
+        raise TypeError("a number that is traced has no value yet: write np.cos for math.cos, and no float().")
+
+    __int__ = __index__ = __float__
+
+
+_OF_NUMPY = {
+    **{name: name for name in ("exp", "expm1", "log", "log1p", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{f"arc{name}": f"a{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+}
+for _name, _function in _OF_NUMPY.items():  # which loops of NumPy over objects call
+    setattr(Number, _name, lambda self, _function=_function: self.apply(_function, (self,)))

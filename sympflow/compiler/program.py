@@ -24,6 +24,9 @@ class Traced(Number):
         self.recording, self.name, self.args, self.order = recording, name, args, order
 
     def apply(self, name: str, args: Sequence[Any]) -> Any:
+        if any(isinstance(x, np.ndarray) for x in args):  # of objects
+            arrays = [np.asarray(x, dtype=object) for x in args]
+            return np.frompyfunc(lambda *x: apply(name, *x), len(args), 1)(*arrays)
         return self.recording.record(name, args)
 
     def __repr__(self) -> str:
@@ -202,11 +205,34 @@ class Program:
     def __len__(self) -> int:
         return len(self.operations)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The operations in a row: a graph of them may be too deep to be pickled."""
+        place = {x.order: i for i, x in enumerate((*self.inputs, *self.operations))}
+
+        def plain(args: Sequence[Any]) -> list[Any]:
+            return [place[a.order] if isinstance(a, Traced) else a for a in args]
+
+        operations = [(x.name, plain(x.args)) for x in self.operations]
+        return _restored, ([repr(x) for x in self.inputs], operations, plain(self.outputs))
+
     def __str__(self) -> str:
         lines = [f"{x!r} = {_written(x)}" for x in self.operations]
         return "\n".join(
             [f"({', '.join(map(repr, self.inputs))}) →", *lines, f"→ ({', '.join(map(repr, self.outputs))})"]
         )
+
+
+def _restored(names: Sequence[str], operations: Sequence[Any], outputs: Sequence[Any]) -> Program:
+    recording = Recording()
+    numbers: list[Any] = [recording.input(name) for name in names]
+    inputs = list(numbers)
+
+    def given(args: Sequence[Any]) -> list[Any]:
+        return [numbers[a] if isinstance(a, int) else a for a in args]
+
+    for name, args in operations:
+        numbers.append(recording.record(name, given(args)))
+    return Program(inputs, given(outputs))
 
 
 def _written(x: Traced) -> str:

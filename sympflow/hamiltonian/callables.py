@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -13,15 +14,214 @@ import numpy as np
 
 from sympflow.arguments import check_flag
 from sympflow.arrays import Array, differentiable, is_tensor, library, stack, to_numpy, unfollowed, values
+from sympflow.compiler.tracing import Untraceable, trace
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.function_checks import Tested, check_writes, test
+from sympflow.hamiltonian.formulas import TracedHamiltonian
+from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
+from sympflow.hamiltonian.times import probe_times
+
+MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays
+TRIED = 6  # states at which a traced function is compared with itself
+CLOSE = 1e-9  # of the largest value
 
 
-class CallableHamiltonian(Definition):
+class Functions(Definition):
+    """A user's functions of V(q) or H(q, p), as a program where they can be traced: `form`.
+
+    They are traced when they are first used, and compared by value with the program.
+
+    Attributes
+    ----------
+    library : str
+        "numpy" or "torch", whose arrays the functions take; "" if they fail on both.
+    untraced : str
+        Why there is no program, a clause; "" if there is one.
+    """
+
+    library: str = ""
+    untraced: str = ""
+    _scene: tuple[Any, ...] = (None, None, None, (0.0, 1.0))
+    _functions: tuple[Any, Any, Any, Any]
+
+    @property
+    def given_functions(self) -> bool:  # type: ignore[override]
+        return self.numba_functions is None
+
+    def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
+        self._scene = y0, domain, inverse_mass, t_span
+
+    @cached_property
+    def form(self) -> TracedHamiltonian | None:  # type: ignore[override]
+        if self.numba_functions is not None:
+            self.untraced = "it is a Numba function"
+            return None
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            try:
+                return self._traced()
+            except Untraceable as reason:
+                self.untraced = str(reason)
+                return None
+
+    @property
+    def _name(self) -> str:
+        return "potential" if self.separable else "hamiltonian"
+
+    @property
+    def _given_function(self) -> Callable[..., Any]:
+        V, H, *_ = self._functions
+        return V if self.separable else H
+
+    def _traced(self) -> TracedHamiltonian:
+        """The program, compared with the functions."""
+        y0, domain, inverse_mass, t_span = self._scene
+        states = probe_states(y0, domain, 2 * self.ndof)
+        states = np.concatenate([states[:: -(-len(states) // (TRIED - 1))], states[-1:]])
+        times = np.resize(probe_times(*t_span), len(states)).tolist()
+        values, f = self._values(states, times), self._given_function
+        d = self.ndof
+        names: list[Any] = [[f"{letter}{i + 1}" for i in range(d)] for letter in "qp"[: 2 - self.separable]]
+        program = trace(f, ["t", *names] if self.timed else names, self.library == "torch")
+        form = TracedHamiltonian(d, program, self.separable, inverse_mass, self.timed)
+        at = (np.array(times),) if self.timed else ()
+        x = states[:, :d] if self.separable else states
+        if not np.isfinite(values).any():
+            raise Untraceable("it is not finite at the states at which it was tried: give `y0`")
+        if not _alike(form.value(x, *at), values):
+            raise Untraceable("the values of what was traced are others: it depends on more than its arguments")
+        self._compare_given(form, x, times)
+        return form
+
+    def _values(self, states: np.ndarray, times: Sequence[float]) -> np.ndarray:
+        """The function's own values at states, NaN where it fails; finds out which library it is written for."""
+        for name in ("numpy", *(("torch",) if "torch" in sys.modules else ())):
+            self.library, failure, found = name, "", []
+            for y, t in zip(states, times, strict=True):
+                try:
+                    value = self._single(self._given_function, y, t)
+                except Exception as error:  # whatever a user's function raises
+                    failure = (
+                        failure or f"{type(error).__name__}: {str(error).splitlines()[0][:160] if str(error) else ''}"
+                    )
+                    value = np.nan
+                if is_tensor(value) != (name == "torch"):
+                    failure, value = failure or "its result is none of NumPy's", np.nan
+                try:
+                    found.append(float(value))
+                except (TypeError, ValueError, RuntimeError):
+                    found.append(np.nan)
+            if not failure or np.isfinite(found).any():
+                return np.array(found)
+        self.library = ""
+        raise Untraceable(f"it fails on an array ({failure})")
+
+    def _single(self, function: Callable[..., Any], y: np.ndarray, t: float, *more: np.ndarray) -> Any:
+        """A function at one state, in its library."""
+        q, p = y[: self.ndof], y[self.ndof :]
+        given: list[Any] = [np.array(x) for x in ((q, *more) if self.separable else (q, p))]
+        if self.library == "torch":
+            import torch
+
+            with torch.no_grad():
+                return function(
+                    *((torch.tensor(t, dtype=torch.float64),) if self.timed else ()), *map(torch.tensor, given)
+                )
+        for x in given:
+            x.flags.writeable = False
+        return function(*((t,) if self.timed else ()), *given)
+
+    def _compare_given(self, form: TracedHamiltonian, q: np.ndarray, times: Sequence[float]) -> None:
+        """Compare a given gradient and product with those of the program."""
+        *_, gradient, product = self._functions
+        for name, function, more in (("gradient", gradient, ()), ("hessian_vector", product, (q[::-1],))):
+            if function is None:
+                continue
+            exact = getattr(form, name)(q, *more, *((np.array(times),) if self.timed else ()))
+            try:
+                given = zip(q, times, *more, strict=True)
+                rows = [self._single(function, x, t, *v) for x, t, *v in given]
+                found = np.stack([to_numpy(row) if is_tensor(row) else np.asarray(row, dtype=float) for row in rows])
+            except Exception as error:  # whatever a user's function raises
+                raise Untraceable(f"`{name}` fails where `{self._name}` does not ({error})") from error
+            if found.shape != exact.shape or not _alike(found, exact):
+                raise Untraceable(f"`{name}` is not exactly that of `{self._name}`: leave it out")
+
+    def check_unchanged(self, y: Array) -> None:
+        """Raise a ValueError if the function has other values than when it was traced."""
+        form = self.form
+        if form is None:
+            return
+        first = to_numpy(y).reshape(-1, 2 * self.ndof)[:1].astype(float) if math.prod(y.shape) else np.zeros((0, 0))
+        t_span, d = self._scene[3], self.ndof
+        for state in [*first, *probe_states(None, None, 2 * d)[:1]]:
+            t = t_span[0]
+            with warnings.catch_warnings(), np.errstate(all="ignore"):
+                warnings.simplefilter("ignore")
+                try:
+                    value = float(self._single(self._given_function, state, t))
+                except Exception:  # whatever a user's function raises
+                    continue
+                expected = float(form.value(state[:d] if self.separable else state, *((t,) if self.timed else ())))
+            if not _alike(np.array([value]), np.array([expected])):
+                raise ValueError(
+                    f"`{self._name}` has other values than when it was traced, {value:g} in place of {expected:g} at "
+                    f"the state {state[:8]}: it reads something that has changed since. Make a new HamiltonianSystem."
+                )
+
+    def _exact(self, x: Array) -> TracedHamiltonian | None:
+        """The program, where it gives derivatives for x: torch differentiates functions of its own tensors itself."""
+        form = self.form
+        if form is None or (is_tensor(x) and self._follows_tensors):
+            return None
+        return form if self.library == "numpy" or form.size <= MOST_BY_ARRAYS else None
+
+    @cached_property
+    def _follows_tensors(self) -> bool:
+        """True if torch differentiates the functions, with the result that the program has."""
+        if self.library == "torch" or self.form is None:
+            return self.library == "torch"
+        import torch
+
+        d, t, f = self.ndof, self._scene[3][0], self._given_function
+        state = probe_states(None, None, 2 * d)[0, : d * (2 - self.separable)]
+
+        def value(x: Array) -> Any:
+            times = (torch.tensor(t, dtype=torch.float64),) if self.timed else ()
+            return f(*times, *((x,) if self.separable else (x[:d], x[d:])))
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                found = to_numpy(torch.func.grad(value)(torch.tensor(state)))
+            except Exception:  # whatever a user's function raises
+                return False
+        return _alike(found, self.form.gradient(state, *((t,) if self.timed else ())))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the program, which is traced again."""
+        return {
+            name: value
+            for name, value in vars(self).items()
+            if name not in ("form", "takes_tensors", "_follows_tensors")
+        }
+
+
+def _alike(found: np.ndarray, expected: np.ndarray) -> bool:
+    """True of equal values, but for rounding, NaN and infinite ones in the same places."""
+    finite = np.isfinite(expected)
+    if not (finite == np.isfinite(found)).all():
+        return False
+    size = np.abs(expected[finite]).max(initial=0.0)
+    return bool((np.abs(found[finite] - expected[finite]) <= CLOSE * size).all())
+
+
+class CallableHamiltonian(Functions):
     """The functions of a system given by V(q) or H(q, p). See `HamiltonianSystem` for the arguments."""
 
     time: float | None = None
     """The time at which those of a driven system are taken, for messages."""
+    traced: bool = False
+    """True of those at a time, of a driven system that was traced."""
 
     def __init__(
         self,
@@ -40,13 +240,20 @@ class CallableHamiltonian(Definition):
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
         self.ndof, self.given = ndof, bool(check)
         self.separable = potential is not None
-        self.has_hessian_vector = gradient is None or hessian_vector is not None
+        self._functions = potential, hamiltonian, gradient, hessian_vector
         self._potential, self._hamiltonian = potential, hamiltonian
         self._gradient, self._hessian_vector = gradient, hessian_vector
-        self.differentiates_itself = gradient is None and hessian_vector is None
         if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector)
             self.take_numba(potential, gradient, hessian_vector)
+
+    @classmethod
+    def at_time(cls, driven: DrivenCallables, functions: Sequence[Any]) -> CallableHamiltonian:
+        """The functions of a driven system at one time, which are not traced again."""
+        now = cls(driven.ndof, *functions)
+        now.given = driven.given
+        now.form, now.library = None, driven.library
+        return now
 
     def take_numba(self, potential: Any, gradient: Any, hessian_vector: Any | None) -> None:
         """Take Numba functions of single states."""
@@ -55,11 +262,23 @@ class CallableHamiltonian(Definition):
         self._potential, self._gradient = arrays.potential, arrays.gradient
         self._hessian_vector = None if hessian_vector is None else arrays.hessian_vector
 
+    @property
+    def has_hessian_vector(self) -> bool:  # type: ignore[override]
+        return self._gradient is None or self._hessian_vector is not None or self.form is not None
+
+    @property
+    def has_third_derivative(self) -> bool:  # type: ignore[override]
+        return self.form is not None and self.library == "numpy"
+
+    @property
+    def differentiates_itself(self) -> bool:  # type: ignore[override]
+        return self._gradient is None and self._hessian_vector is None and not self.has_third_derivative
+
     def identity_parts(self) -> Any:
-        return [self.ndof, self._potential, self._hamiltonian, self._gradient, self._hessian_vector]
+        return [self.ndof, *self._functions]
 
     def learns(self, y: Array) -> bool:
-        if self.numba_functions is not None:
+        if self.numba_functions is not None or self.form is not None:
             return False
         y = unfollowed(y)
         try:
@@ -70,13 +289,18 @@ class CallableHamiltonian(Definition):
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
-        if self.differentiates_itself and not is_tensor(like):
+        traced = self.traced or self.form is not None
+        if traced and self.library == "numpy" and (is_tensor(like) or self._gradient is None):
+            like = np.empty(0)
+        if self.differentiates_itself and not is_tensor(like) and not (traced and self.library == "numpy"):
             import torch
 
             like = torch.from_numpy(np.empty(0, like.dtype))
+        exact = traced and self._gradient is None
         if not self.separable:
             names = "hamiltonian", "gradient", "[q, p]"
-            functions = Tested(names, self.hamiltonian, self.gradient, None, True, 2, self._result_types, self.time)
+            gradient = None if exact else self.gradient
+            functions = Tested(names, self.hamiltonian, gradient, None, True, 2, self._result_types, self.time)
             test(functions, states, like, n_given)
             return
         if self.numba_functions is not None:
@@ -88,10 +312,8 @@ class CallableHamiltonian(Definition):
             like = np.empty(0)
         names = "potential", "gradient", "q"
         product = None if self._hessian_vector is None else self.hessian_vector
-        automatic = self._gradient is None
-        functions = Tested(
-            names, self.potential, self.potential_gradient, product, automatic, 1, self._result_types, self.time
-        )
+        automatic, slope = self._gradient is None, None if exact else self.potential_gradient
+        functions = Tested(names, self.potential, slope, product, automatic, 1, self._result_types, self.time)
         test(functions, states[:, : self.ndof], like, n_given)
 
     def _result_types(self, x: Array) -> list[tuple[str, Any]]:
@@ -99,15 +321,17 @@ class CallableHamiltonian(Definition):
         if self.numba_functions is not None:
             return []
         if not self.separable:
-            return [("hamiltonian", self._H(x).dtype)]
+            return [("hamiltonian", getattr(self._H(x), "dtype", None))]
         functions = ("potential", self._potential), ("gradient", self._gradient)
         return [(name, getattr(f(x), "dtype", None)) for name, f in functions if f is not None]
 
     @cached_property
     def takes_tensors(self) -> bool:  # type: ignore[override]
         """False if the gradient fails on a tensor, or answers with something else or NumPy's warnings."""
-        if self._gradient is None or self.numba_functions is not None:
+        if self.form is not None:
             return True
+        if self._gradient is None or self.numba_functions is not None:
+            return self.library != "numpy"
         import torch
 
         with warnings.catch_warnings():
@@ -117,14 +341,29 @@ class CallableHamiltonian(Definition):
             except Exception:  # whatever a user's function raises
                 return False
 
+    def _value(self, f: Callable[[Array], Any], x: Array, name: str) -> Array:
+        """V or H of x by the function itself, but for tensors that it does not take."""
+        if is_tensor(x) and (form := self._exact(x)) is not None:
+            return form.value(x)
+        if self._gradient is not None or (self.library == "numpy" and not is_tensor(x)):
+            return _checked(self._protected(f, name, x), x, name, ())
+        return _with_torch(f, x, name, (), self.untraced)
+
+    def _derived(self, name: str, make: Callable[..., Any], f: Any, x: Array, tail: tuple[int, ...]) -> Array:
+        """A derivative of V or H at x: by the program, or of a function of tensors by torch."""
+        form = self._exact(x)
+        if form is not None:
+            return getattr(form, name)(x)
+        return _with_torch(make(f, self._name), x, self._name, tail, self.untraced)
+
     def hamiltonian(self, y: Array) -> Array:
-        return _with_torch(self._H, y, "hamiltonian", ())
+        return self._value(self._H, y, "hamiltonian")
 
     def gradient(self, y: Array) -> Array:
-        return _with_torch(_gradient_of(self._H, "hamiltonian"), y, "hamiltonian", (2 * self.ndof,))
+        return self._derived("gradient", _gradient_of, self._H, y, (2 * self.ndof,))
 
     def hessian(self, y: Array) -> Array:
-        return _with_torch(_hessian_of(self._H, "hamiltonian"), y, "hamiltonian", (2 * self.ndof, 2 * self.ndof))
+        return self._derived("hessian", _hessian_of, self._H, y, (2 * self.ndof, 2 * self.ndof))
 
     def _H(self, y: Array) -> Array:
         assert self._hamiltonian is not None
@@ -132,15 +371,12 @@ class CallableHamiltonian(Definition):
 
     def potential(self, q: Array) -> Array:
         assert self._potential is not None
-        if self._gradient is not None:
-            return _checked(self._protected(self._potential, "potential", q), q, "potential", ())
-        return _with_torch(self._potential, q, "potential", ())
+        return self._value(self._potential, q, "potential")
 
     def potential_gradient(self, q: Array) -> Array:
-        if self._gradient is not None:
-            return _checked(self._protected(self._gradient, "gradient", q), q, "gradient", (self.ndof,))
-        assert self._potential is not None
-        return _with_torch(_gradient_of(self._potential, "potential"), q, "potential", (self.ndof,))
+        if self._gradient is None or (is_tensor(q) and self._exact(q) is not None):
+            return self._derived("gradient", _gradient_of, self._potential, q, (self.ndof,))
+        return _checked(self._protected(self._gradient, "gradient", q), q, "gradient", (self.ndof,))
 
     def _protected(self, function: Callable[..., Any], name: str, *states: Array) -> Any:
         """The user's function of arrays that it cannot write into, for they are the state of the run."""
@@ -164,23 +400,32 @@ class CallableHamiltonian(Definition):
             raise ValueError(f"{refused}, q.copy() ({error}).") from error
 
     def hessian_vector(self, q: Array, v: Array) -> Array:
+        form = self._exact(q)
+        if form is not None and (self._hessian_vector is None or is_tensor(q)):
+            return form.hessian_vector(q, v)
         if self._hessian_vector is None:
             return super().hessian_vector(q, v)
         return self._protected(self._hessian_vector, "hessian_vector", q, v)
 
+    def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
+        assert self.form is not None
+        return self.form.third_derivative(q, v, w)
+
     def potential_hessian(self, q: Array) -> Array:
+        if self._exact(q) is not None:
+            return self._derived("hessian", _hessian_of, self._potential, q, ())
         if self._hessian_vector is not None:
             columns = [self._protected(self._hessian_vector, "hessian_vector", q, e) for e in _basis(q)]
             return stack([_checked(column, q, "hessian_vector", (self.ndof,)) for column in columns])
         if self._gradient is not None and not is_tensor(q):
             raise ValueError(
                 "`hessian_vector` is needed here (force-gradient methods, volume and symplecticity metrics) and was "
-                "not given: pass it to HamiltonianSystem, or write `potential` with torch and leave `gradient` out."
+                "not given: pass it to HamiltonianSystem, or write `potential` so that it can be traced and leave "
+                f"`gradient` out; it was not, for {self.untraced}."
             )
         if self._gradient is not None:
             return _jacobian(self._gradient, q)
-        assert self._potential is not None
-        return _with_torch(_hessian_of(self._potential, "potential"), q, "potential", (self.ndof, self.ndof))
+        return self._derived("hessian", _hessian_of, self._potential, q, (self.ndof, self.ndof))
 
 
 def _check_callable(**functions: Any) -> None:
@@ -248,7 +493,7 @@ def _jacobian(f: Callable[[Array], Array], x: Array) -> Array:
     return torch.stack([jvp(f, x, e)[1] for e in _basis(x)], dim=-1)
 
 
-def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...]) -> Array:
+def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], untraced: str = "") -> Array:
     """f(x) for a function written with torch; NumPy arrays go through tensors that share their memory."""
     import torch
 
@@ -259,9 +504,10 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
     except (TypeError, RuntimeError, AttributeError, IndexError) as error:
         if isinstance(error, RecursionError) or str(error).startswith(f"`{name}` must"):
             raise
+        traced = f", and could not be traced, for {untraced}" if untraced else ""
         raise TypeError(
-            f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}). Write it with torch functions of "
-            "(..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
+            f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}){traced}. Write it with NumPy's or "
+            "torch's functions of (..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
         ) from error
     if tensor._version != version:
         raise ValueError(f"`{name}` writes into its argument, the state of the run: let it work on a copy, q.clone().")
@@ -295,7 +541,7 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
     return value.astype(x.dtype, copy=False)
 
 
-class DrivenCallables(Definition):
+class DrivenCallables(Functions):
     """The functions of a driven system, H(t, q, p), each with the time as its first argument.
 
     A user's function is called with one time, a number: as a float beside arrays, and as a tensor of one double beside
@@ -321,24 +567,37 @@ class DrivenCallables(Definition):
         if _is_numba(gradient):
             _check_numba(potential, gradient, hessian_vector, "t, ")
             self.numba_functions = (potential, gradient, hessian_vector)
-        self.ndof, self.check_given = ndof, check
-        now = self._at(0.0)
-        self.given, self.separable = now.given, now.separable
-        self.has_hessian_vector, self.differentiates_itself = now.has_hessian_vector, now.differentiates_itself
+        check_flag("check", check)
+        self.ndof, self.given, self.separable = ndof, bool(check), potential is not None
+        self._at(0.0)  # which refuses what does not fit
+
+    @property
+    def has_hessian_vector(self) -> bool:  # type: ignore[override]
+        return self._functions[2] is None or self._functions[3] is not None or self.form is not None
+
+    @property
+    def has_third_derivative(self) -> bool:  # type: ignore[override]
+        return self.form is not None and self.library == "numpy"
+
+    @property
+    def differentiates_itself(self) -> bool:  # type: ignore[override]
+        return self._functions[2] is None and self._functions[3] is None and not self.has_third_derivative
 
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions]
 
     def _at(self, t: Any) -> CallableHamiltonian:
         """The functions at one time."""
-        V, H, slope, product = (None if f is None else _AtTime(f, t) for f in self._functions)
-        now = CallableHamiltonian(self.ndof, V, H, slope, product, bool(self.check_given))
+        now = CallableHamiltonian.at_time(self, [None if f is None else _AtTime(f, t) for f in self._functions])
         if self.numba_functions is not None:
             now.take_numba(*(None if f is None else _AtTime(f, float(t)) for f in self.numba_functions))
         return now
 
     def _over_times(self, name: str, t: Any, *states: Array) -> Array:
         """A function of `CallableHamiltonian` of states (..., k), each at its time."""
+        form, of_form = self._exact(states[0]), _OF_FORM.get(name)
+        if form is not None and (of_form or is_tensor(states[0])):
+            return getattr(form, of_form or "value")(*states, t)
         if not getattr(t, "ndim", 0):
             return getattr(self._at(t), name)(*states)
         flat = [x.reshape(-1, x.shape[-1]) for x in states]
@@ -359,18 +618,19 @@ class DrivenCallables(Definition):
         return result.reshape(*t.shape, *result.shape[1:])
 
     def learns(self, y: Array) -> bool:
-        return self._at(0.0).learns(y)
+        return self.form is None and self._at(0.0).learns(y)
 
     def check(self, states: np.ndarray, like: Array, n_given: int, times: np.ndarray | None = None) -> None:
         """Test them at each of the times (n,)."""
+        traced = self.form is not None
         for t in (0.0,) if times is None else times.tolist():
             now = self._at(t)
-            now.time = t
+            now.time, now.traced = t, traced
             now.check(states, like, n_given)
 
     @cached_property
     def takes_tensors(self) -> bool:  # type: ignore[override]
-        return self._at(0.0).takes_tensors
+        return self.form is not None or self._at(0.0).takes_tensors
 
     def hamiltonian(self, y: Array, t: Any) -> Array:
         return self._over_times("hamiltonian", t, y)
@@ -393,9 +653,15 @@ class DrivenCallables(Definition):
     def hessian_vector(self, q: Array, v: Array, *t: Any) -> Array:
         return self._over_times("hessian_vector", *t, q, v)
 
+    def third_derivative(self, q: Array, v: Array, w: Array, *t: Any) -> Array:
+        assert self.form is not None
+        return self.form.third_derivative(q, v, w, *t)
+
     def time_derivative(self, y: Array, t: Any) -> Array:
         """∂H/∂t (...): of functions that torch differentiates by that, of others by differences of order 6."""
         states, name = (y[..., : self.ndof], "potential") if self.separable else (y, "hamiltonian")
+        if (form := self._exact(y)) is not None:
+            return form.time_derivative(states, t)
 
         def value(s: Any) -> Array:
             return self._over_times(name, s, states)
@@ -412,6 +678,14 @@ class DrivenCallables(Definition):
         return _time_difference(value, t)
 
 
+_OF_FORM = {
+    "gradient": "gradient",
+    "hessian": "hessian",
+    "potential_gradient": "gradient",
+    "potential_hessian": "hessian",
+    "hessian_vector": "hessian_vector",
+}
+"""Those of a form, by those of functions."""
 _ARGUMENTS = {"potential": "t, q", "hamiltonian": "t, q, p", "gradient": "t, q", "hessian_vector": "t, q, v"}
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from sympflow.arrays import Array
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.formulas import TracedHamiltonian
     from sympflow.hamiltonian.poles import Poles
 
 
@@ -51,6 +52,12 @@ class Definition:
         Those of H, DiracDelta in t, if it has some: then there are `between_impulses` and `kicks`.
     leaps : bool
         True if bodies may meet, over which a step may leap: then there is `leapt`.
+    form : TracedHamiltonian or None
+        The program of functions that could be traced: see `sympflow.hamiltonian.formulas`.
+    given_functions : bool
+        True if H is given by functions of Python, which are traced where that is possible.
+    untraced : str
+        Why functions could not be traced, a clause, once `form` was asked for.
     poles : Poles or None
         The places that a step may leap over at which H as it is written is infinite or no number.
     """
@@ -70,6 +77,9 @@ class Definition:
     leaps: bool = False
     impulses: tuple[Any, ...] = ()
     poles: Poles | None = None
+    form: TracedHamiltonian | None = None
+    untraced: str = ""
+    given_functions: bool = False
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
@@ -88,6 +98,12 @@ class Definition:
     def has_period(self, period: float) -> bool | None:
         """Return True if H, up to a function of t alone, has a period in t; None where its values are to be tried."""
         return None
+
+    def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
+        """Take what a system knows beside its functions, with which they are traced."""
+
+    def check_unchanged(self, y: Array) -> None:
+        """Raise a ValueError if a function has other values than when it was traced."""
 
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""

@@ -88,6 +88,8 @@ class Tested:
     ----------
     names : (str, str, str)
         Those of the functions, and of the state, in messages.
+    gradient : callable, optional
+        None of an exact one, of a function that was traced.
     automatic : bool
         True if the gradient is an automatic one.
     parts : int
@@ -100,7 +102,7 @@ class Tested:
 
     names: tuple[str, str, str]
     value: Callable[[Array], Array]
-    gradient: Callable[[Array], Array]
+    gradient: Callable[[Array], Array] | None
     hessian_vector: Callable[[Array, Array], Array] | None = None
     automatic: bool = False
     parts: int = 1
@@ -130,7 +132,8 @@ def test(functions: Tested, states: np.ndarray, like: Array, n_given: int) -> No
         _check_types(functions, x)
         _check_repetition(functions, x, V, g)
         _check_batches(functions, x, V, g)
-        _check_gradient(functions, x, V, g)
+        if functions.gradient is not None:
+            _check_gradient(functions, x, V, g)
         if functions.hessian_vector is not None:
             _check_hessian_vector(functions, x, g)
 
@@ -157,7 +160,8 @@ def _evaluated(functions: Tested, x: Array, n_given: int) -> tuple[Array, np.nda
     rows, values, slopes = [], [], []
     for i in range(len(x)):
         try:
-            V, g = functions.value(x[i]), functions.gradient(x[i])
+            V = functions.value(x[i])
+            g = functions.gradient(x[i]) if functions.gradient is not None else V
         except Exception:
             if i < n_given:
                 raise
@@ -188,6 +192,8 @@ def _check_repetition(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray)
         (functions.names[0], functions.value, V[0]),
         (functions.names[1], functions.gradient, g[0]),
     ):
+        if function is None:
+            continue
         again = _numbers(function(x[0]))
         if not np.allclose(again, before, rtol=1e-6, atol=1e-12 * np.abs(before).max(), equal_nan=True):
             raise ValueError(
@@ -205,6 +211,8 @@ def _check_batches(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) ->
         (functions.names[0], functions.value, V),
         (functions.names[1], functions.gradient, g),
     ):
+        if function is None:
+            continue
         batch, expected = _numbers(function(x[rows])), single[rows]
         if batch.shape != expected.shape:
             raise ValueError(
@@ -343,6 +351,7 @@ def _refuse(functions: Tested, state: Array, k: int, given: float, found: float,
 
 def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
     assert functions.hessian_vector is not None
+    assert functions.gradient is not None
     v = _vectors(x)
     claimed = _products(functions, x, v)
     batch = _numbers(functions.hessian_vector(x, as_like(v, x)))

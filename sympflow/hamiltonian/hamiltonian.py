@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, per_state
+from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.times import checked_time
 
 if TYPE_CHECKING:
+    from sympflow.compiler.program import Program
+    from sympflow.hamiltonian.formulas import TracedHamiltonian
     from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.poles import Poles
@@ -561,6 +564,32 @@ class Hamiltonian:
     def local(self) -> LocalHamiltonian | None:
         """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
         return self._definition if self._definition.loops else None
+
+    @property
+    def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
+        """What programs are recorded of: the symbolic definition, or functions that were traced; else None."""
+        return self.symbols if self.symbols is not None else self._definition.form
+
+    @property
+    def untraced(self) -> str:
+        """Why functions of Python could not be traced, a clause; "" if they were, or there are none."""
+        return "" if self.form is not None else self._definition.untraced
+
+    @property
+    def program(self) -> Program:
+        """H as the operations that are compiled, of t where it is driven, q1 … qd and p1 … pd: print it.
+
+        Raises
+        ------
+        ValueError
+            If there are none: of a lattice or pairs, and of functions that could not be traced, with the reason.
+        """
+        form = self.form
+        if form is None:
+            why = f"its functions could not be traced: {self.untraced}" if self.untraced else "it is given by one piece"
+            raise ValueError(f"`system` {self.name!r} has no program, for {why}.")
+        times = () if form.time is None else (form.time,)
+        return recorded([form.H], (*times, *form.q, *form.p))
 
     @property
     def written(self) -> SymbolicHamiltonian | None:

@@ -55,6 +55,8 @@ class LocalHamiltonian(Definition, ABC):
     shape: tuple[int, ...] = ()
     ends: tuple[str, ...] = ()
     noun: str = "system"
+    frame: Any = None
+    """The coordinates of planets about a star, of a system that knows its star: see `sympflow.hamiltonian.planets`."""
     written: SymbolicHamiltonian | None = None
     """H in symbols, of a system so small that it is written out when symbols are asked for."""
     loops: str

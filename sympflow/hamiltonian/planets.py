@@ -91,7 +91,7 @@ class Frame:
         self.local, self.G, self.coordinates, self.encounter = local, G, coordinates, encounter
         masses = self.masses = local.masses
         self.inertia = np.where(masses > 0, masses, 1.0)
-        q, v = self._bodies(np.asarray(y0, dtype=float))
+        q, v = self.states(np.asarray(y0, dtype=float))
         x, u = q[1:] - q[0], v[1:] - v[0]
         self.elements = elements_of(x, u, G * (masses[0] + masses[1:]))
         a, e = self.elements[:, :2].T
@@ -108,6 +108,11 @@ class Frame:
         )
         self.periods = 2 * np.pi * np.sqrt(self.size**3 / (G * (masses[0] + masses[1:])))
 
+    @property
+    def longest_step(self) -> float:
+        """The longest time between two kicks."""
+        return float(self.periods.min()) / FEWEST_STEPS
+
     @cached_property
     def bodies(self) -> np.ndarray:
         """The bodies in the order of the coordinates."""
@@ -123,7 +128,7 @@ class Frame:
         mean = (self.size[i - 1] + self.size[j - 1]) / 2
         return mean * np.cbrt((self.masses[i] + self.masses[j]) / (3 * self.masses[0]))
 
-    def _bodies(self, y: Array) -> tuple[Array, Array]:
+    def states(self, y: Array) -> tuple[Array, Array]:
         """Positions and velocities (..., n, 3)."""
         n = len(self.masses)
         q, p = (x.reshape(*y.shape[:-1], n, 3) for x in (y[..., : 3 * n], y[..., 3 * n :]))
@@ -164,7 +169,7 @@ class Frame:
 
     def into(self, y: Array) -> tuple[Array, Array, Array, Array]:
         """x and v of the planets (..., n − 1, 3), and the place and velocity of the centre (..., 3), of states."""
-        q, u = self._bodies(y)
+        q, u = self.states(y)
         x, Q = self.relative(q)
         v, U = self.relative(u)
         if not self.jacobi:
@@ -182,7 +187,8 @@ class Frame:
             u = _joined(star[..., None, :], v) + U[..., None, :]
             q, u = q[..., self._places, :], u[..., self._places, :]
         p = u * like(self.inertia[:, None], u)
-        return _joined(q.reshape(*q.shape[:-2], -1), p.reshape(*p.shape[:-2], -1), -1)
+        d = self.local.ndof
+        return _joined(q.reshape(*q.shape[:-2], d), p.reshape(*p.shape[:-2], d), -1)
 
     # the two flows of the splitting, by array operations ------------------------------------------------------------
 
@@ -249,9 +255,9 @@ class Frame:
         close = r < MOON * np.maximum(self._hill(one), self._hill(other))
         bound = close & ((u * u).sum(-1) / 2 < self.G * (masses[one] + masses[other]) / r)
         if bound.any():
-            k = int(np.argmax(bound))
+            first, second = sorted(int(i[bound][0]) for i in (one, other))
             raise ValueError(
-                f"`method` {method!r} has each body on an orbit about the star, and bodies {one[k]} and {other[k]} are "
+                f"`method` {method!r} has each body on an orbit about the star, and bodies {first} and {second} are "
                 "bound to each other: take the splitting 'kinetic', such as 'srkn11b', or one body in place of both."
             )
 
@@ -428,8 +434,12 @@ def _checked_elements(elements: Any, n: int) -> np.ndarray:
 
 
 def placed(masses: np.ndarray, G: float, elements: np.ndarray) -> np.ndarray:
-    """The state [q, p] of planets with heliocentric elements (n, 6), the centre of mass at rest at the origin."""
-    x, v = states_of(elements, G * (masses[0] + masses[1:]))
-    q, u = (np.concatenate([np.zeros((1, 3)), z]) for z in (x, v))
-    q, u = (z - masses @ z / masses.sum() for z in (q, u))
-    return np.concatenate([q.ravel(), (np.where(masses > 0, masses, 1.0)[:, None] * u).ravel()])
+    """The states [q, p] of planets with heliocentric elements (..., n, 6), the centre of mass at rest at the origin."""
+    share = (masses / masses.sum())[:, None]
+    momenta = np.where(masses > 0, masses, 1.0)[:, None]
+    whole = []
+    for z, factor in zip(states_of(elements, G * (masses[0] + masses[1:])), (1.0, momenta), strict=True):
+        bodies = np.concatenate([0 * z[..., :1, :], z], axis=-2)
+        bodies = factor * (bodies - (share * bodies).sum(-2, keepdims=True))
+        whole.append(bodies.reshape(*bodies.shape[:-2], -1))
+    return np.concatenate(whole, axis=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import sympy as sp
@@ -11,7 +11,7 @@ import sympy as sp
 from sympflow.compiler.functions import apply, where
 from sympflow.hamiltonian.removable import sinc
 
-__all__ = ["NotRecorded", "can_be_recorded", "check_recorded", "evaluator"]
+__all__ = ["NotRecorded", "calculated", "can_be_recorded", "check_recorded"]
 
 
 class NotRecorded(ValueError):
@@ -69,14 +69,14 @@ def _heaviside(x: Any, at_zero: Any = 0.5) -> Any:
 
 
 def can_be_recorded(f: sp.Expr) -> bool:
-    """True if `evaluator` has a rule for every function in an expression."""
+    """True if `calculated` has a rule for every function in an expression."""
     functions = f.atoms(sp.Function, sp.logic.boolalg.Boolean) - f.atoms(sp.Symbol)
     known = (sp.Piecewise, sp.Heaviside, sinc, sp.logic.boolalg.BooleanAtom)
     return all(a.func in _RULES or isinstance(a, known) for a in functions)
 
 
 def check_recorded(f: sp.Expr) -> None:
-    """Raise a ValueError with the term of an expression of which `evaluator` has no rule for a function."""
+    """Raise a ValueError with the term of an expression of which `calculated` has no rule for a function."""
     for term in sp.Add.make_args(f):
         if not can_be_recorded(term):
             raise ValueError(
@@ -84,25 +84,8 @@ def check_recorded(f: sp.Expr) -> None:
             )
 
 
-def evaluator(numbers: Mapping[sp.Symbol, Any]) -> Callable[[sp.Expr], Any]:
-    """Return a function of expressions that calculates with these numbers; common subexpressions once.
-
-    Raises
-    ------
-    NotRecorded
-        From that function, if something in an expression cannot be calculated.
-    """
-    known: dict[sp.Basic, Any] = dict(numbers)
-
-    def value(f: sp.Basic) -> Any:
-        if f not in known:
-            known[f] = _value(f, value)
-        return known[f]
-
-    return value
-
-
-def _value(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
+def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
+    """The value of an expression, by a function that gives those of its parts."""
     if isinstance(f, sp.logic.boolalg.BooleanAtom):
         return 1.0 if f else 0.0
     if f.is_number and f.is_extended_real:

@@ -480,13 +480,12 @@ class HamiltonianSystem(Hamiltonian, Shown):
         >>> system.ndof
         9
         """
-        from sympflow.hamiltonian.planets import FEWEST_STEPS, PlanetsHamiltonian, checked_planets
+        from sympflow.hamiltonian.planets import PlanetsHamiltonian, checked_planets
 
         masses, G, start = checked_planets(masses, elements, y0, G, units)
         local = PlanetsHamiltonian(masses, G, start, coordinates, encounter)
-        periods = local.frame.periods
-        end = (0.0, 1000 * float(periods.max())) if t_span is None else t_span
-        step = float(periods.min()) / FEWEST_STEPS if dt is None else dt
+        end = (0.0, 1000 * float(local.frame.periods.max())) if t_span is None else t_span
+        step = local.frame.longest_step if dt is None else dt
         return cls._of_pieces(local, None, name, domain, start, end, step, energy_scale)
 
     def piece(
@@ -701,6 +700,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         self.domain = None if domain is None else domain_of(domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
+        self._definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
 
     @property
     def dt(self) -> float:
@@ -841,6 +841,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
         if kind in self._tested:
+            self._definition.check_unchanged(like)
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 
@@ -927,6 +928,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
             kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
+        if self._definition.given_functions:
+            kind += f", arrays: it could not be traced, for {self.untraced}" if self.form is None else ", traced"
         degrees = f"{self.ndof:,} degree{'s' * (self.ndof > 1)} of freedom"
         named = self.title if self.name == UNNAMED and self.symbols is not None else f"{self.name}({params})"
         return f"<HamiltonianSystem {named}: {degrees}, {kind}>"

@@ -106,6 +106,14 @@ class FixedStep(Integrator):
         """Return the step that is used for a system."""
         return float(self.dt if self.dt is not None else system.dt)
 
+    def longest_step(self, system: HamiltonianSystem) -> float:
+        """Return the longest step that is chosen for a tolerance."""
+        return math.inf
+
+    def doubt(self, system: HamiltonianSystem) -> str:
+        """Return a warning of the method with its step on a system, or nothing."""
+        return ""
+
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of one run, for states such as the problem's y0."""
         self.check_library(problem.y0)
@@ -246,10 +254,20 @@ class Stepper:
     saves_finite: bool = False
     counts_itself: ClassVar[bool] = False
     """True if `evaluations` tells those that were made so far, whatever the steps."""
+    why: str = ""
+    """Why functions of Python run as such, to be read after the backend."""
     remark: str = ""
     """Why a run of a formula is not compiled, for its message."""
 
     def __init__(self, integrator: FixedStep, problem: Problem, told: Sequence[str] = ()) -> None:
+        if (
+            problem.backend == "auto"
+            and not is_tensor(problem.y0)
+            and problem.y0.dtype == np.float64
+            and problem.system.untraced
+        ):
+            name = "potential" if problem.system.separable else "hamiltonian"
+            self.why = f": `{name}` could not be traced, for {problem.system.untraced}"
         if told and problem.system.symbols is not None:
             self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
         self.integrator, self.system, self.problem = integrator, problem.system, problem
@@ -618,7 +636,7 @@ class GridRun:
             "dt": abs(self.grid.h),
             "n_steps": n_told,
             **stepper.evaluations(n_steps, n_saved, n_extra),
-            "backend": stepper.backend,
+            "backend": stepper.backend + stepper.why,
             **stepper.more_stats(),
         }
 

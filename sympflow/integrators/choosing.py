@@ -30,6 +30,8 @@ NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
 
 Candidate = tuple[str, str]
 """The name of a method, and why it is chosen."""
+CHOSEN_WITH = {"wisdom_holman": {"corrector": 17}}
+"""Options of methods that are chosen."""
 
 
 def choose_method(
@@ -45,7 +47,8 @@ def choose_method(
     between = system.between_impulses
     for name, reason in _candidates(between, y0, options, tol, plain, flows):
         try:
-            integrator = build(name, options if name != "sympflow" or tol is None else {**options, "tol": tol})
+            given = {**CHOSEN_WITH.get(name, {}), **options}
+            integrator = build(name, given if name != "sympflow" or tol is None else {**given, "tol": tol})
             check_applies(integrator, between, y0)
         except (ValueError, TypeError) as error:
             refused = refused or error
@@ -64,6 +67,8 @@ def _candidates(
         yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
     if plain and not is_tensor(y0) and y0.dtype == np.float64 and _falls_to_the_origin(system, y0):
         yield "log_kahan_li8", "V falls without bound at q = 0, where its steps become shorter"
+    if system.local is not None and system.local.frame is not None and system.local.frame.crossing() is None:
+        yield "wisdom_holman", "planets move about a star"
     if system.separable and system.quadratic_kinetic:
         yield "srkn11b", "the kinetic energy is ½ pᵀM⁻¹p"
     if system.separable:
@@ -211,7 +216,8 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
         states = states.reshape(-1, states.shape[-1])[:MOST_STATES]
     length, error = abs(problem.t1 - problem.t0), _error(integrator, replace(problem, system=system, y0=states), tol_of)
     check_applies(integrator, system, states)
-    h = min(integrator.step_length(system), length)
+    most = min(length, integrator.longest_step(system))
+    h = min(integrator.step_length(system), most)
     good, bad, least = 0.0, math.inf, math.inf
     for _ in range(TRIALS):
         e = error(h)
@@ -220,7 +226,7 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
         least = min(least, e)
         if e <= MOST * tol:
             good = max(good, h)
-            if e >= ENOUGH * tol or h >= length:
+            if e >= ENOUGH * tol or h >= most:
                 break
         else:
             bad = min(bad, h)
@@ -230,7 +236,7 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
             following = math.sqrt(good * bad)
         if good and (following <= 1.1 * good or bad <= 1.2 * good):
             break
-        h = min(following, length)
+        h = min(following, most)
     if not good:
         raise ValueError(
             f"`tol` {tol:g} is not met by method {integrator.label!r}: the smallest error of the trial runs is "

@@ -7,6 +7,7 @@ here and a row of `SPLITTINGS`.
 from __future__ import annotations
 
 import itertools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,10 +18,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, to_numpy
-from sympflow.hamiltonian.copies import both, coupling_strength, distance, mean, two_copies
 from sympflow.hamiltonian.monomials import Monomials, gradient
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, linear_and_rest, map_evaluations
-from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
@@ -29,11 +27,13 @@ from sympflow.integrators.contract import Failure
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, scheme_evaluations
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.parts import ExactParts, Map
+    from sympflow.hamiltonian.planets import Frame
     from sympflow.kernels.carry import Carry
     from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
-_PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, ExactParts]] = WeakKeyDictionary()
+_PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()
 
 
 class Composition(ABC):
@@ -83,6 +83,14 @@ class Composition(ABC):
     def check_driving(self) -> None:
         """Raise a ValueError where the parts of a driven system have no exact flows."""
         raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
+
+    def longest_step(self) -> float:
+        """The longest step with which the method is to be used."""
+        return math.inf
+
+    def doubt(self, dt: float) -> str:
+        """A warning of the system with steps dt, or nothing."""
+        return ""
 
     @abstractmethod
     def force_times(self) -> list[float]:
@@ -223,7 +231,7 @@ class KineticPotential(Composition):
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         y = to_numpy(y)
         n = y.shape[-1]
-        if y.dtype == np.float64 and self.system.symbols is not None and y.size:
+        if y.dtype == np.float64 and self.system.form is not None and y.size:
             from sympflow.kernels.stages import step_table
             from sympflow.kernels.tangents import step_tangents
 
@@ -408,6 +416,8 @@ class ExactMaps(Composition):
         return parts_loops(self.parts).kernel(lambda h: known_maps(self, float(h)) if h.ndim == 0 else self.maps(h))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        from sympflow.hamiltonian.parts import map_evaluations  # SymPy, which other splittings do without
+
         return map_evaluations(known_maps(self, 1.0), n_steps, n_saved, n_extra, backend)
 
 
@@ -455,6 +465,8 @@ class LinearRest(ExactMaps):
         self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
     ) -> None:
         super().__init__(method, scheme, system)
+        from sympflow.hamiltonian.parts import linear_and_rest
+
         known = _PARTS.setdefault(system, {})
         if "linear" not in known:
             known["linear"] = linear_and_rest(system)
@@ -473,6 +485,8 @@ class LinearRest(ExactMaps):
             raise ValueError(f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p: use 'linear_srkn6b'.")
 
     def maps(self, h: Any) -> list[Map]:
+        from sympflow.hamiltonian.parts import LINEAR, Map
+
         filters = self.filters(h)
         maps = []
         for (kind, c, c3, *_), at in zip(self.scheme.substeps, self.scheme.substep_times, strict=True):
@@ -555,6 +569,8 @@ class SolvableParts(ExactMaps):
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
         """The parts of a system, found once."""
+        from sympflow.hamiltonian.parts import exact_parts
+
         known = _PARTS.setdefault(system, {})
         if parts not in known:
             known[parts] = exact_parts(system, parts)
@@ -576,6 +592,8 @@ class SolvableParts(ExactMaps):
         return maps
 
     def _map(self, k: int, h: Any, at: float) -> Map:
+        from sympflow.hamiltonian.parts import LINEAR, Map
+
         return Map(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
 
 
@@ -600,17 +618,25 @@ class TwoCopies(SolvableParts):
         known = _PARTS.setdefault(system, {})
         key = "copies", self.omega
         if key not in known:
+            from sympflow.hamiltonian.copies import coupling_strength, two_copies
+
             known[key] = two_copies(system, coupling_strength(system) if self.omega is None else float(self.omega))
         return known[key]
 
     def lift(self, y: Array) -> Array:
+        from sympflow.hamiltonian.copies import both
+
         return both(y, self.ndof)
 
     def project(self, x: Array) -> Array:
+        from sympflow.hamiltonian.copies import mean
+
         return mean(x, self.ndof)
 
     def distance(self, x: Array) -> Array:
         """The largest difference of the copies, and the size of their states: (..., 4d) to (..., 2)."""
+        from sympflow.hamiltonian.copies import distance
+
         return distance(x, self.scale)
 
 
@@ -639,8 +665,14 @@ class KeplerInteraction(Composition):
             )
         if system.friction is not None:
             self.check_friction(0.0)
-        self.frame = frame_of(method, system.name, system.local, system.y0)
-        self.frame.check(method)
+        known = _PARTS.setdefault(system, {})
+        if "kepler" not in known:
+            from sympflow.hamiltonian.planets import frame_of
+
+            frame = frame_of(method, system.name, system.local, system.y0)
+            frame.check(method)
+            known["kepler"] = frame
+        self.frame: Frame = known["kepler"]
         self.substeps = _paired([(s.kind, s.one) for s in scheme.substeps])
         self.before: list[tuple[float, float]] = []
         self.after: list[tuple[float, float]] = []
@@ -674,6 +706,27 @@ class KeplerInteraction(Composition):
             if drift:
                 x, v = frame.drift(x, v, drift * h)
         return frame.out(x, v, Q + sign * h[..., None] * U, U)
+
+    def longest_step(self) -> float:
+        kicks = sum(kick != 0 for kick, _ in self.substeps)
+        return self.frame.longest_step * max(kicks, 1)
+
+    def doubt(self, dt: float) -> str:
+        frame, crossing = self.frame, self.frame.crossing()
+        if dt > self.longest_step() * (1 + 1e-9):
+            body = 1 + int(np.argmin(frame.periods))
+            return (
+                f"`dt` {dt:g} is long for method {self.method!r}: its kicks are more than a twentieth of the period of "
+                f"body {body}, {frame.periods.min():.4g}, apart, where steps may be in resonance with the orbit. Take "
+                f"at most {self.longest_step():.3g}."
+            )
+        if crossing:
+            return (
+                f"`system` has orbits that cross, those of bodies {crossing[0]} and {crossing[1]}, where the splitting "
+                "'kepler' is right only until they come close to each other. Take the splitting 'kinetic', such as "
+                "'srkn11b', unless a resonance keeps them apart."
+            )
+        return ""
 
     def kernel(self, compensated: bool) -> Kernel:
         from sympflow.kernels.kepler import KeplerKernel, KeplerLoops

@@ -258,12 +258,14 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem, stacklevel: int) -> None:
-    """Warn where the energy of a run with fixed steps is off by more than `TOO_LONG` of its size.
+    """Warn of what a method doubts, and where the energy of a run with fixed steps is off by `TOO_LONG` of its size.
 
     H is evaluated at the start and a few outputs, of large systems at one for every 200 steps. Its size is the largest
     of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
     """
     system, n = problem.system, len(outcome.t)
+    if isinstance(integrator, FixedStep) and (doubt := integrator.doubt(system)):
+        warnings.warn(doubt, RuntimeWarning, stacklevel=stacklevel + 1)
     if not isinstance(integrator, FixedStep) or integrator.trained or not (system.conservative and system.autonomous):
         return
     seen = LOOKED_AT if system.ndof <= LARGE else min(LOOKED_AT, outcome.stats.get("n_steps", 0) // 200)

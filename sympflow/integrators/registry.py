@@ -46,7 +46,7 @@ SYNONYMS = {
 _STIFF = "It is for stiff dissipative systems, and not symplectic: take 'gauss_legendre6', which is implicit too."
 ABSENT = {
     **dict.fromkeys(("radau", "bdf", "lsoda", "radau5", "cvode"), _STIFF),
-    "whfast": "It splits off Kepler's motion: for planets take 'srkn11b' or 'log_kahan_li8'.",
+    "whfast": "Its name here is 'wisdom_holman', with `corrector` where it is to have one.",
     "ias15": "For close encounters take 'dop853' with `rtol`, or 'log_kahan_li8'.",
     "yoshida": "Did you mean 'yoshida4' or 'yoshida6'? 'kahan_li8' has smaller errors.",
     "ruth3": "Did you mean 'yoshida4'? A better one of few stages is 'omelyan4'.",

@@ -42,10 +42,13 @@ class ExplicitStep(ByVectorField):
     @staticmethod
     def compiled(system: HamiltonianSystem, name: str, *arguments: Any) -> Any:
         """Return a function of `kernels.explicit_loops` called for a symbolic system."""
-        if system.symbols is None:
+        if system.form is None:
             raise ValueError(
                 "`system` cannot be compiled: its vector field is not symbolic. Use HamiltonianSystem.from_sympy, or "
                 "use backend='array'."
+                if not system.untraced
+                else f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change "
+                "them, or use HamiltonianSystem.from_sympy, or use backend='array'."
             )
         from sympflow.kernels import explicit_loops  # SymPy, which other systems do without
 

@@ -324,6 +324,12 @@ class Splitting(OwnStepper):
             names = ", ".join(problem.followed)
             raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
 
+    def longest_step(self, system: HamiltonianSystem) -> float:
+        return self.composed(system).longest_step() if self.clock == "physical" else super().longest_step(system)
+
+    def doubt(self, system: HamiltonianSystem) -> str:
+        return self.composed(system).doubt(self.step_length(system)) if self.clock == "physical" else ""
+
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock != "physical":
             self.on_clock(system)

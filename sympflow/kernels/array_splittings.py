@@ -16,6 +16,7 @@ from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, POINTER, Value
 from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
+from sympflow.hamiltonian.formulas import Letter
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splittings import Splitting, SplittingCode
@@ -156,7 +157,7 @@ def term_code(splitting: Splitting) -> ArrayCode:
     """The compiled functions of a symbolic system of many terms."""
     from sympflow.kernels.terms import Terms
 
-    symbols = splitting.symbols
+    symbols: Any = splitting.symbols
     M = symbols.inverse_mass
     T: Terms | np.ndarray | None = None
     if M is None or not M.is_diagonal() or M.free_symbols:
@@ -182,12 +183,6 @@ def function_code(
     sizes: Any = Sizes(ndof, (Letter("time"),) if driven else ())
     clock: Any = Clock() if driven else None
     return ArrayCode(Splitting(sizes, level, monomials, compensated, friction, clock), forces)
-
-
-class Letter(NamedTuple):
-    """A number of a stage."""
-
-    name: str
 
 
 class Sizes(NamedTuple):

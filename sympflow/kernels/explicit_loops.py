@@ -9,15 +9,14 @@ from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import sympy as sp
 
 from sympflow.compiler.control import DOUBLE, POINTER, Module, Value
 from sympflow.compiler.machine import compiled, host
 from sympflow.compiler.program import Program, gradient
+from sympflow.hamiltonian.formulas import Letter, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, add_terms, recorded
+from sympflow.kernels.one_steps import OneStep, OneStepKernel, add_terms, is_large, lettered
 from sympflow.kernels.runs import Numbers, Room
-from sympflow.kernels.terms import families, is_large
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
 
@@ -77,18 +76,18 @@ class Field:
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
-        symbols, force = system.symbols, system.external_force
+        symbols, force = system.form, system.external_force
         assert symbols is not None
         forces = getattr(force, "expressions", None)
-        if force is not None and forces is None:
+        if force is not None and (forces is None or system.symbols is None):
             raise ValueError("`system` has a force that is no formula, which is not compiled: use backend='array'.")
         self.large = is_large(symbols) and force is None
         symbols = symbols if is_large(symbols) else symbols.parametric
-        self.lettered = Lettered(symbols, [symbols.H, *(forces or [])])
+        self.lettered = lettered(symbols, [symbols.H, *(forces or [])])
         self.ndof = system.ndof
         self._damping = None if system.friction is None else system.friction.matrix(self.ndof)
         self.rates = [] if self._damping is None else self._damping[self._damped].tolist()
-        self._families = families(self.lettered.expressions[0], (*symbols.q, *symbols.p)) if self.large else []
+        self._families = _families(self.lettered) if self.large else []
         self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]
         if self._damping is not None:
             self.data.append(np.ascontiguousarray(self._damping))
@@ -107,7 +106,7 @@ class Field:
     def program(self) -> Program:
         """f, from q, p, the parameters, the letters and the numbers of Γ."""
         symbols, d, n = self.lettered.symbols, self.ndof, 2 * self.ndof
-        rates = sp.symbols(f"rate_:{len(self.rates)}")
+        rates = [Letter(f"rate_{i}") for i in range(len(self.rates))]
         inputs = (*symbols.q, *symbols.p, *self.lettered.given, *rates)
         found = recorded([*self.lettered.expressions, *rates], inputs)
         slope = gradient(found.outputs[0], found.inputs[:n])
@@ -162,6 +161,13 @@ class Field:
 
                 (force,) = code.loop(d, [force], damped)
             code.store(force, out, m + d)
+
+
+def _families(lettered: Any) -> list[Any]:
+    """The kinds of terms of H."""
+    from sympflow.kernels.terms import families
+
+    return families(lettered.expressions[0], (*lettered.symbols.q, *lettered.symbols.p))
 
 
 class _Explicit(OneStep):

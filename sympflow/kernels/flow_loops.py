@@ -98,7 +98,7 @@ class PrimedFlowKernel(Kernel):
             raise ValueError(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
-        known = system.symbols is not None or (tables.level == CURVATURE and system.local is not None)
+        known = system.form is not None or (tables.level == CURVATURE and system.local is not None)
         if tables.level >= CURVATURE and not known:
             raise ValueError(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "

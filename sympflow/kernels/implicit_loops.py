@@ -9,8 +9,7 @@ import numpy as np
 from sympflow.hamiltonian.collocation import Tableau, stage_nodes
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.newton import newton_code
-from sympflow.kernels.one_steps import Lettered, OneStepKernel
-from sympflow.kernels.terms import is_large
+from sympflow.kernels.one_steps import OneStepKernel, is_large, lettered
 
 __all__ = ["implicit_kernel"]
 
@@ -33,7 +32,7 @@ _KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneSte
 
 
 def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
-    written = system.written
+    written = system.written or system.form
     if written is None:
         raise ValueError(
             "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
@@ -45,9 +44,9 @@ def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> O
     if friction is not None and friction.damping.ndim == 2:
         raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
     symbols = written if is_large(written) else written.parametric
-    lettered = Lettered(symbols, [symbols.H])
-    code = newton_code(lettered, tableau, compensated, friction is not None)
-    single = newton_code(lettered, tableau, False, False) if compensated else code
+    of_time = lettered(symbols, [symbols.H])
+    code = newton_code(of_time, tableau, compensated, friction is not None)
+    single = newton_code(of_time, tableau, False, False) if compensated else code
     if friction is None:
         return OneStepKernel(code, single)
     rates = np.broadcast_to(friction.rates, system.ndof)

@@ -307,7 +307,7 @@ class KeplerLoops:
         """The states of running ones (..., n_values), after times since those y0 (..., 2d)."""
         *_, Q, U = self.frame.into(y0)
         planets = rows.reshape(*rows.shape[:-1], self.code.groups, 2 * AXES, LANES).swapaxes(-1, -2)
-        planets = planets.reshape(*rows.shape[:-1], -1, 2 * AXES)[..., : len(self.frame.order), :]
+        planets = planets.reshape(*rows.shape[:-1], self.code.groups * LANES, 2 * AXES)[..., : len(self.frame.order), :]
         centre = Q + times[..., None] * U
         return self.frame.out(planets[..., :AXES], planets[..., AXES:], centre, U + 0 * centre)
 

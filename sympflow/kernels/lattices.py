@@ -23,10 +23,10 @@ from sympflow.compiler.control import INT, Code, Sweep, Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, times
 from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.hamiltonian.local import LocalHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.recorded import evaluator
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room
 from sympflow.kernels.teams import Member, SharedRollouts, meet

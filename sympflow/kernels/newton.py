@@ -19,10 +19,10 @@ from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Type, Value
 from sympflow.compiler.functions import added, fma, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
-from sympflow.kernels.one_steps import Lettered, OneStep, add_terms, recorded
+from sympflow.hamiltonian.formulas import recorded
+from sympflow.kernels.one_steps import Lettered, OneStep, add_terms, is_large
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
-from sympflow.kernels.terms import families, is_large
 
 __all__ = ["newton_code"]
 
@@ -218,7 +218,11 @@ class _InMemory(NewtonCode):
         super().__init__(lettered, tableau, compensated, damped)
         symbols = lettered.symbols
         self._large = is_large(symbols)
-        self._families = families(lettered.expressions[0], (*symbols.q, *symbols.p)) if self._large else []
+        self._families = []
+        if self._large:
+            from sympflow.kernels.terms import families
+
+            self._families = families(lettered.expressions[0], (*symbols.q, *symbols.p))
         self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]
         n, N = self.n_out, self.unknowns
         self._numbers = self.size + self.stages * len(self.lettered.letters)

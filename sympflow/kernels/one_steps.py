@@ -4,79 +4,68 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import sympy as sp
 from numpy.typing import ArrayLike
 
 from sympflow.compiler.control import INT, Code, Value
-from sympflow.compiler.program import Program, traced
-from sympflow.hamiltonian.driving import with_letters
-from sympflow.hamiltonian.recorded import check_recorded, evaluator
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.compiler.program import Program
+from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
-from sympflow.kernels.samples import check_samples, sampled_value
-from sympflow.kernels.stage_times import letters_of_time
-from sympflow.kernels.terms import Family
 from sympflow.kernels.threads import given
 
-__all__ = ["Lettered", "OneStep", "OneStepKernel", "add_terms", "recorded"]
+if TYPE_CHECKING:
+    from sympflow.kernels.terms import Family
+
+__all__ = ["Lettered", "OneStep", "OneStepKernel", "add_terms", "check_size", "is_large", "lettered"]
+
+MOST_COMPILED = 5000  # operations of a gradient
 
 
-def recorded(expressions: Sequence[sp.Expr], inputs: Sequence[sp.Symbol]) -> Program:
-    """Expressions as a program of symbols."""
-
-    def values(*numbers: Any) -> list[Any]:
-        return list(map(evaluator(dict(zip(inputs, numbers, strict=True))), expressions))
-
-    return traced(values, *(s.name for s in inputs))
+Lettered = Any
+"""Expressions with letters for what depends on the time alone: of symbols, or of functions that were traced."""
 
 
-class Lettered:
-    """Expressions of a symbolic system with letters for what depends on the time and on parameters alone.
-
-    Parameters
-    ----------
-    symbols : SymbolicHamiltonian
-    expressions : sequence of Expr
-        In its symbols.
-
-    Attributes
-    ----------
-    expressions : list of Expr
-        In q, p, the parameters and the letters: the `given` symbols.
-    letters : dict of Symbol to Expr
+def lettered(form: Any, expressions: Sequence[Any]) -> Lettered:
+    """Expressions of a form with letters.
 
     Raises
     ------
     ValueError
         If a function in them has no compiled form.
     """
+    if isinstance(form, TracedHamiltonian):
+        check_size(form)
+        return TracedLetters(form, expressions)
+    from sympflow.kernels.stage_times import SymbolicLetters
 
-    def __init__(self, symbols: SymbolicHamiltonian, expressions: Sequence[sp.Expr]) -> None:
-        for samples in symbols.samples.values():
-            check_samples(samples)
-        for f in with_letters(list(expressions))[0]:
-            check_recorded(f)
-        found: dict[sp.Expr, sp.Symbol] = {}
-        time, fixed = symbols.time, {*symbols.parameters}
-        self.expressions = list(expressions)
-        if time is not None:
-            self.expressions = [letters_of_time(f, time, fixed, found, "letter") for f in expressions]
-        self.symbols, self.letters = symbols, {s: f for f, s in found.items()}
-        self.given = (*symbols.parameters, *self.letters)
+    return SymbolicLetters(form, expressions)
 
-    def at(self, t: Value, parameters: Sequence[Value]) -> list[Value]:
-        """The letters at times t."""
-        symbols = self.symbols
-        expressions, sampled = with_letters(list(self.letters.values()))
-        of_time = evaluator({symbols.time: t, **dict(zip(symbols.parameters, parameters, strict=True))})
-        values = [sampled_value(symbols.samples[f.name_of_samples], f.order, of_time(f.at)) for f in sampled]
-        program = recorded(expressions, (symbols.time, *symbols.parameters, *sampled.values()))
-        return [t.code.operand(x, t.type) for x in program(t, *parameters, *values)]
+
+def is_large(form: Any) -> bool:
+    """True of a system whose terms are better looped over than written out."""
+    if isinstance(form, TracedHamiltonian):
+        return False
+    from sympflow.kernels.terms import is_large
+
+    return is_large(form)
+
+
+def check_size(form: TracedHamiltonian) -> None:
+    """Refuse a traced function that would take long to compile.
+
+    Raises
+    ------
+    ValueError
+    """
+    if form.size > MOST_COMPILED:
+        raise ValueError(
+            f"`system` has {form.size:,} operations in its gradient, more than {MOST_COMPILED:,}, which are not "
+            "compiled: write it with HamiltonianSystem.from_sympy, lattice or pairs, or use backend='array'."
+        )
 
 
 def add_terms(

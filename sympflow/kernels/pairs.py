@@ -22,7 +22,7 @@ from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
 from sympflow.compiler.functions import added, apply
 from sympflow.compiler.machine import address, host
 from sympflow.hamiltonian.bodies import PairsHamiltonian
-from sympflow.hamiltonian.recorded import evaluator
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room, finished

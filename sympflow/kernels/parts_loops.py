@@ -19,12 +19,13 @@ from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import fma, times
 from sympflow.compiler.program import Program, gradient
+from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
-from sympflow.kernels.one_steps import Lettered, recorded
 from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers
+from sympflow.kernels.stage_times import SymbolicLetters
 from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
 from sympflow.kernels.threads import given
 
@@ -62,7 +63,7 @@ class PartMaps:
 
     def __init__(self, parts: ExactParts, filters: bool) -> None:
         self.parts, self.ndof, self.filters = parts, parts.ndof, filters
-        self.lettered = [Lettered(part, [part.H]) for part in parts.rest]
+        self.lettered = [SymbolicLetters(part, [part.H]) for part in parts.rest]
         self._arranged: dict[int, Arranged] = {}
 
     def arranged(self, code: int) -> Arranged:

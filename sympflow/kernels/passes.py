@@ -79,7 +79,7 @@ def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..
         least, most = ([code.load(bound, i) for i in range(n if symbols is None else n + 2)] for bound in (low, high))
         outside = [~((a <= value) & (value <= b)) for a, value, b in zip(least, x, most, strict=False)]
         if symbols is not None:
-            from sympflow.hamiltonian.recorded import evaluator
+            from sympflow.hamiltonian.formulas import evaluator
 
             H = evaluator(dict(zip(symbols.q + symbols.p, x, strict=True)))(symbols.H)
             outside.append(~((least[n] < H) & (most[n] > H)))

@@ -11,8 +11,10 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.one_steps import check_size
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.stages import StageTable, check_damping, run_table, step_table
 from sympflow.kernels.threads import given
@@ -81,8 +83,8 @@ class SplittingLoops:
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.traced = self._large = False
-        self._form: Any = symbols
-        self._driving: Driving | None = None
+        self._form: Any = system.form if symbols is system.symbols else symbols
+        self._driving: Driving | TracedDriving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Rollouts]
         self._longs: dict[int, bool] = {}
@@ -117,6 +119,15 @@ class SplittingLoops:
                 self._has_ranges, self.traced = not self._large, True
                 sums = V is not None and not self._large and V.is_polynomial(*symbols.q)
                 self.abreast = LANES_OF_SUMS if sums else LANES
+        elif isinstance(system.form, TracedHamiltonian):
+            check_size(system.form)
+            check_damping(system, False)
+            self._has_force_gradient = self.traced = True
+            V = system.form.V
+            self.abreast = LANES_OF_SUMS if V is not None and V.is_polynomial() and not self.driven else LANES
+            if self.driven:
+                driving = self._driving = system.form.driving
+                self._form = driving.form
         elif system.numba_functions is not None:
             _, gradient, hessian_vector = system.numba_functions
             self._has_force_gradient = hessian_vector is not None
@@ -145,11 +156,11 @@ class SplittingLoops:
             self.traced = self._written is not None
         else:
             raise ValueError(
-                "`system` cannot be compiled: it is given by plain functions. Define it with "
-                "HamiltonianSystem.from_sympy or by Numba functions, or use backend='array'."
+                f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change them, "
+                "or define it with HamiltonianSystem.from_sympy, or use backend='array'."
             )
         self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops
-        self._has_curvature = symbols is not None or system.local is not None
+        self._has_curvature = system.form is not None or system.local is not None
         self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], Rollouts] = {}
 
     def __getstate__(self) -> dict[str, Any]:

@@ -19,16 +19,17 @@ from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import Type, Value, Variable
 from sympflow.compiler.functions import FUNCTIONS, added, dot, times
 from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.recorded import evaluator
-from sympflow.kernels.approximations import OnInterval, Ranges, on_interval
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+    from sympflow.kernels.approximations import OnInterval, Ranges
     from sympflow.kernels.stage_times import Driving
 
 __all__ = ["Shape", "Splitting", "SplittingCode", "WithinRange", "shared"]
@@ -59,12 +60,12 @@ class Splitting:
         Intervals of one position in which kicks are polynomials, equal but for rounding; its values are then in V.
     """
 
-    symbols: SymbolicHamiltonian
+    symbols: SymbolicHamiltonian | TracedHamiltonian
     level: int
     monomials: Monomials = ()
     compensated: bool = False
     friction: int | None = None
-    driving: Driving | None = None
+    driving: Driving | TracedDriving | None = None
     ranges: Ranges = ()
 
     @property
@@ -128,6 +129,8 @@ class Splitting:
 
     def _within_range(self, terms: int) -> Stage | WithinRange:
         """The stage as a polynomial in its range, if there is one."""
+        from sympflow.kernels.approximations import on_interval
+
         near = on_interval(_of_kick(self.symbols, terms), self.symbols.q[0], *self.ranges[0])
         if near is None:
             return self._arranged(terms)
@@ -317,7 +320,7 @@ class _Both:
         return [x for program in self._programs for x in program(*values)]
 
 
-def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
+def _of_kick(symbols: Any, terms: int) -> list[Any]:
     """V′, V″M⁻¹V′ and (½ V′M⁻¹V″M⁻¹V′)′ of one position, as many as there are terms."""
     V, M = symbols.V, symbols.inverse_mass
     assert V is not None
@@ -329,7 +332,7 @@ def _of_kick(symbols: SymbolicHamiltonian, terms: int) -> list[Any]:
 
 
 def _kick_changes(
-    symbols: SymbolicHamiltonian, q: Sequence[Any], kicks: Sequence[Any], known: Any, terms: int, monomials: Monomials
+    symbols: Any, q: Sequence[Any], kicks: Sequence[Any], known: Any, terms: int, monomials: Monomials
 ) -> list[Any]:
     """The change of p by a kick of so many terms, of recorded numbers; `known` evaluates expressions."""
     slope, M, d = gradient(known(symbols.V), q), symbols.inverse_mass, len(q)

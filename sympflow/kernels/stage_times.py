@@ -17,11 +17,12 @@ import sympy as sp
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import apply, where
 from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled, with_letters
-from sympflow.hamiltonian.recorded import check_recorded, evaluator
+from sympflow.hamiltonian.formulas import evaluator, recorded
+from sympflow.hamiltonian.recorded import check_recorded
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.samples import check_samples, sampled_value
 
-__all__ = ["Driving", "driven_form", "letters_of_time"]
+__all__ = ["Driving", "SymbolicLetters", "driven_form", "letters_of_time"]
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,50 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
         f"`system` has the kinetic energy {symbols.T}, which is no sum of products of functions of {symbols.time} and "
         "of p: use an implicit method such as 'gauss_legendre6'."
     )
+
+
+class SymbolicLetters:
+    """Expressions of a symbolic system with letters for what depends on the time and on parameters alone.
+
+    Parameters
+    ----------
+    symbols : SymbolicHamiltonian
+    expressions : sequence of Expr
+        In its symbols.
+
+    Attributes
+    ----------
+    expressions : list of Expr
+        In q, p, the parameters and the letters: the `given` symbols.
+    letters : dict of Symbol to Expr
+
+    Raises
+    ------
+    ValueError
+        If a function in them has no compiled form.
+    """
+
+    def __init__(self, symbols: SymbolicHamiltonian, expressions: Sequence[sp.Expr]) -> None:
+        for samples in symbols.samples.values():
+            check_samples(samples)
+        for f in with_letters(list(expressions))[0]:
+            check_recorded(f)
+        found: dict[sp.Expr, sp.Symbol] = {}
+        time, fixed = symbols.time, {*symbols.parameters}
+        self.expressions = list(expressions)
+        if time is not None:
+            self.expressions = [letters_of_time(f, time, fixed, found, "letter") for f in expressions]
+        self.symbols, self.letters = symbols, {s: f for f, s in found.items()}
+        self.given = (*symbols.parameters, *self.letters)
+
+    def at(self, t: Value, parameters: Sequence[Value]) -> list[Value]:
+        """The letters at times t."""
+        symbols = self.symbols
+        expressions, sampled = with_letters(list(self.letters.values()))
+        of_time = evaluator({symbols.time: t, **dict(zip(symbols.parameters, parameters, strict=True))})
+        values = [sampled_value(symbols.samples[f.name_of_samples], f.order, of_time(f.at)) for f in sampled]
+        program = recorded(expressions, (symbols.time, *symbols.parameters, *sampled.values()))
+        return [t.code.operand(x, t.type) for x in program(t, *parameters, *values)]
 
 
 def letters_of_time(

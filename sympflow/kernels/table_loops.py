@@ -21,9 +21,9 @@ from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
 from sympflow.compiler.functions import dot, fma
 from sympflow.compiler.machine import address, host
 from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.rollouts import aligned, filled
 from sympflow.kernels.runs import finished

@@ -18,8 +18,8 @@ from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, Value
 from sympflow.compiler.functions import dot, fma
 from sympflow.compiler.program import Program, derivatives, gradient, traced
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.recorded import evaluator
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, Task, run_states
 from sympflow.kernels.runs import Numbers, Room
@@ -395,12 +395,14 @@ def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, ve
 
 def _lacks(system: HamiltonianSystem) -> str:
     """The reason why a system has no compiled vectors, "" if it has."""
-    from sympflow.kernels.terms import is_long
-
     if not system.autonomous:
         return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
-    symbols = system.symbols
-    given = system.local is not None if symbols is None else not is_long(symbols, FORCE_GRADIENT)
+    if system.symbols is None:
+        given = system.local is not None or system.form is not None
+    else:
+        from sympflow.kernels.terms import is_long
+
+        given = not is_long(system.symbols, FORCE_GRADIENT)
     if not given or not splitting_loops(system).traced:
         return (
             f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "

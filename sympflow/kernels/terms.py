@@ -17,7 +17,7 @@ import sympy as sp
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import INT, Value
 from sympflow.compiler.program import Program, gradient, tangent, traced
-from sympflow.hamiltonian.recorded import evaluator
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.runs import Room
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT

@@ -321,7 +321,7 @@ class Attempt:
             dt=stats.get("dt"),
             tolerance=tolerance_of(sol.integrator),
             n_steps=max(int(s.stats["n_steps"]) for s in self.sols),
-            backend=stats.get("backend"),
+            backend=stats.get("backend", "").partition(":")[0] or None,
             force_evaluations=int(stats["force_evaluations"]),
             hessian_evaluations=int(stats["hessian_evaluations"]),
             training_time=trained,

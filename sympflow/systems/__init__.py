@@ -19,6 +19,7 @@ from sympflow.systems.celestial import (
 )
 from sympflow.systems.chains import fput, lax_eigenvalues, lennard_jones, oscillatory_energies, toda_lattice
 from sympflow.systems.driven import driven_pendulum, duffing, fodo_cell, fodo_matrices, kicked, paul_trap
+from sympflow.systems.planets import solar_system
 from sympflow.systems.textbook import (
     charged_particle,
     damped_oscillator,
@@ -63,6 +64,7 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "kepler": kepler,
     "three-body": three_body,
     "outer-solar-system": outer_solar_system,
+    "solar-system": solar_system,
     "fput": fput,
     "spring-pendulum": spring_pendulum,
     "toda-lattice": toda_lattice,

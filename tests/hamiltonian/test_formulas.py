@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from sympflow import HamiltonianSystem, doubled, solve
 from sympflow.integrators.implicit import gauss_legendre
 from sympflow.kernels.newton import newton_code
-from sympflow.kernels.one_steps import Lettered
+from sympflow.kernels.one_steps import lettered
 
 made = HamiltonianSystem.from_sympy
 Y = np.array([0.31, 0.47, 0.23, -0.39])
@@ -194,7 +194,7 @@ def formula(r: random.Random, depth: int) -> str:
 
 def slopes(system):
     """∇H and the upper triangle of ∇²H as they are compiled."""
-    return newton_code(Lettered(system.symbols, [system.symbols.H]), gauss_legendre(1), False, False).slopes
+    return newton_code(lettered(system.symbols, [system.symbols.H]), gauss_legendre(1), False, False).slopes
 
 
 @pytest.mark.parametrize("q", [0.0, 1e-9, 1e-4, 0.999, 1.001, 30.0])

@@ -61,7 +61,7 @@ def assert_accepted(y0, **functions):
         system.check_functions(y0)
         n = len(calls)
         system.check_functions(y0)
-    assert len(calls) == n > 4
+    assert 4 < n <= len(calls) <= n + 2  # two values are compared with what was traced
 
 
 @pytest.mark.parametrize(

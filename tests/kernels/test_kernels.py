@@ -333,8 +333,8 @@ def test_refusals(systems):
         splitting_loops(HamiltonianSystem.from_sympy("p**2*q**2/2 + q**2"))
     with pytest.raises(ValueError, match="no compiled function"):
         splitting_loops(HamiltonianSystem.from_sympy("p**2/2 + besselj(0, q)"))
-    plain = HamiltonianSystem(potential=lambda q: (q**2).sum(-1), ndof=1)
-    with pytest.raises(ValueError, match="`system` cannot be compiled"):
+    plain = HamiltonianSystem(potential=lambda q: np.sort(q).sum(-1), ndof=1)
+    with pytest.raises(ValueError, match=r"`system` cannot be compiled, .*: numpy\.sort has no rule"):
         splitting_loops(plain)
 
 

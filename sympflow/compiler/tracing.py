@@ -1,0 +1,698 @@
+"""Functions of arrays, written with NumPy or torch, as programs: called once with arrays of traced numbers.
+
+An array of objects does most of it: NumPy's own code indexes, reshapes, adds up and multiplies them. Three protocols
+bring what objects lack: functions of each element, functions of arrays, and torch's names of both.
+"""
+
+from __future__ import annotations
+
+import builtins
+import math
+import operator
+import warnings
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from sympflow.compiler.functions import apply
+from sympflow.compiler.program import Program, Recording, Traced
+
+__all__ = ["TracedArray", "Untraceable", "trace"]
+
+MOST_OPERATIONS = 200_000  # recorded of one function
+LARGEST_COFACTORS = 3  # of matrices; larger ones are eliminated
+
+
+class Untraceable(TypeError):
+    """The reason why a function is no program, a clause."""
+
+
+BRANCH = "it branches on a value: write np.where(condition, a, b) in place of `if`, `min` and `max`"
+VALUE = "it asks for the value of a coordinate, by float(), item() or a function of `math`: write np.cos for math.cos"
+BY_CONDITION = "it indexes by a condition: write np.where(condition, a, b)"
+
+
+class TracedArray(np.ndarray):
+    """An array whose elements are traced numbers, or floats; one number is an array of shape ()."""
+
+    __array_priority__ = 2000.0
+
+    def __getitem__(self, index: Any) -> Any:
+        if _holds_traced(index):
+            raise Untraceable(BY_CONDITION)
+        return _array(_raw(self)[index], type(self))
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        if _holds_traced(index):
+            raise Untraceable(BY_CONDITION)
+        _raw(self)[index] = _plain(value)
+
+    def __iter__(self) -> Any:
+        return (self[k] for k in range(len(self)))
+
+    def __bool__(self) -> bool:
+        if self.size == 1 and not isinstance(value := _raw(self).reshape(-1)[0], Traced):
+            return bool(value)
+        raise Untraceable(BRANCH)
+
+    def __float__(self) -> float:
+        if self.size == 1 and not isinstance(value := _raw(self).reshape(-1)[0], Traced):
+            return float(value)
+        raise Untraceable(VALUE)
+
+    def __index__(self) -> int:
+        raise Untraceable(VALUE)
+
+    __int__ = __complex__ = item = tolist = __index__  # type: ignore[assignment]
+
+    def __array_ufunc__(self, ufunc: Any, method: Any, *inputs: Any, out: Any = None, **kwargs: Any) -> Any:
+        function, name, given = ufunc, ufunc.__name__, [_plain(x) for x in inputs]
+        if out is not None and any(_plain(x) is x and method != "__call__" for x in out):
+            raise Untraceable(f"it calls {name} with `out`")
+        options = {key: _plain(x) for key, x in kwargs.items() if key != "dtype"}
+        if name in NATIVE or function.types == ["O" * function.nin + "->O"]:
+            called = function
+        elif name in ELEMENTS:
+            called = np.frompyfunc(ELEMENTS[name], function.nin, 1)
+        else:
+            raise Untraceable(f"{_module(function)}{name} has no rule")
+        result = _array(getattr(called, method)(*given, **options), type(self))
+        if out is None:
+            return result
+        (target,) = out
+        if not isinstance(target, TracedArray):  # V += x: the name is bound to the new value
+            return result if not target.ndim else np.broadcast_to(result, target.shape)
+        _raw(target)[...] = _raw(result)
+        return target
+
+    def __array_function__(self, function: Any, types: Any, args: Any, options: Any) -> Any:
+        name = function.__name__
+        if name in ARRAYS:
+            return self._of(ARRAYS[name](*_plain(args), **_plain(options)))
+        if name not in UNCHANGED:
+            raise Untraceable(f"{_module(function)}{name} has no rule")
+        return self._of(function(*_plain(args), **_plain(options)))
+
+    def _of(self, result: Any) -> Any:
+        return _wrapped(result, type(self))
+
+    # NumPy's methods that do not pass through the protocols
+
+    def sum(self, *args: Any, **options: Any) -> Any:
+        return self._called("sum", args, options)
+
+    def prod(self, *args: Any, **options: Any) -> Any:
+        return self._called("prod", args, options)
+
+    def mean(self, *args: Any, **options: Any) -> Any:
+        return self._called("mean", args, options)
+
+    def var(self, *args: Any, **options: Any) -> Any:
+        return self._called("var", args, options)
+
+    def std(self, *args: Any, **options: Any) -> Any:
+        return self._called("std", args, options)
+
+    def max(self, *args: Any, **options: Any) -> Any:
+        return self._called("max", args, options)
+
+    def min(self, *args: Any, **options: Any) -> Any:
+        return self._called("min", args, options)
+
+    def clip(self, *args: Any, **options: Any) -> Any:
+        return self._called("clip", args, options)
+
+    def dot(self, *args: Any, **options: Any) -> Any:
+        return self._called("dot", args, options)
+
+    def any(self, *args: Any, **options: Any) -> Any:
+        return self._called("any", args, options)
+
+    def all(self, *args: Any, **options: Any) -> Any:
+        return self._called("all", args, options)
+
+    def cumsum(self, *args: Any, **options: Any) -> Any:
+        return self._called("cumsum", args, options)
+
+    def astype(self, *args: Any, **options: Any) -> Any:
+        return self.copy()
+
+    def sort(self, *args: Any, **options: Any) -> Any:
+        raise Untraceable("numpy.sort has no rule")
+
+    def _called(self, name: str, args: Any, options: Any) -> Any:
+        rule = ARRAYS.get(name) or getattr(np, name)
+        return self._of(rule(_raw(self), *_plain(args), **_plain(options)))
+
+    @classmethod
+    def __torch_function__(cls, function: Any, types: Any, args: Any = (), options: Any = None) -> Any:
+        name = getattr(function, "__name__", str(function))
+        given = {_OF_NUMPY.get(key, key): _plain(x) for key, x in (options or {}).items() if key != "dtype"}
+        rule = _torch_rule(name)
+        if rule is None:
+            raise Untraceable(f"torch.{name} has no rule")
+        return _wrapped(rule(*_plain(args), **given), TracedTensor)
+
+
+class TracedTensor(TracedArray):
+    """The same with the names that torch has: of the properties and methods of tensors."""
+
+    @property
+    def dtype(self) -> Any:
+        return _torch().float64
+
+    @property
+    def device(self) -> Any:
+        return _torch().device("cpu")
+
+    requires_grad = False
+    is_cuda = False
+
+    def size(self, dim: int | None = None) -> Any:  # type: ignore[override]
+        return self.shape if dim is None else self.shape[dim]
+
+    def __bool__(self) -> bool:
+        return _array(_raw(self)).__bool__()
+
+    def __float__(self) -> float:
+        return _array(_raw(self)).__float__()
+
+    def __getattribute__(self, name: str) -> Any:
+        if name.startswith("_") or name in _KEPT or name in vars(TracedTensor):
+            return super().__getattribute__(name)
+        rule = _torch_rule(name)
+        if rule is None:
+            return super().__getattribute__(name)
+
+        def method(*args: Any, **options: Any) -> Any:
+            given = {_OF_NUMPY.get(key, key): _plain(x) for key, x in options.items() if key != "dtype"}
+            return _wrapped(rule(_raw(self), *_plain(args), **given), TracedTensor)
+
+        return method
+
+    def detach(self) -> Any:
+        raise Untraceable("it calls detach(), item() or numpy(), which cut derivatives off: leave these out")
+
+    numpy = cpu = detach
+
+
+_KEPT = {"shape", "ndim", "T", "flags", "dtype"}
+_OF_NUMPY = {"dim": "axis", "keepdim": "keepdims", "input": "x", "other": "y"}
+
+
+def _torch() -> Any:
+    import torch
+
+    return torch
+
+
+def _raw(x: np.ndarray) -> np.ndarray:
+    return np.ndarray.view(x, np.ndarray)
+
+
+def _array(x: Any, kind: type[TracedArray] = TracedArray) -> TracedArray:
+    if isinstance(x, Traced) or not isinstance(x, np.ndarray):
+        made = np.empty((), dtype=object)
+        made[()] = x
+        return np.ndarray.view(made, kind)
+    return np.ndarray.view(x if np.ndarray.dtype.__get__(x).kind == "O" else x.astype(object), kind)
+
+
+def _wrapped(x: Any, kind: type[TracedArray]) -> Any:
+    """A result of raw arrays as it is given to the function again."""
+    if isinstance(x, Traced) or (isinstance(x, np.ndarray) and x.dtype == object):
+        return _array(x, kind)
+    if isinstance(x, tuple) and hasattr(x, "_fields"):
+        return type(x)(*(_wrapped(y, kind) for y in x))
+    return type(x)(_wrapped(y, kind) for y in x) if type(x) in (list, tuple) else x
+
+
+def _plain(x: Any) -> Any:
+    """An argument as raw arrays of objects or numbers."""
+    if isinstance(x, TracedArray):
+        return _raw(x)
+    if type(x) in (list, tuple):
+        return type(x)(_plain(y) for y in x)
+    if type(x) is dict:
+        return {key: _plain(y) for key, y in x.items()}
+    if hasattr(x, "detach") and hasattr(x, "requires_grad"):
+        if x.requires_grad:
+            raise Untraceable("it has a tensor that requires gradients, such as weights of a network")
+        return x.detach().cpu().numpy()
+    return x
+
+
+def _holds_traced(index: Any) -> bool:
+    return isinstance(index, TracedArray) or (type(index) is tuple and builtins.any(map(_holds_traced, index)))
+
+
+def _module(function: Any) -> str:
+    module = getattr(function, "__module__", None) or "numpy"
+    return f"{module}." if module != "numpy" or not isinstance(function, np.ufunc) else "numpy."
+
+
+# functions of elements ---------------------------------------------------------------------------------------------
+
+
+def _choose(condition: Any, x: Any, y: Any) -> Any:
+    return apply("where", condition, x, y) if isinstance(condition, Traced) else x if condition else y
+
+
+def _not(x: Any) -> Any:
+    return apply("not", x)
+
+
+def _heaviside(x: Any, at_zero: Any) -> Any:
+    return _choose(apply("eq", x, 0.0), at_zero, _choose(apply("lt", 0.0, x), 1.0, 0.0))
+
+
+def _truncated(x: Any) -> Any:
+    return _choose(apply("lt", x, 0.0), -apply("floor", -x), apply("floor", x))
+
+
+def _logaddexp(x: Any, y: Any) -> Any:
+    return apply("max", x, y) + apply("log1p", apply("exp", -abs(x - y)))
+
+
+def _sigmoid(x: Any) -> Any:
+    return 1.0 / (1.0 + apply("exp", -x))
+
+
+def _softplus(x: Any) -> Any:
+    return apply("max", x, 0.0) + apply("log1p", apply("exp", -abs(x)))
+
+
+def _sinc(x: Any) -> Any:
+    """sin(x)/x, near 0 by its series, whose derivatives do not cancel there."""
+    if not isinstance(x, Traced):
+        return float(np.sinc(x / np.pi))
+    near, squared = abs(x) < 1.0, x * x
+    series: Any = 0.0
+    for k in range(10, -1, -1):
+        series = series * squared + (-1.0) ** k / math.factorial(2 * k + 1)
+    far = apply("where", near, 1.0, x)
+    return apply("where", near, series, apply("sin", far) / far)
+
+
+def _of(name: str) -> Callable[..., Any]:
+    return lambda *x: apply(name, *x)
+
+
+# fmt: off
+NATIVE = {"add", "subtract", "multiply", "divide", "true_divide", "negative", "positive", "matmul", "conjugate"}
+"""Functions that arrays of objects have."""
+ELEMENTS: dict[str, Callable[..., Any]] = {
+    **{name: _of(name) for name in (
+        "exp", "expm1", "log", "log1p", "sin", "cos", "tan", "tanh", "sinh", "cosh", "sqrt", "sign", "floor", "erf",
+        "erfc")},
+    **{f"arc{name}": _of(f"a{name}") for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    "arctan2": _of("atan2"), "absolute": abs, "fabs": abs, "gammaln": _of("lgamma"), "psi": _of("digamma"),
+    "maximum": _of("max"), "minimum": _of("min"), "fmax": _of("max"), "fmin": _of("min"),
+    "less": _of("lt"), "less_equal": _of("le"), "equal": _of("eq"),
+    "greater": lambda x, y: apply("lt", y, x), "greater_equal": lambda x, y: apply("le", y, x),
+    "not_equal": lambda x, y: _not(apply("eq", x, y)),
+    "logical_and": _of("and"), "logical_or": _of("or"), "logical_not": _not,
+    "bitwise_and": _of("and"), "bitwise_or": _of("or"), "invert": _not,
+    "power": lambda x, n: x**n, "float_power": lambda x, n: x**n,
+    "square": lambda x: x * x, "reciprocal": lambda x: 1.0 / x,
+    "hypot": lambda x, y: apply("sqrt", x * x + y * y), "exp2": lambda x: apply("exp", math.log(2.0) * x),
+    "log2": lambda x: apply("log", x) * (1.0 / math.log(2.0)),
+    "log10": lambda x: apply("log", x) * (1.0 / math.log(10.0)),
+    "cbrt": lambda x: apply("sign", x) * abs(x) ** (1.0 / 3.0),
+    "remainder": _of("mod"), "fmod": lambda x, y: x - y * _truncated(x / y),
+    "floor_divide": lambda x, y: apply("floor", x / y), "ceil": lambda x: -apply("floor", -x), "trunc": _truncated,
+    "deg2rad": lambda x: x * (math.pi / 180), "radians": lambda x: x * (math.pi / 180),
+    "rad2deg": lambda x: x * (180 / math.pi), "degrees": lambda x: x * (180 / math.pi),
+    "copysign": lambda x, y: abs(x) * _choose(apply("lt", y, 0.0), -1.0, 1.0), "heaviside": _heaviside,
+    "logaddexp": _logaddexp, "expit": _sigmoid, "log_expit": lambda x: -_softplus(-x),
+    "xlogy": lambda x, y: _choose(apply("eq", x, 0.0), 0.0, x * apply("log", y)),
+    "clip": lambda x, low, high: apply("min", apply("max", x, low), high),
+}
+# fmt: on
+
+
+def _each(name: str, *args: Any) -> np.ndarray:
+    return np.frompyfunc(ELEMENTS[name], len(args), 1)(*map(_objects, args))
+
+
+# functions of arrays -----------------------------------------------------------------------------------------------
+
+
+def _objects(x: Any) -> np.ndarray:
+    return np.asarray(x, dtype=object)
+
+
+def _where(condition: Any, *choices: Any) -> Any:
+    if not choices:
+        raise Untraceable(BY_CONDITION)
+    return np.frompyfunc(_choose, 3, 1)(*map(_objects, (condition, *choices)))
+
+
+def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False, **_: Any) -> Any:
+    if ord in (None, 2, 2.0, "fro"):
+        if ord == 2 and axis is None and np.ndim(x) > 1:
+            raise Untraceable("numpy.linalg.norm of a matrix has no rule of this order")
+        return _each("sqrt", _objects((_objects(x) * x).sum(axis=axis, keepdims=keepdims)))
+    if ord == 1 and (axis is not None or np.ndim(x) == 1) and not isinstance(axis, tuple):
+        return _objects(_each("absolute", x)).sum(axis=axis, keepdims=keepdims)
+    if ord == math.inf and (axis is not None or np.ndim(x) == 1) and not isinstance(axis, tuple):
+        return _extreme("maximum")(_each("absolute", x), axis, keepdims=keepdims)
+    raise Untraceable(f"numpy.linalg.norm of the order {ord!r} has no rule")
+
+
+def _extreme(name: str) -> Callable[..., Any]:
+    def function(x: Any, axis: Any = None, out: Any = None, keepdims: bool = False, **_: Any) -> Any:
+        values = _objects(x)
+        axes = tuple(range(values.ndim)) if axis is None else axis if isinstance(axis, tuple) else (axis,)
+        chosen = np.frompyfunc(ELEMENTS[name], 2, 1)
+        for k in sorted((k % values.ndim for k in axes), reverse=True):
+            values = _objects(chosen.reduce(values, axis=k, keepdims=keepdims))
+        return values
+
+    return function
+
+
+def _variance(x: Any, axis: Any = None, ddof: int = 0, correction: int | None = None, **_: Any) -> Any:
+    values = _objects(x)
+    n = values.size if axis is None else values.shape[axis]
+    apart = values - values.sum(axis=axis, keepdims=True) * (1.0 / n)
+    return (apart * apart).sum(axis=axis) * (1.0 / (n - (ddof if correction is None else correction)))
+
+
+def _mean(x: Any, axis: Any = None, keepdims: bool = False, **_: Any) -> Any:
+    values = _objects(x)
+    axes = range(values.ndim) if axis is None else axis if isinstance(axis, tuple) else (axis,)
+    return values.sum(axis=axis, keepdims=keepdims) / float(math.prod(values.shape[k] for k in axes))
+
+
+def _clip(x: Any, a_min: Any = None, a_max: Any = None, **options: Any) -> Any:
+    low, high = (options.get(key, given) for key, given in (("min", a_min), ("max", a_max)))
+    if low is not None:
+        x = _each("maximum", x, low)
+    return x if high is None else _each("minimum", x, high)
+
+
+def _select(conditions: Sequence[Any], choices: Sequence[Any], default: Any = 0.0) -> Any:
+    pairs = list(zip(conditions, choices, strict=True))
+    return reduce(lambda rest, pair: _where(pair[0], pair[1], rest), pairs[::-1], default)
+
+
+def _piecewise(x: Any, conditions: Sequence[Any], functions: Sequence[Any], *args: Any, **options: Any) -> Any:
+    values = [_plain(f(_array(x), *args, **options)) if callable(f) else f for f in functions]
+    default = values.pop() if len(values) > len(conditions) else 0.0
+    return _select(conditions, values, default)
+
+
+def _minor(M: np.ndarray, i: int, j: int) -> Any:
+    return np.delete(np.delete(M, i, -2), j, -1)
+
+
+def _det(M: Any) -> Any:
+    M = _objects(M)
+    if M.shape[-1] > LARGEST_COFACTORS:
+        return _eliminated(M, M[..., :0])[1]
+    if M.shape[-1] == 1:
+        return M[..., 0, 0]
+    return reduce(operator.add, ((-1.0) ** j * M[..., 0, j] * _det(_minor(M, 0, j)) for j in range(M.shape[-1])))
+
+
+def _solve(M: Any, b: Any) -> Any:
+    M, b = _objects(M), _objects(b)
+    if b.ndim == 1:
+        return _solve(M, b[:, None])[..., 0]
+    if M.shape[-1] > LARGEST_COFACTORS:
+        return _eliminated(M, b)[0]
+    return _inv(M) @ b
+
+
+def _inv(M: Any) -> Any:
+    M = _objects(M)
+    if np.frompyfunc(lambda x: not isinstance(x, Traced), 1, 1)(M).all():
+        return np.linalg.inv(M.astype(float)).astype(object)
+    n = M.shape[-1]
+    if n > LARGEST_COFACTORS:
+        return _eliminated(M, np.broadcast_to(np.eye(n).astype(object), M.shape))[0]
+    if n == 1:
+        return 1.0 / M
+    rows = [[(-1.0) ** (i + j) * _det(_minor(M, j, i)) for j in range(n)] for i in range(n)]
+    adjugate = np.stack([np.stack([_objects(x) for x in row], -1) for row in rows], -2)
+    return adjugate * _objects(1.0 / _det(M))[..., None, None]
+
+
+def _eliminated(M: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, Any]:
+    """M⁻¹b and det M by Gauss's elimination, rows exchanged where a pivot below is larger."""
+    n = M.shape[-1]
+    rows = [np.concatenate([M[..., i, :], b[..., i, :]], -1) for i in range(n)]
+    det: Any = 1.0
+    for k in range(n):
+        for i in range(k + 1, n):
+            larger = _each("less", _each("absolute", rows[k][..., k]), _each("absolute", rows[i][..., k]))
+            swap = _objects(larger)[..., None]
+            rows[k], rows[i] = _where(swap, rows[i], rows[k]), _where(swap, rows[k], rows[i])
+            det = det * _where(larger, -1.0, 1.0)
+        det = det * rows[k][..., k]
+        pivot = _objects(1.0 / rows[k][..., k])[..., None]
+        rows[k] = rows[k] * pivot
+        for i in range(n):
+            if i != k:
+                rows[i] = rows[i] - _objects(rows[i][..., k])[..., None] * rows[k]
+    return np.stack(rows, -2)[..., n:], det
+
+
+def _like(fill: float) -> Callable[..., np.ndarray]:
+    return lambda x, *_, **__: np.full(np.shape(x), fill).astype(object)
+
+
+def _reduced(name: str) -> Callable[..., Any]:
+    def function(x: Any, axis: Any = None, **_: Any) -> Any:
+        return np.frompyfunc(ELEMENTS[name], 2, 1).reduce(_objects(x).reshape(-1) if axis is None else x, axis or 0)
+
+    return function
+
+
+ARRAYS: dict[str, Callable[..., Any]] = {
+    "where": _where, "norm": _norm, "vector_norm": _norm, "clip": _clip, "select": _select, "piecewise": _piecewise,
+    "amax": _extreme("maximum"), "max": _extreme("maximum"), "amin": _extreme("minimum"), "min": _extreme("minimum"),
+    "mean": _mean, "var": _variance, "std": lambda *x, **options: _each("sqrt", _objects(_variance(*x, **options))),
+    "det": _det, "inv": _inv, "solve": _solve, "zeros_like": _like(0.0), "ones_like": _like(1.0),
+    "full_like": lambda x, value, **_: np.full(np.shape(x), value).astype(object), "empty_like": _like(0.0),
+    "sinc": lambda x: np.frompyfunc(lambda y: _sinc(math.pi * y), 1, 1)(_objects(x)),
+    "real": lambda x: x,
+    "any": _reduced("logical_or"), "all": _reduced("logical_and"), "vecdot": lambda x, y, **_: (x * y).sum(-1),
+    "linalg_vecdot": lambda x, y, **_: (x * y).sum(-1), "iscomplexobj": lambda x: False,
+}  # fmt: skip
+# fmt: off
+UNCHANGED = {
+    "append", "array_split", "atleast_1d", "atleast_2d", "atleast_3d", "average", "block", "broadcast_arrays",
+    "broadcast_to", "column_stack", "concat", "concatenate", "convolve", "copy", "correlate", "cross", "cumprod",
+    "cumsum", "delete", "diag", "diagflat", "diagonal", "diff", "dot", "dsplit", "dstack", "ediff1d", "einsum",
+    "expand_dims", "flip", "fliplr", "flipud", "gradient", "hsplit", "hstack", "inner", "insert", "kron", "matmul",
+    "matrix_power", "matrix_transpose", "meshgrid", "moveaxis", "multi_dot", "ndim", "outer", "pad", "permute_dims",
+    "polyval", "prod", "ravel", "repeat", "reshape", "roll", "rollaxis", "rot90", "shape", "size", "split",
+    "squeeze", "stack", "sum", "swapaxes", "take", "take_along_axis", "tensordot", "tile", "trace", "transpose",
+    "trapezoid", "tril", "triu", "unstack", "vander", "vdot", "vsplit", "vstack",
+}
+# fmt: on
+"""NumPy's functions whose own code takes arrays of objects."""
+
+
+# torch -------------------------------------------------------------------------------------------------------------
+
+
+def _flat(x: Any) -> Any:
+    return x[0] if len(x) == 1 and isinstance(x[0], list | tuple) else x
+
+
+def _softmax(x: Any, axis: int = -1, **_: Any) -> Any:
+    powers = _objects(_each("exp", x))
+    return powers / powers.sum(axis=axis, keepdims=True)
+
+
+def _extremes(name: str) -> Callable[..., Any]:
+    """torch's max and min: of two arrays, along an axis with indices, which are not to be had, or of all."""
+
+    def function(x: Any, *args: Any, **options: Any) -> Any:
+        if args and isinstance(args[0], np.ndarray):
+            return _each(name, x, args[0])
+        found = _extreme(name)(x, *args, **options)
+        return _Extremes(found) if args or "axis" in options else found
+
+    return function
+
+
+class _Extremes(tuple[Any, ...]):
+    """The values along an axis, in place of torch's pair of values and indices."""
+
+    _fields = ("values",)
+
+    def __new__(cls, values: Any) -> _Extremes:
+        return super().__new__(cls, (values,))
+
+    @property
+    def values(self) -> Any:
+        return self[0]
+
+
+def _in_place(name: str) -> Callable[..., Any]:
+    return lambda x, y, **_: getattr(operator, name)(x, y)
+
+
+def _reshaped(x: Any, *shape: Any) -> Any:
+    return np.reshape(x, tuple(_flat(shape)))
+
+
+def _expanded(x: Any, *shape: Any) -> Any:
+    shape, old = tuple(_flat(shape)), np.shape(x)
+    padded = (1,) * (len(shape) - len(old)) + old
+    return np.broadcast_to(x, tuple(n if m == -1 else m for m, n in zip(shape, padded, strict=True)))
+
+
+def _summed(x: Any, axis: Any = None, keepdims: bool = False, **_: Any) -> Any:
+    return np.sum(x, axis=tuple(axis) if isinstance(axis, list) else axis, keepdims=keepdims)
+
+
+def _gelu(x: Any, approximate: str = "none") -> Any:
+    if approximate != "none":
+        raise Untraceable("torch.gelu has no rule where it is approximate")
+    return 0.5 * x * (1.0 + _each("erf", x * (1.0 / math.sqrt(2.0))))
+
+
+def _chunks(x: Any, size: int, axis: int = 0) -> Any:
+    return tuple(np.split(x, range(size, np.shape(x)[axis], size), axis))
+
+
+_SELF = lambda x, *_, **__: x  # noqa: E731
+# fmt: off
+TORCH: dict[str, Callable[..., Any]] = {
+    "add": lambda x, y, alpha=1: x + alpha * y, "sub": lambda x, y, alpha=1: x - alpha * y,
+    "mul": lambda x, y: x * y, "div": lambda x, y: x / y, "pow": lambda x, n: _each("power", x, n),
+    "rsub": lambda x, y: y - x, "rpow": lambda x, y: _each("power", y, x), "neg": lambda x: -x,
+    "abs": lambda x: _each("absolute", x), "square": lambda x: x * x, "rsqrt": lambda x: 1.0 / _each("sqrt", x),
+    "sigmoid": lambda x: _each("expit", x), "softplus": lambda x, *a: np.frompyfunc(_softplus, 1, 1)(_objects(x)),
+    "silu": lambda x, **_: x * _each("expit", x), "relu": lambda x, **_: _each("maximum", x, 0.0), "gelu": _gelu,
+    "elu": lambda x, alpha=1.0, **_: _where(_each("less", 0.0, x), x, alpha * _each("expm1", x)),
+    "tril": np.tril, "triu": np.triu, "stack": lambda x, axis=0: np.stack([_objects(y) for y in x], axis),
+    "cat": lambda x, axis=0: np.concatenate(x, axis), "concat": lambda x, axis=0: np.concatenate(x, axis),
+    "linear": lambda x, w, b=None: x @ np.swapaxes(w, -1, -2) + (0.0 if b is None else b),
+    "roll": lambda x, shifts, dims=None, axis=None: np.roll(x, shifts, dims if axis is None else axis),
+    "einsum": lambda e, *x: np.einsum(e, *_flat(x)), "norm": lambda x, p=2, axis=None, keepdims=False, **_: _norm(
+        x, None if p == "fro" else p, axis, keepdims),
+    "linalg_norm": _norm, "linalg_vector_norm": lambda x, ord=2, axis=None, keepdims=False, **_: _norm(
+        x if axis is not None else _objects(x).reshape(-1), ord, axis, keepdims),
+    "sum": _summed, "prod": lambda x, axis=None, keepdims=False, **_: np.prod(x, axis=axis, keepdims=keepdims),
+    "mean": _mean, "var": lambda x, axis=None, correction=1, **_: _variance(x, axis, correction),
+    "diff": lambda x, n=1, axis=-1, **_: np.diff(x, n, axis), "cumsum": np.cumsum,
+    "logsumexp": lambda x, axis, keepdims=False: np.frompyfunc(_logaddexp, 2, 1).reduce(
+        _objects(x), axis=axis, keepdims=keepdims), "softmax": _softmax,
+    "max": _extremes("maximum"), "min": _extremes("minimum"), "amax": _extreme("maximum"), "amin": _extreme("minimum"),
+    "maximum": lambda x, y: _each("maximum", x, y), "minimum": lambda x, y: _each("minimum", x, y),
+    "clamp": lambda x, min=None, max=None: _clip(x, min, max), "clamp_min": _clip,
+    "clamp_max": lambda x, high: _clip(x, None, high), "fmod": lambda x, y: _each("fmod", x, y),
+    "remainder": lambda x, y: _each("remainder", x, y), "mod": lambda x, y: _each("remainder", x, y),
+    "where": _where, "det": _det, "linalg_det": _det, "linalg_inv": _inv, "inverse": _inv, "linalg_solve": _solve,
+    "matmul": np.matmul, "mm": np.matmul, "mv": np.matmul, "bmm": np.matmul, "dot": np.dot, "inner": np.inner,
+    "outer": np.outer, "ger": np.outer, "tensordot": lambda x, y, dims=2, axis=None: np.tensordot(
+        x, y, dims if axis is None else axis), "trace": np.trace, "vecdot": lambda x, y, axis=-1: (x * y).sum(axis),
+    "linalg_vecdot": lambda x, y, axis=-1: (x * y).sum(axis), "cross": lambda x, y, axis=-1: np.cross(x, y, axis=axis),
+    "linalg_cross": lambda x, y, axis=-1: np.cross(x, y, axis=axis),
+    "addcmul": lambda x, y, z, value=1: x + value * y * z,
+    "unbind": lambda x, axis=0: tuple(np.moveaxis(x, axis, 0)), "split": _chunks,
+    "chunk": lambda x, n, axis=0: _chunks(x, -(-np.shape(x)[axis] // n), axis), "unsqueeze": np.expand_dims,
+    "squeeze": lambda x, axis=None: np.squeeze(x, axis) if axis is None or np.shape(x)[axis] == 1 else x,
+    "view": _reshaped, "reshape": _reshaped, "flatten": lambda x, *a: np.ravel(x), "ravel": np.ravel,
+    "expand": _expanded, "expand_as": lambda x, y: np.broadcast_to(x, np.shape(y)),
+    "broadcast_to": np.broadcast_to, "permute": lambda x, *axes, dims=None: np.transpose(
+        x, _flat(axes) if dims is None else dims), "transpose": np.swapaxes, "swapaxes": np.swapaxes,
+    "movedim": np.moveaxis, "moveaxis": np.moveaxis, "t": np.transpose, "flip": lambda x, *axes, axis=None: np.flip(
+        x, tuple(_flat(axes)) if axis is None else axis), "repeat": lambda x, *n: np.tile(x, tuple(_flat(n))),
+    "narrow": lambda x, axis, start, n: np.take(x, range(start, start + n), axis),
+    "select": lambda x, axis, i: np.take(x, i, axis), "index_select": lambda x, axis, i: np.take(x, i, axis),
+    "diagonal": lambda x, offset=0, dim1=0, dim2=1: np.diagonal(x, offset, dim1, dim2), "diag": np.diag,
+    "zeros_like": _like(0.0), "ones_like": _like(1.0), "full_like": ARRAYS["full_like"],
+    "new_zeros": lambda x, *n, **_: np.zeros(_flat(n)).astype(object), "numel": np.size, "dim": np.ndim,
+    "clone": lambda x, **_: np.array(x), "contiguous": _SELF, "to": _SELF, "double": _SELF, "type": _SELF,
+    "type_as": _SELF, "positive": _SELF, "lgamma": lambda x: _each("gammaln", x),
+    "digamma": lambda x: _each("psi", x), "special_erf": lambda x: _each("erf", x),
+    "special_erfc": lambda x: _each("erfc", x), "special_expit": lambda x: _each("expit", x),
+    "special_gammaln": lambda x: _each("gammaln", x), "atan2": lambda x, y: _each("arctan2", x, y),
+    "logaddexp": lambda x, y: _each("logaddexp", x, y), "heaviside": lambda x, y: _each("heaviside", x, y),
+    "hypot": lambda x, y: _each("hypot", x, y), "sinc": ARRAYS["sinc"],
+    "any": ARRAYS["any"], "all": ARRAYS["all"], "is_floating_point": lambda x: True, "is_complex": lambda x: False,
+    **{name: (lambda x, name=f"arc{name[1:]}": _each(name, x)) for name in (
+        "asin", "acos", "atan", "asinh", "acosh", "atanh")},
+    **{f"arc{name}": (lambda x, name=f"arc{name}": _each(name, x)) for name in (
+        "sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{name: (lambda x, name=name: _each(name, x)) for name in (
+        "exp", "exp2", "expm1", "log", "log2", "log10", "log1p", "sin", "cos", "tan", "tanh", "sinh", "cosh", "sqrt",
+        "sign", "floor", "ceil", "trunc", "erf", "erfc", "reciprocal", "deg2rad", "rad2deg")},
+    **{short: (lambda x, y, name=name: _each(name, x, y)) for short, name in (
+        ("lt", "less"), ("le", "less_equal"), ("gt", "greater"), ("ge", "greater_equal"), ("eq", "equal"),
+        ("ne", "not_equal"), ("logical_and", "logical_and"), ("logical_or", "logical_or"), ("and", "logical_and"),
+        ("or", "logical_or"))},
+    "logical_not": lambda x: _each("logical_not", x), "invert": lambda x: _each("logical_not", x),
+}
+# fmt: on
+_LONG = {"subtract": "sub", "multiply": "mul", "divide": "div", "truediv": "div", "negative": "neg", "absolute": "abs"}
+
+
+def _torch_rule(name: str) -> Callable[..., Any] | None:
+    """The rule of a function or method of torch, by its name, of an operator of tensors too."""
+    if name in TORCH:
+        return TORCH[name]
+    bare = name.strip("_")
+    if name.startswith("__") and bare[:1] in "ri" and _LONG.get(bare[1:], bare[1:]) in TORCH:
+        rule = TORCH[_LONG.get(bare[1:], bare[1:])]
+        return (lambda x, y: rule(y, x)) if bare[0] == "r" else rule
+    if name.endswith("_") and not name.startswith("_"):
+        return None  # in place, of a tensor
+    return TORCH.get(_LONG.get(bare, bare))
+
+
+# recording ---------------------------------------------------------------------------------------------------------
+
+
+def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
+    """Record a function of arrays, which returns one number.
+
+    Parameters
+    ----------
+    function : callable
+    names : sequence
+        Of each argument: the names of the elements of an array, or that of a number.
+    torch : bool
+        True of a function that takes tensors.
+
+    Raises
+    ------
+    Untraceable
+        With the reason.
+    """
+    recording = Recording()
+    kind = TracedTensor if torch else TracedArray
+    inputs, args = [], []
+    for each in names:
+        numbers = [recording.input(name) for name in ([each] if isinstance(each, str) else each)]
+        array: np.ndarray = np.empty(len(numbers), dtype=object)
+        array[:] = numbers
+        array = array[0:1].reshape(()) if isinstance(each, str) else array
+        array.flags.writeable = False
+        inputs += numbers
+        args.append(np.ndarray.view(array, kind))
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            value = _objects(_plain(function(*args)))
+    except Untraceable:
+        raise
+    except RecursionError as error:
+        raise Untraceable("it is too deep to be traced") from error
+    except Exception as error:  # whatever a user's function raises
+        shown = str(error).splitlines()[0] if str(error) else ""
+        known = {"in place of a branch": BRANCH, "no float()": VALUE}
+        reason = next((r for part, r in known.items() if part in shown), f"{type(error).__name__}: {shown[:160]}")
+        raise Untraceable(reason) from error
+    if value.shape != () or not isinstance(value[()], Traced | float | int | np.number):
+        raise Untraceable(f"it returns an array of shape {value.shape} for one state")
+    return Program(inputs, [value[()]])

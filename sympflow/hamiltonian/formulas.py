@@ -1,0 +1,367 @@
+"""Formulas: functions of letters that programs are recorded of, whether H was given by symbols or by Python functions.
+
+A form says what H is made of. That of symbols is `SymbolicHamiltonian`, whose expressions are SymPy's; that of Python
+functions is `TracedHamiltonian`, whose expressions are programs. Kernels take either, and no more than they share.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sympflow.arrays import Array, assemble, is_tensor
+from sympflow.compiler.functions import apply
+from sympflow.compiler.program import Program, Recording, Traced, gradient, tangent, traced
+
+__all__ = ["Formula", "Letter", "TracedDriving", "TracedHamiltonian", "TracedLetters", "evaluator", "recorded"]
+
+_POLYNOMIAL = {"add", "sub", "mul", "times", "neg", "fma"}
+
+
+class Letter(NamedTuple):
+    """A variable of a formula."""
+
+    name: str
+
+
+class Formula:
+    """A function of letters, a program of one output.
+
+    Parameters
+    ----------
+    program : Program
+    letters : sequence of Letter
+        Those of its inputs.
+    """
+
+    def __init__(self, program: Program, letters: Sequence[Letter]) -> None:
+        self.program, self.letters = program, tuple(letters)
+
+    @cached_property
+    def _text(self) -> str:
+        return str(self.program)
+
+    def __str__(self) -> str:
+        return self._text
+
+    def __hash__(self) -> int:
+        return hash(self._text)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Formula) and self._text == other._text
+
+    def __len__(self) -> int:
+        return len(self.program)
+
+    def value(self, known: Mapping[Any, Any]) -> Any:
+        """The value, of numbers for the letters."""
+        return self.program(*(known[s] for s in self.letters))[0]
+
+    def diff(self, letter: Letter) -> Formula:
+        """The derivative by a letter."""
+        program = self.program
+        (slope,) = gradient(program.outputs[0], [program.inputs[self.letters.index(letter)]])
+        return Formula(Program(program.inputs, [slope]), self.letters)
+
+    def is_polynomial(self, *letters: Letter) -> bool:
+        """True if the program has sums and products alone."""
+
+        def is_simple(x: Traced) -> bool:
+            if x.name == "pow":
+                n = x.args[1]
+                return isinstance(n, float) and n >= 0 and n % 1 == 0
+            return x.name in _POLYNOMIAL or (x.name == "div" and isinstance(x.args[1], float))
+
+        return all(map(is_simple, self.program.operations))
+
+
+class Entries:
+    """The entries of a matrix of numbers, in place of a matrix of symbols."""
+
+    free_symbols: frozenset[Any] = frozenset()
+
+    def __init__(self, matrix: np.ndarray) -> None:
+        self._rows = matrix.tolist()
+
+    def __getitem__(self, place: tuple[int, int]) -> float:
+        return self._rows[place[0]][place[1]]
+
+
+class TracedHamiltonian:
+    """The form of a system that was given by Python functions: what a `SymbolicHamiltonian` is for one by symbols.
+
+    Parameters
+    ----------
+    ndof : int
+    program : Program
+        V of q, or H of q and p; of a driven system of the time first.
+    separable : bool
+        True of V.
+    inverse_mass : ndarray, optional
+        (d,) or (d, d), of V.
+    timed : bool
+
+    Attributes
+    ----------
+    H, V, T : Formula
+        V and T are None if it is not separable.
+    parameters : tuple of Letter
+        Those of the time, in the form that `driving` has.
+    """
+
+    parameters: tuple[Letter, ...] = ()
+    values: tuple[float, ...] = ()
+    samples: Mapping[str, Any] = MappingProxyType({})
+
+    def __init__(
+        self, ndof: int, program: Program, separable: bool, inverse_mass: np.ndarray | None = None, timed: bool = False
+    ) -> None:
+        self.ndof, self.program, self.separable = ndof, program, separable
+        self.q = tuple(Letter(f"q{i + 1}") for i in range(ndof))
+        self.p = tuple(Letter(f"p{i + 1}") for i in range(ndof))
+        self.time = Letter("t") if timed else None
+        times = (self.time,) if self.time else ()
+        self.V: Formula | None = None
+        self.T: Formula | None = None
+        self.inverse_mass: Entries | None = None
+        if not separable:
+            self.H = Formula(program, (*times, *self.q, *self.p))
+            return
+        M = np.ones(ndof) if inverse_mass is None else inverse_mass
+        M = np.diag(M) if M.ndim == 1 else M
+        self.inverse_mass = Entries(M)
+        self.T = Formula(traced(lambda *p: [_kinetic(M, p)], *(s.name for s in self.p)), self.p)
+        self._set_potential(Formula(program, (*times, *self.q)))
+
+    def _set_potential(self, V: Formula) -> None:
+        T, n = self.T, len(V.letters)
+        assert T is not None
+        letters = (*V.letters, *self.p)
+        H = traced(lambda *x: [V.program(*x[:n])[0] + T.program(*x[n:])[0]], *(s.name for s in letters))
+        self.V, self.H = V, Formula(H, letters)
+
+    @property
+    def parametric(self) -> TracedHamiltonian:
+        return self
+
+    @cached_property
+    def size(self) -> int:
+        """Operations of ∇V, or of ∇H."""
+        return len(self._orders[0])
+
+    @cached_property
+    def driving(self) -> TracedDriving:
+        """The form with letters for what depends on the time alone."""
+        assert self.V is not None
+        (V,), letters = without_time([self.V], self.time)
+        form = copy.copy(self)
+        form.time, form.parameters = None, tuple(letters)
+        form._set_potential(V)
+        return TracedDriving(form, letters)
+
+    # arrays, of V in q or of H in [q, p] --------------------------------------------------------------------------
+
+    @cached_property
+    def _orders(self) -> tuple[Program, Program]:
+        """The gradient, and the Hessian row by row to the diagonal."""
+        y, inputs = self.program.outputs[0], self.program.inputs
+        x = inputs[1:] if self.time else inputs
+        slope = gradient(y, x)
+        rows = [entry for i, s in enumerate(slope) for entry in gradient(s, x[: i + 1])]
+        return Program(inputs, slope), Program(inputs, rows)
+
+    @cached_property
+    def _along(self) -> tuple[Program, Program]:
+        """∇²V·v and ∇³V(v, w), of the inputs and vectors."""
+        inputs = [repr(x) for x in self.program.inputs]
+        n, d = len(inputs), self.ndof
+        names = [*inputs, *(f"{letter}{i}" for letter in "vw" for i in range(d))]
+
+        def products(*numbers: Any) -> list[Any]:
+            x = numbers[n - d : n]
+            v, w = numbers[n : n + d], numbers[n + d :]
+            product = tangent(self._orders[0](*numbers[:n]), x, v)
+            return [*product, *tangent(product, x, w)]
+
+        both = traced(products, *names)
+        return Program(both.inputs[: n + d], both.outputs[:d]), Program(both.inputs, both.outputs[d:])
+
+    def value(self, x: Array, *t: Any) -> Array:
+        """V of q (..., d), or H of y (..., 2d): (...)."""
+        return self._assembled(self.program, x, *t)[..., 0]
+
+    def gradient(self, x: Array, *t: Any) -> Array:
+        """Its gradient, (..., n)."""
+        return self._assembled(self._orders[0], x, *t)
+
+    def hessian(self, x: Array, *t: Any) -> Array:
+        """Its Hessian, (..., n, n)."""
+        n = x.shape[-1]
+        rows = self._assembled(self._orders[1], x, *t)
+        pairs = [(max(i, j), min(i, j)) for i in range(n) for j in range(n)]
+        return rows[..., [i * (i + 1) // 2 + j for i, j in pairs]].reshape(*x.shape[:-1], n, n)
+
+    def hessian_vector(self, q: Array, v: Array, *t: Any) -> Array:
+        """∇²V·v, (..., d)."""
+        return self._assembled(self._along[0], q, *t, more=(v,))
+
+    def third_derivative(self, q: Array, v: Array, w: Array, *t: Any) -> Array:
+        """∇³V(v, w), (..., d)."""
+        return self._assembled(self._along[1], q, *t, more=(v, w))
+
+    def time_derivative(self, x: Array, t: Any) -> Array:
+        """∂V/∂t or ∂H/∂t, (...)."""
+        inputs = self.program.inputs
+        slope = Program(inputs, gradient(self.program.outputs[0], inputs[:1]))
+        return self._assembled(slope, x, t)[..., 0]
+
+    def _assembled(self, program: Program, x: Array, *t: Any, more: Sequence[Array] = ()) -> Array:
+        arrays = (x, *more)
+        columns = [a[..., i] for a in arrays for i in range(a.shape[-1])]
+        if is_tensor(x):
+            import torch
+
+            t = tuple(torch.as_tensor(s, dtype=x.dtype, device=x.device) for s in t)
+        with np.errstate(all="ignore"):
+            values = program(*t[: self.time is not None], *columns)
+        return assemble(values, sum(columns[:: max(x.shape[-1], 1)]) if more else columns[0])
+
+
+class TracedDriving:
+    """Letters of a traced V that depend on the time alone, and V in these.
+
+    Attributes
+    ----------
+    form : TracedHamiltonian
+    means : tuple
+        Those of T, none.
+    """
+
+    means: tuple[()] = ()
+
+    def __init__(self, form: TracedHamiltonian, letters: Mapping[Letter, Formula]) -> None:
+        self.form, self._letters = form, letters
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        return tuple(self._letters.items())
+
+    def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
+        """The letters at a time."""
+        return _at_time(self._letters, time)
+
+    def check(self) -> None:
+        """All that was traced has a compiled form."""
+
+
+class TracedLetters:
+    """Formulas with letters for what depends on the time alone.
+
+    Attributes
+    ----------
+    symbols : TracedHamiltonian
+    expressions : list of Formula
+    letters : mapping of Letter to Formula
+    given : tuple of Letter
+    """
+
+    def __init__(self, form: TracedHamiltonian, expressions: Sequence[Formula]) -> None:
+        self.symbols, self.expressions, self.letters = form, list(expressions), dict[Letter, Formula]()
+        if form.time is not None:
+            self.expressions, self.letters = without_time(expressions, form.time)
+        self.given = (*form.parameters, *self.letters)
+
+    def at(self, t: Any, parameters: Sequence[Any]) -> list[Any]:
+        """The letters at times t, numbers of compiled code."""
+        return [t.code.operand(x, t.type) for x in _at_time(self.letters, t)]
+
+
+def _at_time(letters: Mapping[Letter, Formula], time: Any) -> list[Any]:
+    """Values of letters at a time, common operations once."""
+    together = traced(lambda t: [f.program(t)[0] for f in letters.values()], "t")
+    return together(time)
+
+
+def without_time(formulas: Sequence[Formula], time: Any) -> tuple[list[Formula], dict[Letter, Formula]]:
+    """Formulas with letters for the largest parts that depend on the time alone; these as formulas of it."""
+    found: dict[Letter, Formula] = {}
+    return [_without_time(f, time, found) for f in formulas], found
+
+
+def _without_time(f: Formula, time: Letter, found: dict[Letter, Formula]) -> Formula:
+    program, place = f.program, f.letters.index(time)
+    t = program.inputs[place]
+    moving = {x.order for x in program.inputs if x is not t}
+    for x in program.operations:
+        if any(isinstance(a, Traced) and a.order in moving for a in x.args):
+            moving.add(x.order)
+    used = [a for x in (*program.operations,) if x.order in moving for a in x.args] + list(program.outputs)
+    own: dict[int, Letter] = {}
+    for a in used:
+        if isinstance(a, Traced) and a.order not in moving and a.order not in own:
+            own[a.order] = Letter(f"letter_{len(found)}")
+            found[own[a.order]] = Formula(Program([t], [a]), (time,))
+    others = [(s, x) for s, x in zip(f.letters, program.inputs, strict=True) if x is not t]
+    recording = Recording()
+    inputs = [recording.input(s.name) for s, _ in others]
+    of: dict[int, Any] = {x.order: new for (_, x), new in zip(others, inputs, strict=True)}
+    of |= {order: recording.input(letter.name) for order, letter in own.items()}
+    for x in program.operations:
+        if x.order in moving:
+            of[x.order] = apply(x.name, *(of[a.order] if isinstance(a, Traced) else a for a in x.args))
+    (y,) = program.outputs
+    letters = [of[order] for order in own]
+    return Formula(
+        Program([*inputs, *letters], [of[y.order] if isinstance(y, Traced) else y]),
+        (*(s for s, _ in others), *own.values()),
+    )
+
+
+def _kinetic(M: np.ndarray, p: Sequence[Any]) -> Any:
+    """½ pᵀM⁻¹p."""
+    total: Any = 0.0
+    for i, row in enumerate(M.tolist()):
+        for j, entry in enumerate(row):
+            if entry:
+                total = total + (0.5 * entry) * (p[i] * p[j])
+    return total
+
+
+def evaluator(numbers: Mapping[Any, Any]) -> Callable[[Any], Any]:
+    """Return a function of expressions that calculates with these numbers; common subexpressions once.
+
+    Raises
+    ------
+    NotRecorded
+        From that function, if something in an expression cannot be calculated.
+    """
+    known: dict[Any, Any] = dict(numbers)
+
+    def value(f: Any) -> Any:
+        if isinstance(f, float):
+            return f
+        if f not in known:
+            known[f] = f.value(known) if isinstance(f, Formula) else _of_symbols()(f, value)
+        return known[f]
+
+    return value
+
+
+def _of_symbols() -> Callable[[Any, Callable[[Any], Any]], Any]:
+    from sympflow.hamiltonian.recorded import calculated
+
+    return calculated
+
+
+def recorded(expressions: Sequence[Any], inputs: Sequence[Any]) -> Program:
+    """Expressions as a program of letters or symbols."""
+
+    def values(*numbers: Any) -> list[Any]:
+        return list(map(evaluator(dict(zip(inputs, numbers, strict=True))), expressions))
+
+    return traced(values, *(s.name for s in inputs))

@@ -1,0 +1,313 @@
+"""Python functions, written with NumPy or torch, are traced: every method runs for them as for the same H by text."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, lyapunov, solve
+from sympflow.compiler.program import gradient
+from sympflow.compiler.tracing import Untraceable, trace
+
+RNG = np.random.default_rng(3)
+A, M = RNG.normal(size=(4, 4)), np.array([1.0, 2.0, 3.0, 4.0])
+AT, MT = torch.tensor(A), torch.tensor(M)
+FIRST, SECOND = np.triu_indices(4, 1)
+Y0 = np.array([0.1, 0.2, 0.3, 0.4])
+
+
+def over_pairs(library):
+    def V(q):
+        total = 0.0
+        for a in range(4):
+            for b in range(a):
+                total = total + 1 / library.sqrt((q[..., a] - q[..., b]) ** 2 + 0.1)
+        return total
+
+    return V
+
+
+def accumulated(q):
+    V = np.zeros(q.shape[:-1])
+    for a in range(4):
+        V += q[..., a] ** 2
+    return V
+
+
+def assigned(q):
+    V = np.zeros_like(q)
+    V[..., 0] = q[..., 0] ** 2
+    V[..., 1:] = np.sin(q[..., 1:])
+    return V.sum(-1)
+
+
+def bodies(q):
+    x = q.reshape((*q.shape[:-1], 2, 2))
+    d = x[..., None, :, :] - x[..., :, None, :]
+    return (1 / np.sqrt((d**2).sum(-1) + 0.1)).sum((-1, -2))
+
+
+def matrix(q, library=np):
+    rows = [[1 + q[..., 0] ** 2, q[..., 1]], [q[..., 1], 2 + q[..., 2] ** 2]]
+    return library.stack([library.stack(row, -1) for row in rows], -2)
+
+
+def large_matrix(q):
+    return np.eye(4) * (5 + q[..., :1, None] ** 2) + q[..., :, None] * A * q[..., None, :]
+
+
+def unpacked(a, b, c, d):
+    return a * b + c * d
+
+
+# fmt: off
+NUMPY = {
+    "a sum and a cosine": lambda q: (q**2).sum(-1) / 2 + np.cos(q[..., 0]),
+    "np.sum": lambda q: np.sum(q**4, axis=-1) / 4,
+    "einsum": lambda q: np.einsum("...i,ij,...j->...", q, A, q) + np.einsum("...i,...i->...", q, q @ A),
+    "matmul": lambda q: ((q @ A) * q).sum(-1) + (A @ q[..., None])[..., 0].sum(-1),
+    "norm": lambda q: 1 / np.linalg.norm(q, axis=-1) + np.linalg.norm(q, ord=1, axis=-1),
+    "diff and roll": lambda q: (np.diff(q, axis=-1) ** 2).sum(-1) + ((np.roll(q, 1, -1) - q) ** 4).sum(-1),
+    "where": lambda q: np.where(q > 0, q**2, q**4).sum(-1) + np.where(q[..., 0] < 0.1, q[..., 0], q[..., 1]),
+    "loops": over_pairs(np), "pairs by indices": lambda q: (1 / np.abs(q[..., FIRST] - q[..., SECOND])).sum(-1),
+    "stack": lambda q: (np.stack([q[..., 0] * q[..., 1], np.sin(q[..., 2])], -1) ** 2).sum(-1),
+    "concatenate": lambda q: (np.concatenate([q[..., :2], q[..., 3:]], -1) ** 2).sum(-1),
+    "tensordot and dot": lambda q: np.tensordot(q, M, axes=(-1, 0)) + np.dot(q, M),
+    "elementary": lambda q: (np.exp(-(q**2)) + np.log(1 + q**2) + np.sqrt(1 + q * q) + np.tanh(q)).sum(-1),
+    "bases": lambda q: (np.log10(2 + q) + np.log2(2 + q) + np.exp2(q) + np.cbrt(q) + np.logaddexp(q, 1)).sum(-1),
+    "rounding": lambda q: (np.floor(3 * q) * q + np.mod(q, 0.3) + np.fmod(q, 0.3) + np.trunc(9 * q) * q).sum(-1),
+    "maximum": lambda q: np.maximum(q, 0.1).sum(-1) + np.clip(q, -0.2, 0.2).sum(-1) + q.max(-1) + q.min(-1),
+    "abs and prod": lambda q: abs(q).sum(-1) + np.abs(q).prod(-1) + np.sign(q[..., 0]) * q[..., 0],
+    "arctan2": lambda q: np.arctan2(q[..., 0], q[..., 1]) + np.hypot(q[..., 2], q[..., 3]),
+    "powers": lambda q: (np.abs(q) ** 1.5 + np.power(2.0, q) + np.power(np.abs(q), 0.5)).sum(-1),
+    "unpacked": lambda q: unpacked(*np.moveaxis(q, -1, 0)),
+    "asarray": lambda q: np.asarray(q)[..., 0] ** 2 + np.cos(np.asarray(q)[..., 1]), "bodies": bodies,
+    "outer": lambda q: (q[..., :, None] * q[..., None, :] * A).sum((-1, -2)),
+    "statistics": lambda q: q.mean(-1) + np.var(q, axis=-1) + np.std(q, axis=-1),
+    "cross": lambda q: np.cross(q[..., :3], np.array([0, 0, 1.0]))[..., 0],
+    "cumsum": lambda q: (np.cumsum(q, -1) ** 2).sum(-1), "accumulated": accumulated, "assigned": assigned,
+    "numbers of NumPy": lambda q: np.float64(2) * q[..., 0] + M[1] * q[..., 1],
+    "solve": lambda q: (np.linalg.solve(A, q[..., None])[..., 0] * q).sum(-1),
+    "det": lambda q: np.linalg.det(matrix(q)) + np.linalg.det(large_matrix(q)),
+    "inv": lambda q: (np.linalg.inv(matrix(q)) @ q[..., :2, None])[..., 0, 0],
+    "solve by elimination": lambda q: (np.linalg.solve(large_matrix(q), q[..., None])[..., 0] * q).sum(-1),
+    "vectorize": lambda q: np.vectorize(lambda x: x * x)(q).sum(-1),
+    "piecewise": lambda q: np.piecewise(q, [q < 0], [lambda x: x**2, lambda x: x]).sum(-1),
+    "select": lambda q: np.select([q < 0, q >= 0], [q**2, q]).sum(-1), "polyval": lambda q: np.polyval(M, q).sum(-1),
+    "sinc": lambda q: np.sinc(q).sum(-1) + np.heaviside(q, 0.5).sum(-1), "constant": lambda q: 0 * q[..., 0] + 3.0,
+}
+NETWORK = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Tanh(), torch.nn.Linear(8, 1)).double()
+NETWORK.requires_grad_(False)
+TORCH = {
+    "a sum and a cosine": lambda q: (q**2).sum(-1) / 2 + torch.cos(q[..., 0]),
+    "sum of dim": lambda q: torch.sum(q**2, dim=-1) + q.sum(dim=-1), "network": lambda q: NETWORK(q).squeeze(-1),
+    "stack and cat": lambda q: torch.cat([torch.stack([q[..., 0], q[..., 2].sin()], -1), q], dim=-1).prod(-1),
+    "einsum": lambda q: torch.einsum("...i,ij,...j->...", q, AT, q), "matmul": lambda q: ((q @ AT) * q).sum(-1),
+    "norm": lambda q: 1 / torch.linalg.norm(q, dim=-1) + q.norm(dim=-1) + torch.linalg.vector_norm(q, dim=-1),
+    "diff and roll": lambda q: (torch.diff(q, dim=-1) ** 2).sum(-1) + ((torch.roll(q, 1, -1) - q) ** 4).sum(-1),
+    "where": lambda q: torch.where(q > 0, q**2, q**4).sum(-1), "loops": over_pairs(torch),
+    "elementary": lambda q: (torch.exp(-(q**2)) + torch.log1p(q**2) + torch.sqrt(1 + q * q) + torch.tanh(q)).sum(-1),
+    "clamp": lambda q: q.clamp(-0.2, 0.2).sum(-1) + torch.relu(q).sum(-1) + q.clamp(min=0.1).sum(-1),
+    "unbind": lambda q: unpacked(*q.unbind(-1)), "tensor": lambda q: (MT * q**2).sum(-1),
+    "view": lambda q: (q.view(*q.shape[:-1], 2, 2) ** 2).sum((-1, -2)) + q.size(-1) * q.reshape(-1)[0] * 0,
+    "zeros": lambda q: torch.zeros(q.shape[:-1], dtype=q.dtype, device=q.device) + q[..., 0] ** 2,
+    "cumsum": lambda q: (torch.cumsum(q, -1) ** 2).sum(-1), "logsumexp": lambda q: torch.logsumexp(q, -1),
+    "softmax": lambda q: (torch.softmax(q, -1) * q).sum(-1),
+    "activations": lambda q: (torch.nn.functional.gelu(q) + torch.nn.functional.softplus(q) + q.sigmoid()
+                              + torch.nn.functional.silu(q)).sum(-1),
+    "outer": lambda q: (q[..., :, None] * q[..., None, :] * AT).sum((-1, -2)),
+    "pairs by indices": lambda q: (1 / (q[..., FIRST] - q[..., SECOND]).abs()).sum(-1),
+    "det": lambda q: torch.linalg.det(matrix(q, torch)),
+    "max": lambda q: q.max(-1).values + q.amax(-1) + q.min(dim=-1)[0],
+    "in place": lambda q: (q * 1).mul(2).sum(-1).pow(2) + q.square().mean(-1),
+}
+UNTRACEABLE = {
+    "if": (lambda q: q[..., 0] ** 2 if q[..., 0] > 0 else q[..., 1], "write np.where"),
+    "math": (lambda q: math.cos(q[0]), "write np.cos for math.cos"),
+    "float": (lambda q: float(q[0]) ** 2, "float()"),
+    "a mask": (lambda q: q[q > 0].sum(-1), "indexes by a condition: write np.where"),
+    "sort": (lambda q: np.sort(q)[..., 0], "numpy.sort has no rule"),
+    "fft": (lambda q: (np.abs(np.fft.rfft(q)) ** 2).sum(-1), "numpy.fft.rfft has no rule"),
+    "any": (lambda q: q.sum(-1) if np.any(q > 0) else 0.0 * q.sum(-1), "write np.where"),
+    "min": (lambda q: min(q[0], q[1]), "write np.where"),
+    "asarray of floats": (lambda q: np.asarray(q, dtype=float).sum(-1), "float()"),
+    "out": (lambda q: np.add.reduce(q, axis=-1, out=np.zeros(())), "with `out`"),
+    "a shape": (lambda q: q**2, "returns an array of shape (4,)"),
+}
+# fmt: on
+
+
+def checked(program, function, states, convert):
+    """Assert that a program has the values of a function, one by one and as a batch, and its derivatives by torch."""
+    for x in states:
+        np.testing.assert_allclose(program(*x)[0], function(convert(x)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", NUMPY)
+def test_functions_of_numpy(name):
+    program, states = trace(NUMPY[name], [list("abcd")]), RNG.normal(size=(5, 4)) * 0.7
+    checked(program, NUMPY[name], states, np.array)
+    system = HamiltonianSystem(potential=NUMPY[name], ndof=4, check=False)
+    assert system.untraced == "", system.untraced
+    small = 1e-6 * np.eye(4)[:, None]
+    differences = (NUMPY[name](states + small) - NUMPY[name](states - small)).T / 2e-6
+    smooth = {"rounding": 0.5}.get(name, 1e-6)  # where a floor jumps is left out
+    assert np.median(np.abs(differences + system.force(states))) < smooth
+
+
+@pytest.mark.parametrize("name", TORCH)
+def test_functions_of_torch(name):
+    program, states = trace(TORCH[name], [list("abcd")], torch=True), RNG.normal(size=(5, 4)) * 0.7
+    checked(program, TORCH[name], states, torch.tensor)
+    slopes = gradient(program.outputs[0], program.inputs)
+    for x in states:
+        q = torch.tensor(x, requires_grad=True)
+        (exact,) = torch.autograd.grad(TORCH[name](q), q)
+        found = type(program)(program.inputs, slopes)(*x)
+        np.testing.assert_allclose(np.array(found, dtype=float), exact, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", UNTRACEABLE)
+def test_what_cannot_be_traced_says_why(name):
+    function, reason = UNTRACEABLE[name]
+    with pytest.raises(Untraceable) as error:
+        trace(function, [list("abcd")])
+    assert reason in str(error.value)
+
+
+H2 = "p1**2/2 + p2**2/2 + q1**4/4 + q2**4/4 "
+SYSTEMS = {
+    "NumPy": (
+        {"potential": lambda q: (q**2).sum(-1) / 2 + q[..., 0] ** 2 * q[..., 1] - q[..., 1] ** 3 / 3},
+        ("p1**2/2 + p2**2/2 + (q1**2 + q2**2)/2 + q1**2*q2 - q2**3/3", {}),
+    ),
+    "torch, masses": (
+        {"potential": lambda q: torch.cos(q[..., 0] - q[..., 1]) + (q**4).sum(-1) / 4, "mass": [1.0, 2.0]},
+        ("p1**2/2 + p2**2/4 + cos(q1 - q2) + q1**4/4 + q2**4/4", {}),
+    ),
+    "friction": (
+        {"potential": lambda q: np.cos(q[..., 0] - q[..., 1]) + (q**4).sum(-1) / 4, "damping": 0.1},
+        (H2 + "+ cos(q1 - q2)", {"damping": 0.1}),
+    ),
+    "driven": (
+        {
+            "potential": lambda t, q: (1 + np.sin(2 * t) / 3) * np.cos(q[..., 0] - q[..., 1]) + (q**4).sum(-1) / 4,
+            "time": True,
+        },
+        (H2 + "+ (1 + sin(2*t)/3)*cos(q1 - q2)", {"time": "t"}),
+    ),
+    "general": (
+        {"hamiltonian": lambda q, p: (p**2).sum(-1) / 2 * (1 + q[..., 0] ** 2) + (q**4).sum(-1) / 4},
+        ("(p1**2 + p2**2)/2*(1 + q1**2) + q1**4/4 + q2**4/4", {}),
+    ),
+    "general, driven": (
+        {
+            "hamiltonian": lambda t, q, p: (
+                (p**2).sum(-1) / 2 * (1 + q[..., 0] ** 2 * np.sin(t) ** 2) + (q**4).sum(-1) / 4
+            ),
+            "time": True,
+        },
+        ("(p1**2 + p2**2)/2*(1 + q1**2*sin(t)**2) + q1**4/4 + q2**4/4", {"time": "t"}),
+    ),
+}
+ANY = ["gauss_legendre4", "implicit_midpoint", "rk4"]
+METHODS = [*ANY, "verlet", "srkn11b", "chin4a", "kahan_li8"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("kind", SYSTEMS)
+def test_every_method_runs_as_for_the_same_text(kind, method):
+    given, (text, options) = SYSTEMS[kind]
+    system = HamiltonianSystem(**given, ndof=2)
+    if not system.separable and method not in ANY:
+        return
+    same = HamiltonianSystem.from_sympy(text, **options)
+    for y0 in (Y0, Y0 * np.linspace(0.5, 1, 9)[:, None]):
+        found, expected = (solve(s, method, (0, 2), y0, dt=0.05) for s in (system, same))
+        assert found.stats["backend"] == expected.stats["backend"] == "compiled"
+        np.testing.assert_allclose(found.y, expected.y, rtol=1e-12, atol=1e-13)
+        assert found.stats["force_evaluations"] == expected.stats["force_evaluations"]
+    states = RNG.normal(size=(3, 4))
+    t = () if system.autonomous else (0.7,)
+    for name in ("hamiltonian", "gradient", "hessian", "time_derivative"):
+        values = [np.asarray(getattr(s, name)(states, *t)) for s in (system, same)]
+        np.testing.assert_allclose(*values, rtol=1e-13, atol=1e-13, err_msg=name)
+        tensors = getattr(system, name)(torch.tensor(states), *t)
+        np.testing.assert_allclose(tensors, values[1], rtol=1e-13, atol=1e-13, err_msg=name)
+
+
+def test_deviation_vectors_run_compiled():
+    given, (text, _) = SYSTEMS["NumPy"]
+    systems = HamiltonianSystem(**given, ndof=2), HamiltonianSystem.from_sympy(text)
+    found, expected = (lyapunov(s, "verlet", (0, 20), Y0, dt=0.1, backend="compiled") for s in systems)
+    np.testing.assert_allclose(found.value, expected.value, rtol=1e-9)
+
+
+def test_programs_can_be_read_and_pickled():
+    system = HamiltonianSystem(lambda q: np.cos(q[..., 0]), ndof=1)
+    assert str(system.program).startswith("(q1, p1) →\n")
+    assert "cos(q1)" in str(system.program)
+    assert "cos(q1)" in str(HamiltonianSystem.from_sympy("p**2/2 + cos(q)").program)
+    deep = trace(lambda q: sum((q[0] * k for k in range(3000)), q[1]) ** 2, [["a", "b"]])
+    again = pickle.loads(pickle.dumps(deep))
+    assert str(again) == str(deep)
+    assert again(0.1, 0.2) == deep(0.1, 0.2)
+    branches = HamiltonianSystem(lambda q: q[..., 0] if q.sum() > 0 else -q[..., 0], ndof=1)
+    with pytest.raises(ValueError, match=r"has no program, .*: it branches on a value: write np\.where"):
+        _ = branches.program
+
+
+def changing(q):
+    return STATE["k"] * (q**2).sum(-1)
+
+
+def random(q):
+    return (q**2).sum(-1) * (1 + 1e-3 * np.random.default_rng().uniform())
+
+
+def writing(q):
+    q *= 2
+    return (q**2).sum(-1)
+
+
+STATE = {"k": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("function", "error", "message"),
+    [
+        (random, (ValueError, TypeError), r"^`potential` (gives another value each time|failed on a torch tensor)"),
+        (writing, ValueError, "^`potential` writes into its argument"),
+        (lambda q: q[0] ** 2, ValueError, "^`potential` gives a batch other values"),
+        (lambda q: (q * q).sum() if q.ndim == 1 else (q * q).sum(-1) / 2, ValueError, "gives a batch other values"),
+        (lambda q: np.float32(0.1) * q.astype(np.float32).sum(-1), (TypeError, ValueError), "^`potential`"),
+        (lambda q: q.detach().numpy().sum(-1), (TypeError, ValueError), "^`potential`"),
+    ],
+)
+def test_functions_that_are_none_of_the_state_are_refused(function, error, message):
+    with pytest.raises(error, match=message):
+        solve(HamiltonianSystem(function, ndof=2), "verlet", (0, 1), Y0, dt=0.1)
+
+
+def test_a_function_that_has_changed_is_refused():
+    system = HamiltonianSystem(changing, ndof=2)
+    STATE["k"] = 1.0
+    solve(system, "verlet", (0, 1), Y0, dt=0.1)
+    STATE["k"] = 2.0
+    with pytest.raises(ValueError, match=r"^`potential` has other values than when it was traced"):
+        solve(system, "verlet", (0, 1), Y0, dt=0.1)
+    assert solve(HamiltonianSystem(changing, ndof=2), "verlet", (0, 1), Y0, dt=0.1).stats["backend"] == "compiled"
+
+
+def test_a_given_gradient_is_optional_and_compared():
+    system = HamiltonianSystem(lambda q: np.cos(q).sum(-1), gradient=lambda q: -np.sin(q), ndof=2)
+    assert solve(system, "srkn11b", (0, 1), Y0, dt=0.1).stats["backend"] == "compiled"
+    rough = {"gradient": lambda q: -np.sin(q) * (1 + 1e-8)}
+    system = HamiltonianSystem(lambda q: np.cos(q).sum(-1), ndof=2, **rough)
+    backend = solve(system, "verlet", (0, 1), Y0, dt=0.1).stats["backend"]
+    assert (
+        backend
+        == "numpy: `potential` could not be traced, for `gradient` is not exactly that of `potential`: leave it out"
+    )
