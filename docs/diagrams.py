@@ -36,6 +36,7 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
         ("schemes", "events", "workers", "storage"),
         "tables; zeros along a run; maps over workers; stores",
     ),
+    (("show",), "cards and figures of what a user looks at"),
     (("arguments",), "checks of what users give"),
     (("arrays",), "operations that NumPy and torch spell differently"),
 )

@@ -55,14 +55,6 @@ Own = Annotated[
         autocompletion=_systems,
     ),
 ]
-Method = Annotated[
-    str,
-    typer.Option(
-        "--method",
-        help="A name, name:option=value, or a .safetensors file.",
-        autocompletion=completion.one_method,
-    ),
-]
 OneMethod = Annotated[
     str | None,
     typer.Option(
