@@ -284,3 +284,15 @@ def test_every_fragment_is_included_and_says_where_it_is_from():
         assert f'--8<-- "measured/{fragment.name}"' in text, fragment.name
         source = fragment.read_text(encoding="utf-8").splitlines()[-1]
         assert re.fullmatch(r"<small>`[^`]+` · .+ · commit .+ · \d{4}-\d\d-\d\d</small>", source), fragment.name
+
+
+def test_the_table_of_where_to_add_names_what_is_there():
+    table = (ROOT / "docs" / "architecture.md").read_text().split("## Where do I add")[1].split("## ")[0]
+    rows = [row.split("|") for row in table.splitlines() if row.startswith("| a ")]
+    assert len(rows) > 8
+    for _, _, file, there, *_ in rows:
+        for path in re.findall(r"`([\w/]+\.py)`", file):
+            code = (ROOT / "sympflow" / path).read_text()
+            name = re.search(r"`([A-Za-z_]+)`(?!.*`[A-Z_]+`)", there)
+            assert name is not None, there
+            assert re.search(rf"^(class |def )?{name[1]}\b", code, re.M), f"{path} has no {name[1]}"

@@ -113,6 +113,11 @@ class PrimedShape:
             [column(f"polynomials.{i}", "kick", 3) for i in range(len(self.monomials))] if self.monomials else None,
         )
 
+    def substeps(self, inside: Columns, outside: Columns) -> tuple[Substep, ...]:
+        """Return χ⁻¹, K, χ by the columns of K and χ."""
+        outer = {sign: substeps_of(self.outer, outside, sign) for sign in (1, -1)}
+        return (*reversed(outer[-1]), *substeps_of(self.kernel, inside, 1), *outer[1])
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
         return {

@@ -14,15 +14,15 @@ from sympflow.kernels.carry import Carry
 from sympflow.kernels.protocol import Task
 
 if TYPE_CHECKING:
-    from sympflow.integrators.base import KernelStepper
+    from sympflow.integrators.steppers import Stepper
 
 __all__ = ["rolled_out", "stepped"]
 
 
 def rolled_out(
-    stepper: KernelStepper, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: Carry | None
+    stepper: Stepper, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: Carry | None
 ) -> tuple[Tensor, np.ndarray]:
-    """`KernelStepper.rollout` of a tensor on the CPU: float32 is computed in double, and rounded at the outputs."""
+    """`Stepper.rollout` of a tensor on the CPU: float32 is computed in double, and rounded at the outputs."""
     if y0.dtype != torch.float64:
         states, finite = rolled_out(stepper, y0.double(), h, n_steps, save, t0, carry)
         return states.to(y0.dtype), finite
@@ -34,8 +34,8 @@ def rolled_out(
     return _Run.apply(run, y0, *followed), run.finite
 
 
-def stepped(stepper: KernelStepper, y: Tensor, h: Any, t: Any) -> Tensor:
-    """`KernelStepper.shorter` of tensors, differentiable by their lengths too."""
+def stepped(stepper: Stepper, y: Tensor, h: Any, t: Any) -> Tensor:
+    """`Stepper.shorter` of tensors, differentiable by their lengths too."""
     if y.dtype != torch.float64:
         h = h.double() if isinstance(h, Tensor) else h
         return stepped(stepper, y.double(), h, t).to(y.dtype)
@@ -46,7 +46,7 @@ def stepped(stepper: KernelStepper, y: Tensor, h: Any, t: Any) -> Tensor:
 class _Rolled:
     """A run of a stepper from y0: its numbers, its reverse, and the same by tensor operations."""
 
-    def __init__(self, stepper: KernelStepper, h: float, n_steps: int, save: np.ndarray, t0: float) -> None:
+    def __init__(self, stepper: Stepper, h: float, n_steps: int, save: np.ndarray, t0: float) -> None:
         self.stepper, self.h, self.n_steps, self.save, self.t0 = stepper, h, n_steps, save, t0
         self.finite = np.empty(0)
 
@@ -65,10 +65,10 @@ class _Rolled:
         return [torch.from_numpy(x) for x in (of_states.reshape(shape), *numbers)]
 
     def by_arrays(self, y0: Tensor, *followed: Tensor) -> Tensor:
-        from sympflow.integrators.base import rollout
+        from sympflow.integrators.steppers import rollout
 
         def step(k: int, y: Tensor) -> Tensor:
-            return self.stepper.by_arrays(y, self.h, self.t0 + k * self.h, *followed)
+            return _by_arrays(self.stepper, y, self.h, self.t0 + k * self.h, *followed)
 
         return rollout(step, y0, self.n_steps, self.save)[0]
 
@@ -94,14 +94,28 @@ class _Step(torch.autograd.Function):
     """The states after single steps, each of its own length; derivatives by tensor operations."""
 
     @staticmethod
-    def forward(ctx: Any, stepper: KernelStepper, t: Any, y: Tensor, h: Tensor, *followed: Tensor) -> Tensor:
-        ctx.step = lambda y, h, *numbers: stepper.by_arrays(y, h, t, *numbers)
+    def forward(ctx: Any, stepper: Stepper, t: Any, y: Tensor, h: Tensor, *followed: Tensor) -> Tensor:
+        ctx.step = lambda y, h, *numbers: _by_arrays(stepper, y, h, t, *numbers)
         ctx.save_for_backward(y, h, *followed)
         return torch.from_numpy(stepper.shorter(to_numpy(y), to_numpy(h), t))
 
     @staticmethod
     def backward(ctx: Any, cotangents: Tensor) -> tuple[Any, ...]:
         return None, None, *_pulled(ctx.step, ctx.saved_tensors, ctx.needs_input_grad[2:], cotangents)
+
+
+def _by_arrays(stepper: Stepper, y: Tensor, h: Any, t: Any, *followed: Tensor) -> Tensor:
+    """A step by tensor operations, of which torch follows the parameters too."""
+    if not followed:
+        return stepper.arrays.step(y, h, t)
+    if stepper.system.friction:
+        raise ValueError(
+            "`params` with gradients of a system with friction have no second derivatives, and none at times between "
+            "two steps: choose times on the grid, or detach them."
+        )
+    assert stepper.kernel is not None
+    batch = stepper.problem.y0.shape[:-1]
+    return stepper.kernel.stepped(y, h, t, [x.reshape(batch) for x in followed])
 
 
 def _pulled(

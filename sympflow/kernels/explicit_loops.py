@@ -85,7 +85,7 @@ class Field:
         symbols = symbols if is_large(symbols) else symbols.parametric
         self.lettered = lettered(symbols, [symbols.H, *(forces or [])])
         self.ndof = system.ndof
-        self._damping = None if system.friction is None else system.friction.matrix(self.ndof)
+        self._damping = system.friction.matrix(self.ndof) if system.friction else None
         self.rates = [] if self._damping is None else self._damping[self._damped].tolist()
         self._families = _families(self.lettered) if self.large else []
         self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]

@@ -39,15 +39,15 @@ def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> O
             "or use backend='array'."
         )
     friction = system.friction
-    if friction is not None and compensated:
+    if friction and compensated:
         raise ValueError("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
-    if friction is not None and friction.damping.ndim == 2:
+    if friction.kind == 2:
         raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
     symbols = written if is_large(written) else written.parametric
     of_time = lettered(symbols, [symbols.H])
-    code = newton_code(of_time, tableau, compensated, friction is not None)
+    code = newton_code(of_time, tableau, compensated, bool(friction))
     single = newton_code(of_time, tableau, False, False) if compensated else code
-    if friction is None:
+    if not friction:
         return OneStepKernel(code, single)
     rates = np.broadcast_to(friction.rates, system.ndof)
     exponents = np.outer([*stage_nodes(tableau), 1.0], rates).ravel()

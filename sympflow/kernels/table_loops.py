@@ -69,7 +69,7 @@ class TableLoops:
         kicks: Sequence[bool],
         level: int,
         monomials: Monomials,
-        friction: Friction | None,
+        friction: Friction,
     ) -> None:
         self._given = symbols, tuple(kicks), level, monomials, friction
         form, d = symbols.parametric, symbols.ndof
@@ -77,7 +77,7 @@ class TableLoops:
         self.values = np.array([*form.values, 0.0], dtype=np.float64)
         self._driven = symbols.time is not None
         self._inverse_mass = np.array(symbols.inverse_mass, dtype=np.float64)
-        damping = None if friction is None else tuple(tuple(map(float, row)) for row in friction.matrix(d))
+        damping = tuple(tuple(map(float, row)) for row in friction.matrix(d)) if friction else None
         self._maps = _maps(form, level, monomials, damping)
         sizes = [self._maps.terms if kick else 1 for kick in kicks]
         self.drifts = (np.cumsum(sizes) - sizes)[self.kicks == 0]
@@ -112,7 +112,7 @@ class TableLoops:
 
     def motions(self, c: np.ndarray) -> np.ndarray:
         """The linear maps of the drifts in numbers c (J, n), with friction: (J, m, 2 d²), else none."""
-        if self.friction is None:
+        if not self.friction:
             return NONE
         M, s = self._inverse_mass, c[:, self.drifts]
         mean, end = (
@@ -222,7 +222,7 @@ def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def table_loops(
-    symbols: SymbolicHamiltonian, kicks: Sequence[bool], level: int, monomials: Monomials, friction: Friction | None
+    symbols: SymbolicHamiltonian, kicks: Sequence[bool], level: int, monomials: Monomials, friction: Friction
 ) -> TableLoops | None:
     """The loops; None of a system that has no compiled form, or one too long."""
     if symbols.samples:

@@ -423,7 +423,7 @@ def step_tangents(
 
     None where they are not compiled.
     """
-    if system.friction is not None:
+    if system.friction:
         return None
     n = y.shape[1]
     try:

@@ -16,7 +16,8 @@ from typing import Any
 
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
 from sympflow.hamiltonian.lattice_states import LatticeStates
-from sympflow.hamiltonian.system import UNNAMED, HamiltonianSystem
+from sympflow.hamiltonian.scene import UNNAMED
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 DOMAINS: dict[str, tuple[str, ...]] = {
     "Ball": ("center", "radius"),
