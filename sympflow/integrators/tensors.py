@@ -51,6 +51,7 @@ class _Rolled:
         self.finite = np.empty(0)
 
     def run(self, y0: Tensor) -> Tensor:
+        assert self.stepper.kernel is not None
         rows = to_numpy(y0).reshape(-1, y0.shape[-1])
         self.recorded = self.stepper.kernel.recorded(Task(self.h, rows, self.n_steps, self.save, None, self.t0))
         self.finite = self.recorded.n_finite.reshape(y0.shape[:-1])
