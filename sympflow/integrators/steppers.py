@@ -20,7 +20,7 @@ from sympflow.arrays import (
 )
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel

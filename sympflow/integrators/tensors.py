@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import differentiable, to_numpy, transformed
-from sympflow.kernels.carry import Carry
-from sympflow.kernels.protocol import Task
+from sympflow.kernels.protocol import Carry, Task
 
 if TYPE_CHECKING:
     from sympflow.integrators.steppers import Stepper

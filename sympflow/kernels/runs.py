@@ -23,6 +23,7 @@ __all__ = [
     "Memory",
     "Numbers",
     "Room",
+    "assign",
     "finished",
     "groups",
     "map_function",
@@ -244,7 +245,7 @@ def reverse_function(
                 step.value = code.select(code.apply("eq", (r.value + 1, link)), step.value - 1, step.value)
                 begins = code.apply("eq", (s.value + first, 0))
                 j = code.select(opens, code.select(begins, zero, link), r.value)
-                _set(cotangents, pulled(j, step.value, history.state(s.value), [x.value for x in cotangents]))
+                assign(cotangents, pulled(j, step.value, history.state(s.value), [x.value for x in cotangents]))
                 r.value = code.select(opens, link, r.value)
             n.value = to
         lanes.store([x.value for x in cotangents], rows, begin, n_rows, one, zero)
@@ -418,19 +419,19 @@ class _Registers:
 
     def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
         state = self._end if end else self._state
-        _set(state, column(j, [x.value for x in state], step))
+        assign(state, column(j, [x.value for x in state], step))
 
     def values(self) -> list[Value]:
         return [x.value for x in self._state]
 
     def look(self, look: Callable[[Any], Any]) -> None:
-        _set(self._state, look(self.values()))
+        assign(self._state, look(self.values()))
 
     def remember(self) -> None:
         self._before = [x.value for x in self._state]
 
     def restore(self) -> None:
-        _set(self._state, self._before)
+        assign(self._state, self._before)
 
     def end(self) -> None:
         self._end = [self.code.variable(x.value) for x in self._state]
@@ -750,7 +751,7 @@ class ColumnStage:
         return self._stage(values, self.numbers(j, chunk), self.kind(j), step)
 
 
-def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:
+def assign(variables: Sequence[Variable], values: Sequence[Value]) -> None:
     for variable, value in zip(variables, values, strict=True):
         variable.value = value
 
