@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,14 +12,11 @@ from torch import Tensor
 from sympflow.arrays import differentiable, to_numpy, transformed
 from sympflow.kernels.protocol import Carry, Task
 
-if TYPE_CHECKING:
-    from sympflow.integrators.steppers import Stepper
-
 __all__ = ["rolled_out", "stepped"]
 
 
 def rolled_out(
-    stepper: Stepper, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: Carry | None
+    stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: Carry | None
 ) -> tuple[Tensor, np.ndarray]:
     """`Stepper.rollout` of a tensor on the CPU: float32 is computed in double, and rounded at the outputs."""
     if y0.dtype != torch.float64:
@@ -33,7 +30,7 @@ def rolled_out(
     return _Run.apply(run, y0, *followed), run.finite
 
 
-def stepped(stepper: Stepper, y: Tensor, h: Any, t: Any) -> Tensor:
+def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
     """`Stepper.shorter` of tensors, differentiable by their lengths too."""
     if y.dtype != torch.float64:
         h = h.double() if isinstance(h, Tensor) else h
@@ -45,12 +42,11 @@ def stepped(stepper: Stepper, y: Tensor, h: Any, t: Any) -> Tensor:
 class _Rolled:
     """A run of a stepper from y0: its numbers, its reverse, and the same by tensor operations."""
 
-    def __init__(self, stepper: Stepper, h: float, n_steps: int, save: np.ndarray, t0: float) -> None:
+    def __init__(self, stepper: Any, h: float, n_steps: int, save: np.ndarray, t0: float) -> None:
         self.stepper, self.h, self.n_steps, self.save, self.t0 = stepper, h, n_steps, save, t0
         self.finite = np.empty(0)
 
     def run(self, y0: Tensor) -> Tensor:
-        assert self.stepper.kernel is not None
         rows = to_numpy(y0).reshape(-1, y0.shape[-1])
         self.recorded = self.stepper.kernel.recorded(Task(self.h, rows, self.n_steps, self.save, None, self.t0))
         self.finite = self.recorded.n_finite.reshape(y0.shape[:-1])
@@ -65,12 +61,12 @@ class _Rolled:
         return [torch.from_numpy(x) for x in (of_states.reshape(shape), *numbers)]
 
     def by_arrays(self, y0: Tensor, *followed: Tensor) -> Tensor:
-        from sympflow.integrators.steppers import rollout
-
-        def step(k: int, y: Tensor) -> Tensor:
-            return _by_arrays(self.stepper, y, self.h, self.t0 + k * self.h, *followed)
-
-        return rollout(step, y0, self.n_steps, self.save)[0]
+        y, states, wanted = y0, [], self.save.tolist()
+        for k in range(self.n_steps + 1):
+            states += [y] * wanted.count(k)
+            if k < self.n_steps:
+                y = _by_arrays(self.stepper, y, self.h, self.t0 + k * self.h, *followed)
+        return torch.stack(states)
 
 
 class _Run(torch.autograd.Function):
@@ -94,7 +90,7 @@ class _Step(torch.autograd.Function):
     """The states after single steps, each of its own length; derivatives by tensor operations."""
 
     @staticmethod
-    def forward(ctx: Any, stepper: Stepper, t: Any, y: Tensor, h: Tensor, *followed: Tensor) -> Tensor:
+    def forward(ctx: Any, stepper: Any, t: Any, y: Tensor, h: Tensor, *followed: Tensor) -> Tensor:
         ctx.step = lambda y, h, *numbers: _by_arrays(stepper, y, h, t, *numbers)
         ctx.save_for_backward(y, h, *followed)
         return torch.from_numpy(stepper.shorter(to_numpy(y), to_numpy(h), t))
@@ -104,7 +100,7 @@ class _Step(torch.autograd.Function):
         return None, None, *_pulled(ctx.step, ctx.saved_tensors, ctx.needs_input_grad[2:], cotangents)
 
 
-def _by_arrays(stepper: Stepper, y: Tensor, h: Any, t: Any, *followed: Tensor) -> Tensor:
+def _by_arrays(stepper: Any, y: Tensor, h: Any, t: Any, *followed: Tensor) -> Tensor:
     """A step by tensor operations, of which torch follows the parameters too."""
     if not followed:
         return stepper.arrays.step(y, h, t)
@@ -113,7 +109,6 @@ def _by_arrays(stepper: Stepper, y: Tensor, h: Any, t: Any, *followed: Tensor) -
             "`params` with gradients of a system with friction have no second derivatives, and none at times between "
             "two steps: choose times on the grid, or detach them."
         )
-    assert stepper.kernel is not None
     batch = stepper.problem.y0.shape[:-1]
     return stepper.kernel.stepped(y, h, t, [x.reshape(batch) for x in followed])
 

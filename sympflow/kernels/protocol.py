@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.kernels.threads import NEVER, given, run_rows
-
-if TYPE_CHECKING:
-    from sympflow.kernels.reverse import Recorded
 
 __all__ = ["Batch", "Carry", "Kernel", "Run", "Steps", "Task", "run_states"]
 
@@ -268,8 +265,8 @@ class Kernel:
         """Raise a ValueError, with the reason, where runs cannot be differentiated: see `recorded`."""
         raise ValueError("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
 
-    def recorded(self, task: Task) -> Recorded:
-        """`runs` of which cotangents can be pulled back."""
+    def recorded(self, task: Task) -> Any:
+        """`runs`, as a `Recorded` run, of which cotangents can be pulled back."""
         raise NotImplementedError
 
     def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
