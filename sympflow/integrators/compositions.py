@@ -29,8 +29,7 @@ from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, sc
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parts import ExactParts, SubFlow
     from sympflow.hamiltonian.planets import Frame
-    from sympflow.kernels.carry import Carry
-    from sympflow.kernels.protocol import Kernel
+    from sympflow.kernels.protocol import Carry, Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()

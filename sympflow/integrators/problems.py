@@ -35,7 +35,9 @@ def check_backend(backend: Any, integrator: Integrator) -> None:
 
 def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
     if y0 is None:
-        raise ValueError(f"`y0` is needed: the system {system.name!r} has no default initial state.")
+        raise ValueError(
+            f"`y0` is needed: {system.title} has no initial state. Pass [q, p], {2 * system.ndof:,} numbers."
+        )
     size = 2 * system.ndof
     if is_tensor(y0):
         if dtype is not None:

@@ -11,7 +11,7 @@ import numpy as np
 from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, library_name, stack
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
