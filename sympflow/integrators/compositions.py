@@ -67,6 +67,8 @@ class Composition(ABC, ArraySteps):
     """True if the time moves with one of the parts, of a system that depends on it."""
     breakdown: ClassVar[Failure | None] = None
     """The reason for which runs end that cannot go on; None for that of all methods."""
+    doubts: ClassVar[bool] = False
+    """True if there may be a warning of a step that is long for the system."""
     takes_extended: ClassVar[bool] = False
     """True if the parts stay as they are with E, the momentum of the time, as one more momentum."""
 
@@ -599,6 +601,7 @@ class KeplerInteraction(Composition):
     heliocentric ones it holds the motion of the star too, half before a kick and half after, which is of order 2.
     """
 
+    doubts: ClassVar[bool] = True
     breakdown: ClassVar[Failure | None] = Failure.ENCOUNTER
 
     def __init__(

@@ -335,7 +335,8 @@ class Splitting(FixedStep):
         return self.composed(system).longest_step() if self.clock == "physical" else super().longest_step(system)
 
     def doubt(self, system: HamiltonianSystem) -> str:
-        return self.composed(system).doubt(self.step_length(system)) if self.clock == "physical" else ""
+        doubts = SPLITTINGS[self.splitting].doubts and self.clock == "physical"
+        return self.composed(system).doubt(self.step_length(system)) if doubts else ""
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock != "physical":
