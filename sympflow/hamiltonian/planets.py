@@ -123,10 +123,10 @@ class Frame:
         """The share of each planet in the mass of all up to it."""
         return (self.masses[self.order] / self.sums[1:]).tolist()
 
-    def hill_radii(self, i: Any, j: Any) -> np.ndarray:
-        """The mutual Hill radius of bodies."""
+    def hill_radii(self, i: Any, j: Any, share: float = 1.0) -> np.ndarray:
+        """The mutual Hill radius of bodies; with a share of 0 that of i and bodies without mass."""
         mean = (self.size[i - 1] + self.size[j - 1]) / 2
-        return mean * np.cbrt((self.masses[i] + self.masses[j]) / (3 * self.masses[0]))
+        return mean * np.cbrt((self.masses[i] + share * self.masses[j]) / (3 * self.masses[0]))
 
     def states(self, y: Array) -> tuple[Array, Array]:
         """Positions and velocities (..., n, 3)."""
