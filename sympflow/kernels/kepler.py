@@ -233,13 +233,16 @@ class KeplerCode(Rollouts):
         """NaN where two planets met, whose places are then written down; else 0."""
         code = room.code
 
-        start = 0 if light is None else AXES * LANES * self.groups
-
         def told() -> Vectors:
             group = code.constant(-1.0) if light is None else code.convert("sitofp", light, "double")
             code.store(group, room.data(2), len(self.report) - 1)
-            for i, value in enumerate([y for group in h for y in group]):
-                code.store(value, room.data(2), start + LANES * i)
+            places = [y for group in h for y in group]
+            if light is not None:
+                turns = [(g, i) for g in range(self.groups) for i in range(AXES)]
+                planets = [code.load(room.work, LANES * (self.groups * i + g), like.type) for g, i in turns]
+                places = [*planets, *places]
+            for i, value in enumerate(places):
+                code.store(value, room.data(2), LANES * i)
             return [code.constant(float("nan"), like.type)]
 
         return code.when(met, told, lambda: [code.constant(0.0, like.type)], rare=True)[0]
@@ -354,8 +357,8 @@ class KeplerLoops:
         n = len(frame.order)
         if not n or n > MOST_GROUPS * LANES - 1 or (len(frame.test) and not frame.jacobi):
             raise ValueError(
-                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, and in "
-                "Jacobi's coordinates for bodies without mass: use backend='array'."
+                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, and for "
+                "bodies without mass in Jacobi's coordinates: use backend='array'."
             )
         self.frame, self.code = frame, KeplerCode(frame)
         size = AWAY * frame.size.max()

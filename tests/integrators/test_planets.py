@@ -369,7 +369,8 @@ def test_bodies_without_mass_are_compiled(planets):
     system = HamiltonianSystem.planets([1.0, *[1e-5] * planets, *[0.0] * 30], elements=orbits, encounter=None)
     runs = [solve(system, "wisdom_holman", (0, 12.0), dt=0.3, backend=b).y for b in ("compiled", "array")]
     assert np.abs(runs[0] - runs[1]).max() < 1e-11
-    alone = HamiltonianSystem.planets([1.0, *[1e-5] * planets], elements={n: x[:planets] if n != "e" else x for n, x in orbits.items()}, encounter=None)  # fmt: skip
+    few = {name: x if name == "e" else x[:planets] for name, x in orbits.items()}
+    alone = HamiltonianSystem.planets([1.0, *[1e-5] * planets], elements=few, encounter=None)
     d = 3 * (1 + planets)
     assert np.abs(solve(alone, "wisdom_holman", (0, 12.0), dt=0.3).y[:d] - runs[0][:d]).max() < 1e-11
 
