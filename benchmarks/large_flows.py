@@ -25,7 +25,7 @@ import argparse
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -41,9 +41,8 @@ from measuring.compiled import last
 from measuring.race import SHORTEST, Runner, fewest_steps, schemes
 
 import sympflow
-from sympflow import HamiltonianSystem, LatticeStates, train
+from sympflow import HamiltonianSystem, LatticeStates
 from sympflow.flow.primed import PrimedFlow
-from sympflow.training.fits import PrimedFit
 
 TARGETS = (1e-4, 1e-6, 1e-8)
 SITES = 1024
@@ -66,8 +65,6 @@ LATTICES: dict[str, tuple[str, dict[str, Any], int]] = {
     "sine_gordon": ("sine-Gordon", {"onsite": "1 - cos(q)", "bond": "r**2/2"}, 1),
 }
 """Title, terms and number of axes. The fastest frequency is 2 to 3.2."""
-FIT: dict[str, Any] = {"restarts": 24, "energy_weight": 300.0, "steps": 300, "runs": 48}
-"""Options of the fit of a flow that does not ship."""
 
 
 def lattice(name: str, sites: int) -> HamiltonianSystem:
@@ -76,18 +73,8 @@ def lattice(name: str, sites: int) -> HamiltonianSystem:
     return HamiltonianSystem.lattice(**terms, shape=(n,) * axes, name=name, domain=LatticeStates(DENSITY))
 
 
-def flows_of(
-    system: HamiltonianSystem, folder: Path, ladder: Sequence[PrimedFit] = (), fit: Mapping[str, Any] = FIT
-) -> list[PrimedFlow]:
-    """The flows of a system that ship or are in a folder, where those of a ladder are fitted first if they are not."""
-    for start in ladder:
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{system.name}-primed-{start.stages}-{start.dt:g}.safetensors"
-        if not path.exists():
-            begun = time.process_time()
-            flow = train(system, flow=start.flow(system), progress=False, **fit)
-            flow.save(path)
-            print(f"{path.stem}: {time.process_time() - begun:.0f} s of a processor", flush=True)
+def flows_of(system: HamiltonianSystem, folder: Path) -> list[PrimedFlow]:
+    """The flows of a system that ship or are in a folder."""
     paths = {path.name: path for place in (SHIPPED, folder) for path in place.glob(f"{system.name}-*.safetensors")}
     found = [sympflow.load(paths[name]) for name in sorted(paths)]
     return [flow.bound(system) for flow in found if isinstance(flow, PrimedFlow) and flow.matches(system)]

@@ -36,6 +36,7 @@ ROOMS: tuple[tuple[tuple[str, ...], str], ...] = (
         ("schemes", "events", "workers", "storage"),
         "tables; zeros along a run; maps over workers; stores",
     ),
+    (("show",), "cards and figures of what a user looks at"),
     (("arguments",), "checks of what users give"),
     (("arrays",), "operations that NumPy and torch spell differently"),
 )
@@ -45,7 +46,7 @@ SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (
         "solve(system, method, t_span, y0, …)",
         "",
-        ("checks every argument before anything runs",),
+        ("checks every argument: a Problem, and an Outcome at the end",),
     ),
     (
         "registry.build(method)",
@@ -64,7 +65,7 @@ SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         "Stepper",
         "integrator.stepper(problem)",
         (
-            "one run: compiled kernel or arrays, decided when it is made",
+            "one run: its kernel or arrays, decided when it is made",
             "rollout, shorter steps; counts of evaluations",
         ),
     ),
@@ -75,6 +76,11 @@ SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
             "walks the grid t0 + k·dt, asks the stepper for steps",
             "finds what is not finite, places outputs, finds events",
         ),
+    ),
+    (
+        "diagnose(outcome, …)",
+        "an Outcome",
+        ("poles, blow-up, leaps, domain, energy: each a message or a warning",),
     ),
     (
         "Solution",

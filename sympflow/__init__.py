@@ -3,12 +3,11 @@
 The public names are loaded when first used (PEP 562): importing sympflow loads neither torch, SciPy nor matplotlib.
 """
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from sympflow._version import __version__
-from sympflow.lazy import FORMER_PATHS, whole_import
+from sympflow.lazy import whole_import
 
 _HOME = {
     "HamiltonianSystem": "hamiltonian.system",
@@ -104,6 +103,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.domain import EnergySublevel as EnergySublevel
     from sympflow.hamiltonian.domain import Tube as Tube
     from sympflow.hamiltonian.doubling import doubled as doubled
+    from sympflow.hamiltonian.lattice_states import LatticeStates as LatticeStates
     from sympflow.hamiltonian.system import HamiltonianSystem as HamiltonianSystem
     from sympflow.hamiltonian.time_transformation import time_transformed as time_transformed
     from sympflow.integrators.choosing import choose_step as choose_step
@@ -155,10 +155,6 @@ if TYPE_CHECKING:
     from sympflow.training.fits import PrimedFit as PrimedFit
     from sympflow.training.fits import SplitFit as SplitFit
     from sympflow.training.trainer import train as train
-
-
-if FORMER_PATHS not in sys.meta_path:
-    sys.meta_path.append(FORMER_PATHS)
 
 
 def __getattr__(name: str) -> Any:

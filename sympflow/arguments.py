@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+import sys
+import warnings
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -184,6 +186,19 @@ def as_float(value: Any) -> float:
         return math.nan
 
 
+def check_positive(name: str, value: Any, most: float = sys.float_info.max) -> None:
+    """Raise unless the argument `name` is a positive and finite real number."""
+    if not (real_number(value) and 0 < value <= most):
+        raise ValueError(f"`{name}` must be positive and finite; got {value!r}.")
+
+
+def check_one_of(name: str, value: Any, known: Iterable[str]) -> None:
+    """Raise unless the argument `name` is one of the known words."""
+    words = list(known)
+    if not isinstance(value, str) or value not in words:
+        raise ValueError(f"`{name}` must be one of {', '.join(map(repr, words))}; got {value!r}.")
+
+
 def check_flag(name: str, value: Any) -> None:
     """Raise unless the option `name` is True or False."""
     if not isinstance(value, bool | np.bool_):
@@ -246,6 +261,14 @@ def sample_count(n: int) -> int:
     if n > _MOST_SAMPLES:
         raise ValueError(f"`n` must be at most {_MOST_SAMPLES:.0e}; got {n:.3g}: draw in parts, with several seeds.")
     return int(n)
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line outside of the package that led here."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("sympflow."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level - 1)
 
 
 def plain(value: Any) -> Any:

@@ -35,27 +35,48 @@ def library(x: Array) -> Any:
     return np
 
 
-def concatenate(parts: Sequence[Array]) -> Array:
-    """Join arrays along the last axis."""
-    if is_tensor(parts[0]):
-        import torch
-
-        return torch.cat(tuple(parts), dim=-1)
-    return np.concatenate(parts, axis=-1)
+def library_name(x: Array) -> str:
+    """Return "torch" for a tensor and "numpy" for an array."""
+    return "torch" if is_tensor(x) else "numpy"
 
 
-def join(parts: Sequence[Array]) -> Array:
-    """Join arrays, or tensors, along the first axis."""
-    return library(parts[0]).concatenate(list(parts))
+def concatenate(parts: Sequence[Array], axis: int = -1) -> Array:
+    """Join arrays along an axis."""
+    return library(parts[0]).concatenate(tuple(parts), axis=axis)
 
 
 def stack(parts: Sequence[Array], axis: int = -1) -> Array:
     """Join arrays along a new axis."""
-    if is_tensor(parts[0]):
+    return library(parts[0]).stack(tuple(parts), axis=axis)
+
+
+def largest(x: Array) -> Array:
+    """Return the largest |x_i| along the last axis, (..., 1)."""
+    return library(x).amax(abs(x), axis=-1, keepdims=True)
+
+
+def last(y: Array) -> Array:
+    """Return y with its first axis as the last: time first as time last."""
+    return y.T if y.ndim == 2 else moveaxis(y, 0, -1)
+
+
+def moveaxis(y: Array, source: int, target: int) -> Array:
+    """Return y with an axis in another place; torch maps `movedim`, and no `moveaxis`, over lanes."""
+    return y.movedim(source, target) if is_tensor(y) else np.moveaxis(y, source, target)
+
+
+def masked(y: Array, mask: Any, value: float) -> Array:
+    """Return y with a value where the mask, an array that broadcasts against it, is True."""
+    if is_tensor(y):
         import torch
 
-        return torch.stack(tuple(parts), dim=axis)
-    return np.stack(parts, axis=axis)
+        return y.masked_fill(torch.as_tensor(mask, device=y.device), value)
+    return np.where(mask, value, y).astype(y.dtype)
+
+
+def of_library(value: Any, like: Array) -> Array:
+    """Return a tensor as it is where `like` is one, and else as an array."""
+    return value if is_tensor(like) else value.detach().numpy()
 
 
 def assemble(values: Sequence[Any], like: Array) -> Array:
@@ -300,10 +321,10 @@ def _set_up() -> None:
         torch.func.jvp(torch.sin, (x,), (x,))
 
 
-def like(constant: np.ndarray, x: Array) -> Array:
-    """A constant array in the library, dtype and device of `x`."""
+def like(values: Any, x: Array) -> Array:
+    """Return values in the library, dtype and device of `x`."""
     if is_tensor(x):
         import torch
 
-        return torch.as_tensor(np.array(constant), dtype=x.dtype, device=x.device)
-    return constant.astype(x.dtype, copy=False)
+        return torch.as_tensor(values if is_tensor(values) else np.array(values), dtype=x.dtype, device=x.device)
+    return np.asarray(values, dtype=x.dtype)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import warn
 from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy
 
 EventFunction = Callable[[float, Array], Any]
@@ -181,11 +181,10 @@ class EventSearch:
             self.found[i].append((t, y))
             if len(self.found[i]) >= self.events[i].limit:
                 if followed:
-                    warnings.warn(
+                    warn(
                         "The state at the event that ends the run carries no derivative, nor does its time: use "
                         "sympflow.interop.torchdiffeq.odeint_event, which gives both.",
                         UserWarning,
-                        stacklevel=2,
                     )
                 self.end = (t, y)
                 return True

@@ -1,68 +1,20 @@
-"""Imports: whole although interrupted, by the paths that modules had before they moved, and of plug-ins when used."""
+"""Imports: whole although interrupted, of plug-ins when used, and of libraries that may be missing."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable
 from importlib import import_module
-from importlib.machinery import ModuleSpec
 from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-FORMER = {
-    "callables": "hamiltonian.callables",
-    "domain": "hamiltonian.domain",
-    "expression": "hamiltonian.expression",
-    "files": "arguments",
-    "flow.base": "flow.flow_map",
-    "imports": "lazy",
-    "integrators.checks": "testing.checks",
-    "integrators.grid_solution": "integrators.base",
-    "integrators.linear_splitting": "integrators.splitting",
-    "integrators.log_sympflow": "integrators.flows",
-    "integrators.logarithmic": "integrators.splitting",
-    "integrators.physical_time": "integrators.clocks",
-    "integrators.scheme": "schemes",
-    "integrators.schemes": "schemes",
-    "integrators.sympflow": "integrators.flows",
-    "linear_part": "hamiltonian.linear_part",
-    "metrics.round_off": "metrics.energy",
-    "monomials": "hamiltonian.monomials",
-    "numba_functions": "hamiltonian.callables",
-    "parts": "hamiltonian.parts",
-    "studies.comparison_report": "studies.comparison",
-    "studies.crossings": "metrics.crossings",
-    "studies.measurements": "studies.attempts",
-    "studies.stability_report": "studies.step_stability",
-    "symbolic": "hamiltonian.symbolic",
-    "system": "hamiltonian.system",
-    "time_transformation": "hamiltonian.time_transformation",
-    "tube": "hamiltonian.domain",
-}
-"""Former module paths, of documented modules and of classes in pickles, and those of today, both below `sympflow`."""
 
-
-class _FormerPaths:
-    """Finder of modules by their former paths: each is the module of today itself."""
-
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        package, _, name = fullname.partition(".")
-        found = package == "sympflow" and name in FORMER
-        return ModuleSpec(fullname, self) if found else None  # type: ignore[arg-type]
-
-    def create_module(self, spec: ModuleSpec) -> None:
-        """Leave the module to Python."""
-
-    def exec_module(self, module: ModuleType) -> None:
-        sys.modules[module.__name__] = import_module(f"sympflow.{FORMER[module.__name__.partition('.')[2]]}")
-
-
-FORMER_PATHS = _FormerPaths()
+def needed(library: str, extra: str) -> str:
+    """The way to install a library that is missing, in a message."""
+    return f'pip install {library}, or in the clone of sympflow pip install ".[{extra}]"'
 
 
 def whole_import(name: str) -> ModuleType:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arguments import check_flag
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arguments import check_flag, warn
+from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, weights
 from sympflow.integrators.contract import method_text
 from sympflow.show.cards import Card, Shown
@@ -172,15 +172,14 @@ class Solution(Shown):
                 return _energy(self, self.states, self.t)
             if self.varied:
                 return gathered(self, lambda part: part.energy())
-            t = None if self.system.autonomous else np.broadcast_to(self.t, self.states.shape[:-1])
-            return self.system.hamiltonian(self.states, t)
+            return self.system.hamiltonian(self.states, np.broadcast_to(self.t, self.states.shape[:-1]))
 
     def energy_error(self) -> np.ndarray:
         """Relative energy error over time, (..., n), with its sign; inf where H is beyond floats.
 
         See `sympflow.energy_error`; the largest magnitude is `sympflow.max_energy_error(sol)`.
         """
-        return energy_change(self, stacklevel=3)
+        return energy_change(self)
 
     def energy_scale(self) -> np.ndarray:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
@@ -398,11 +397,10 @@ def physical_solution(sol: Solution) -> Solution:
         apart = abs(to_numpy(both[0])).max(initial=0.0)
         scaled_apart, size = (abs(scale * to_numpy(y)).max(initial=0.0) for y in both)
     if scaled_apart > LARGEST_DIFFERENCE * size:
-        warnings.warn(
+        warn(
             f"The doubled variables q₋, p₋ have grown to {apart:.3g}: the run has left the physical limit. Reduce "
             "`dt`, or project every step, solve(system, 'projected', of=method).",
             RuntimeWarning,
-            stacklevel=3,
         )
     limit = doubled.physical_limit
     return replace(
@@ -434,7 +432,7 @@ def check_solution(sol: object, name: str = "sol") -> None:
         raise TypeError(f"`{name}` must be a Solution; got {type(sol).__name__}. Pass what solve() returns.")
 
 
-def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> np.ndarray:
+def energy_change(sol: Solution, relative: bool = True) -> np.ndarray:
     """H(y(t)) − H(y0) in float64, (..., n): the metric `sympflow.energy_error`, where it is documented."""
     sol.system.check_conservative(
         "so its energy is lost and no error",
@@ -450,10 +448,9 @@ def energy_change(sol: Solution, relative: bool = True, stacklevel: int = 2) -> 
             return error
         scale = sol.energy_scale()
         if (absolute := np.isnan(scale)).any():
-            warnings.warn(
+            warn(
                 "The energy error is absolute where H(y0) is 0 but for rounding: give the system an `energy_scale`.",
                 RuntimeWarning,
-                stacklevel=stacklevel,
             )
         compared = error / np.where(absolute, 1.0, scale)[..., None]
         return np.where(np.isinf(error), error, compared)  # H(y0) may be infinite itself: inf/inf
@@ -465,8 +462,7 @@ def _energy(sol: Solution, y: Array, t: Any) -> np.ndarray:
     with np.errstate(all="ignore"):
         if sol.rows is not None and not sol.rows.uniform and sol.system.autonomous:
             return sol.rows.hamiltonian(states)
-        times = None if sol.system.autonomous else np.broadcast_to(t, states.shape[:-1])
-        return np.asarray(sol.system.hamiltonian(states, times))
+        return np.asarray(sol.system.hamiltonian(states, np.broadcast_to(t, states.shape[:-1])))
 
 
 # trajectories with parameters of their own -----------------------------------------------------------------------
@@ -527,15 +523,10 @@ def _scattered(pieces: Sequence[tuple[np.ndarray, Any]], shape: tuple[int, ...])
     """Arrays (k, ...) of some trajectories each as one, (*shape, ...)."""
     whole: Any
     order = np.concatenate([index for index, _ in pieces])
-    if is_tensor(pieces[0][1]):
-        import torch
-
-        whole = torch.cat([values for _, values in pieces])[torch.as_tensor(np.argsort(order))]
-        return whole.reshape(*shape, *whole.shape[1:])
     if len(pieces) == 1 and (order == np.arange(len(order))).all():
-        whole = np.asarray(pieces[0][1])
+        whole = pieces[0][1]
     else:
-        whole = np.concatenate([np.asarray(values) for _, values in pieces])[np.argsort(order)]
+        whole = concatenate([values for _, values in pieces], 0)[np.argsort(order)]
     return whole.reshape(*shape, *whole.shape[1:])
 
 

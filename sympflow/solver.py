@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import time
@@ -16,29 +15,36 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import (
-    MAX_ASKED_VALUES,
     MAX_SAVED_VALUES,
-    as_float,
+    check_flag,
     check_not_traced,
     check_save_every,
     check_t_eval,
     check_t_span,
+    warn,
 )
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, lanes, readable, to_numpy
-from sympflow.events import EventSearch, parse
+from sympflow.arrays import Array, concatenate, finite_states, full_of_nan, is_tensor, lanes, last, readable, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import report_lanes, run_and_search
+from sympflow.integrators.base import run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
-from sympflow.integrators.diagnosis import note_poles, note_singularities, warn_of_cancelling, warn_of_long_steps
+from sympflow.integrators.diagnosis import diagnose, diagnose_piece, note_poles, note_singularities_of_rows
 from sympflow.integrators.domain_exit import (
     check_domain,
     check_system_along,
-    warn_of_leap,
-    warn_of_loss,
 )
 from sympflow.integrators.grid import MOST_OPEN_STEPS, no_event
+from sympflow.integrators.grid_runs import report_lanes
 from sympflow.integrators.impulses import landings, run_in_pieces
+from sympflow.integrators.problems import (
+    check_backend,
+    check_event_search,
+    check_events,
+    check_memory,
+    check_params,
+    check_stored,
+    check_y0,
+)
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, get, naming_plugin
 from sympflow.solution import Solution, StoredSolution, energy_change, joined
@@ -48,11 +54,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
     from sympflow.storage.runs import RunStore
 
-BACKENDS = ("auto", "compiled", "array")
-MAX_EVENT_SAMPLES = 100_000_000
-MOST_DIAGNOSED = 16  # sets of values of parameters
 FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite end
-_FLOAT64 = np.dtype(np.float64)
 
 
 def solve(
@@ -204,13 +206,11 @@ def solve(
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
     check_backend(backend, integrator)
-    if not isinstance(dense_output, bool | np.bool_):
-        raise TypeError(f"`dense_output` must be True or False; got {dense_output!r}.")
+    check_flag("dense_output", dense_output)
     action = ("warn" if integrator.trained else "ignore") if on_domain_exit is None else on_domain_exit
     if not isinstance(action, str) or action not in ("warn", "stop", "ignore"):
         raise ValueError(f"`on_domain_exit` must be 'warn', 'stop' or 'ignore'; got {on_domain_exit!r}.")
-    if not isinstance(diagnose, bool | np.bool_):
-        raise TypeError(f"`diagnose` must be True or False; got {diagnose!r}.")
+    check_flag("diagnose", diagnose)
     if action == "stop" and not readable(y_start):
         raise ValueError(
             "`on_domain_exit` 'stop' needs the values of the states, which torch.func.vmap and torch.compile hide: use "
@@ -238,14 +238,7 @@ def solve(
     elif system.step_is_open and readable(y_start):
         integrator = with_step(integrator, system, to_numpy(y_start))
     sol = _shown(integrator, problem, action, rows, progress)
-    if (
-        tol is not None
-        and steps_chosen
-        and store is None
-        and tol_of == "energy"
-        and system.autonomous
-        and system.conservative
-    ):
+    if tol is not None and steps_chosen and store is None and tol_of == "energy" and system.keeps_energy:
         _check_tolerance_met(sol, tol)
     if chosen is not None:
         sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"
@@ -279,17 +272,7 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
     if error > tol:
         note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
         sol.message += f" {note}"
-        warnings.warn(note, RuntimeWarning, stacklevel=3)
-
-
-def check_backend(backend: Any, integrator: Integrator) -> None:
-    """Raise ValueError if it is none, or none of the method."""
-    if not isinstance(backend, str) or backend not in BACKENDS:
-        raise ValueError(
-            f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}: for a GPU pass tensors on it."
-        )
-    if backend == "compiled" and not integrator.compiles:
-        raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
+        warn(note, RuntimeWarning)
 
 
 def _answered(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows | None) -> Solution:
@@ -313,7 +296,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     able = problem.store is None and problem.letters is None
     told, jumps = landings(integrator, between, problem.t0, problem.t1, able)
     if told:
-        warnings.warn(told, RuntimeWarning, stacklevel=4)
+        warn(told, RuntimeWarning)
     if between is not system:
         _check_impulses(problem, integrator)
     if between is not system or jumps:
@@ -333,22 +316,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
             outcome, stopped = stop.outcome, stop
         _check_outcome(outcome, integrator, y_start)
     outcome.stats["wall_time"] = time.perf_counter() - start
-    if stopped is None:
-        _diagnose(outcome, integrator, problem, rows, stacklevel=5)
-    failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
-    if system.leaps and not failed and problem.letters is None and problem.store is None and readable(outcome.y):
-        warn_of_leap(outcome, system, y_start, stacklevel=4)
-    if system.functions_given and readable(outcome.y):
-        system.check_functions_along(outcome.y)
-    if integrator.trained:
-        check_system_along(outcome, integrator, between, y_start)
-    if action != "ignore" and readable(outcome.y):
-        check_domain(outcome, integrator, between, action)
-        if problem.store is None and not failed and between is system:
-            warn_of_loss(outcome, integrator, system, y_start, stacklevel=4)
-    if problem.diagnosed and rows is None and not failed and problem.store is None and readable(outcome.y):
-        warn_of_long_steps(outcome, integrator, problem, stacklevel=4)
-    y = outcome.y.movedim(0, -1) if is_tensor(outcome.y) else _time_last(outcome.y)
+    diagnose(outcome, integrator, problem, rows, action, stopped is not None)
+    y = last(outcome.y)
     sol = (Solution if problem.store is None else StoredSolution)(
         t=outcome.t,
         y=y,
@@ -389,7 +358,7 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
             sol = _solved(integrator, part, action, rows.taken(index))
             pieces.append((index, sol))
             if problem.diagnosed and part.letters is not None and not sol.success:
-                _note_singularities(sol, integrator, part, rows.taken(index))
+                note_singularities_of_rows(sol, integrator, part, rows.taken(index))
     except Interrupted as stop:
         pieces.append((index, stop.solution))
         whole = max((sol for _, sol in pieces), key=lambda sol: len(sol.t))
@@ -398,22 +367,6 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
         sol = joined(pieces, problem.system, problem.y0, rows)
         raise Interrupted(stop.outcome, replace(sol, message=stop.solution.message)) from None
     return joined(pieces, problem.system, problem.y0, rows)
-
-
-def _note_singularities(sol: Solution, integrator: Integrator, problem: Problem, rows: ParameterRows) -> None:
-    """Note when solutions with parameters of their own become infinite, of the first `MOST_DIAGNOSED` that fail."""
-    status = np.asarray(sol.status)
-    failed, times = np.flatnonzero(status < 0), np.full(len(status), np.nan)
-    for few, system, _ in itertools.islice(rows.taken(failed).distinct(), MOST_DIAGNOSED):
-        i = failed[few]
-        stats = {name: value[i] if isinstance(value, np.ndarray) else value for name, value in sol.stats.items()}
-        outcome = Outcome(sol.t, np.moveaxis(sol.y[i], -1, 0), status[i], "", stats)
-        note_singularities(outcome, integrator, replace(problem, system=system, y0=problem.y0[i], letters=None))
-        times[i] = outcome.stats.get("blow_up_time", np.nan)
-    if np.isfinite(times).any():
-        sol.stats["blow_up_time"] = times
-        first = int(np.argmax(np.isfinite(times)))
-        sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."
 
 
 def _not_begun(sol: Solution, problem: Problem) -> Solution:
@@ -426,12 +379,7 @@ def _not_begun(sol: Solution, problem: Problem) -> Solution:
 def _up_to(sol: Solution, t: np.ndarray) -> Solution:
     """A solution of which the outputs at the last ones of the times t are unknown, NaN."""
     unknown = full_of_nan(sol.y0)[..., None]
-    width = len(t) - len(sol.t)
-    if is_tensor(sol.y):
-        import torch
-
-        return replace(sol, t=t, y=torch.cat([sol.y, *[unknown] * width], dim=-1), sol=None)
-    return replace(sol, t=t, y=np.concatenate([sol.y, np.repeat(unknown, width, axis=-1)], axis=-1), sol=None)
+    return replace(sol, t=t, y=concatenate([sol.y, *[unknown] * (len(t) - len(sol.t))]), sol=None)
 
 
 def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
@@ -445,26 +393,8 @@ def _run(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
 def _run_diagnosed(rows: ParameterRows | None, integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
     """The outcome of a piece of a run, and its problem."""
     outcome, problem = _run(integrator, problem)
-    _diagnose(outcome, integrator, problem, rows, stacklevel=7)
+    diagnose_piece(outcome, integrator, problem, rows)
     return outcome, problem
-
-
-def _diagnose(
-    outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None, stacklevel: int
-) -> None:
-    """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
-    if not problem.diagnosed:
-        return
-    passed = False
-    looked = problem.system.poles is not None or problem.letters is not None
-    if looked and problem.store is None and readable(outcome.y):
-        if np.any(np.asarray(outcome.status) >= 0):
-            passed = note_poles(outcome, integrator, problem, rows, stacklevel=stacklevel + (rows is not None))
-        if problem.letters is None:
-            warn_of_cancelling(outcome, problem, stacklevel=stacklevel)
-    failed = outcome.status < 0 if isinstance(outcome.status, int) else np.any(np.asarray(outcome.status) < 0)
-    if failed and problem.letters is None and readable(problem.y0):
-        note_singularities(outcome, integrator, problem, passed)
 
 
 def _check_impulses(problem: Problem, integrator: Integrator) -> None:
@@ -522,28 +452,9 @@ def _look_for_poles(store: RunStore, piece: Outcome, integrator: Integrator, bef
     """Note that a run passed a pole between outputs of a window, and the state before them; of each trajectory once."""
     known = np.array(store.noted.get("failed_at", np.full(before.y0.shape[:-1], np.nan)), dtype=float)
     piece.status = np.where(np.isnan(known), 0, -1) if known.ndim else 0 if np.isnan(known) else -1
-    if note_poles(piece, integrator, before, None, stacklevel=6):
+    if note_poles(piece, integrator, before, None):
         at = np.where(np.isnan(known), piece.stats["failed_at"], known)
         store.noted |= {"failed_at": at.tolist(), "passed": store.noted.get("passed", piece.message)}
-
-
-def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> None:
-    """Refuse what a store does not take, with the reason."""
-    if is_tensor(problem.y0):
-        raise TypeError("`store` takes NumPy states, for it keeps no gradients: pass y0.detach().numpy().")
-    if problem.events is not None and problem.events.events:
-        raise ValueError(
-            "`store` takes no `events`, whose zeros are kept in memory: store the outputs, and look for the zeros in "
-            "them, or leave `store` out."
-        )
-    if problem.dense_output:
-        raise ValueError("`store` has no `dense_output`, which keeps every step in memory: choose times by `t_eval`.")
-    if action == "stop":
-        raise ValueError("`store` takes no `on_domain_exit` 'stop': use 'warn'.")
-    if rows is not None and not rows.uniform:
-        raise ValueError(
-            "`store` is for trajectories of the same `params`: use sympflow.ensemble(..., params=..., store=...)."
-        )
 
 
 def _run_endless(integrator: Integrator, problem: Problem) -> tuple[Outcome, Problem]:
@@ -574,10 +485,6 @@ def _run_endless(integrator: Integrator, problem: Problem) -> tuple[Outcome, Pro
         outcome.message = no_event(outcome.stats.get("n_steps", most), problem.t1)
     reached = problem.events.end or (outcome.stats.get("failed_at", problem.t1),)
     return outcome, replace(problem, t1=float(reached[0]))
-
-
-def _time_last(y: np.ndarray) -> np.ndarray:
-    return y.T if y.ndim == 2 else np.moveaxis(y, 0, -1)
 
 
 def _fits(outcome: Outcome, y0: Array) -> bool:
@@ -619,146 +526,3 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
     outcome.status = np.where(bad, -1, outcome.status) if bad.ndim else -1
     if not bad.ndim:
         outcome.t, outcome.y = outcome.t[:first], outcome.y[:first]
-
-
-def check_y0(system: HamiltonianSystem, y0: Any, dtype: Any) -> Array:
-    if y0 is None:
-        raise ValueError(f"`y0` is needed: the system {system.name!r} has no default initial state.")
-    size = 2 * system.ndof
-    if is_tensor(y0):
-        if dtype is not None:
-            raise TypeError("`dtype` is for NumPy states: convert the tensor `y0` instead.")
-        if str(y0.dtype) not in ("torch.float32", "torch.float64"):
-            raise TypeError(
-                f"`y0` must be a real floating-point tensor of 32 or 64 bits; got {y0.dtype}. Use y0.double()."
-            )
-        if str(y0.layout) != "torch.strided" or y0.device.type == "meta":
-            raise TypeError(
-                f"`y0` must be a dense tensor with values; got {y0.layout} on {y0.device}. Use y0.to_dense()."
-            )
-    else:
-        y0 = _as_floats(y0, _check_dtype(dtype))
-    if y0.ndim == 0 or y0.shape[-1] != size:
-        y0 = system.lift(y0)
-    if math.prod(y0.shape) == 0:
-        raise ValueError(f"`y0` is an empty batch, of shape {tuple(y0.shape)}: pass at least one state.")
-    if not (np.isfinite(y0) if type(y0) is np.ndarray else finite_states(y0)).all():
-        raise ValueError("`y0` must be finite; it holds NaN or infinity. Remove these states.")
-    return y0
-
-
-def _as_floats(y0: Any, dtype: np.dtype) -> np.ndarray:
-    if type(y0) is np.ndarray and y0.dtype == dtype and y0.size <= MAX_ASKED_VALUES:
-        return y0.copy()
-    try:
-        array = np.asarray(y0)
-        if not np.issubdtype(array.dtype, np.number):
-            raise TypeError(f"dtype {array.dtype}")
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"`y0` must be an array of numbers; got {error}. Pass numbers of shape (..., 2d).") from error
-    if np.ma.is_masked(y0):
-        raise ValueError("`y0` has masked entries: fill them, or leave these states out.")
-    if np.iscomplexobj(array):
-        raise TypeError("`y0` must be real; got complex numbers. Use y0.real if the imaginary part is zero.")
-    if array.size > MAX_ASKED_VALUES:
-        raise ValueError(f"`y0` has {array.size:.3g} numbers, more than {MAX_ASKED_VALUES:.0e}: solve in parts.")
-    with np.errstate(over="ignore"):  # what is infinite in float32 is refused as such
-        return array.astype(dtype)
-
-
-def _check_dtype(dtype: Any) -> np.dtype:
-    if dtype is None:
-        return _FLOAT64
-    try:
-        chosen = np.dtype(dtype)
-    except Exception:  # NumPy raises errors of many kinds
-        chosen = np.dtype(object)
-    if chosen not in (np.float32, np.float64):
-        raise ValueError(f"`dtype` must be 'float32' or 'float64'; got {dtype!r}.")
-    return chosen
-
-
-def check_params(
-    system: HamiltonianSystem, params: Any, y0: Array, integrator: Integrator
-) -> tuple[ParameterRows, Array]:
-    """The parameters of each trajectory, and y0 broadcast with them."""
-    from sympflow.hamiltonian.parameter_rows import checked_rows
-
-    rows = checked_rows(system, params, tuple(y0.shape[:-1]))
-    check_own_parameters(system, rows.values, integrator)
-    shape = (*rows.shape, y0.shape[-1])
-    return rows, (y0.expand(shape) if is_tensor(y0) else np.broadcast_to(y0, shape).copy())
-
-
-def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLike], integrator: Integrator) -> None:
-    """Refuse a trained flow for other parameters than its system's, and a sweep from where H is constant in time."""
-    if system.autonomous and system.symbols is not None and system.symbols.named_time is not None and values:
-        raise ValueError(
-            "`params` are those of a driven system, and the values that `system` has make it constant in time: pass "
-            "one whose H depends on t, as by system.with_params(...)."
-        )
-    if not integrator.trained:
-        return
-    other = [name for name, value in values.items() if np.any(np.asarray(value) != system.params[name])]
-    if other:
-        own = ", ".join(f"{name} = {system.params[name]:.9g}" for name in other)
-        raise ValueError(
-            f"`params` changes {', '.join(other)}, and a trained flow, as of method {integrator.name!r}, holds for "
-            f"its own parameters ({own}): train one for each value, or use a classical method such as 'kahan_li8'."
-        )
-
-
-def check_events(events: Any, event_step: Any) -> EventSearch | None:
-    parsed = parse(events)
-    if not parsed:
-        if event_step is not None:
-            raise ValueError("`event_step` samples events, but there are none: pass `events`, or leave it out.")
-        return None if events is None else EventSearch(())
-    if event_step is None:
-        return EventSearch(parsed)
-    if not as_float(event_step) > 0:
-        raise ValueError(f"`event_step` must be a positive number, a time; got {event_step!r}.")
-    return EventSearch(parsed, float(event_step))
-
-
-def check_event_search(search: EventSearch, y0: Array, duration: float) -> None:
-    """Refuse events along a batch, and samples of them that would never end."""
-    if search.events and not readable(y0):
-        raise ValueError(
-            "`events` are found by the values of the states, which torch.func.vmap and torch.compile hide: call solve "
-            "outside of them, one state at a time."
-        )
-    if search.events and y0.ndim != 1:
-        raise ValueError(
-            f"`events` are found along one trajectory, but `y0` is a batch of shape {tuple(y0.shape)}: solve one state "
-            "at a time, or use poincare_section, which takes batches."
-        )
-    if search.max_interval is not None and MAX_EVENT_SAMPLES * search.max_interval < duration < math.inf:
-        raise ValueError(
-            f"`event_step` {search.max_interval:g} would take more than {MAX_EVENT_SAMPLES:.0e} samples over a time of "
-            f"{duration:g}: increase it."
-        )
-
-
-def check_memory(integrator: Integrator, problem: Problem) -> None:
-    """Refuse runs whose outputs would fill the memory."""
-    size = math.prod(problem.y0.shape)
-    if problem.t_eval is not None and problem.t_eval.size * size > MAX_ASKED_VALUES:
-        raise ValueError(
-            f"`t_eval` asks for {problem.t_eval.size * size:.3g} values, more than {MAX_ASKED_VALUES:.0e}: choose "
-            "fewer times, or solve in parts."
-        )
-    if problem.t_eval is not None and not problem.dense_output:
-        return
-    length = integrator.step_length(problem.system) if problem.dense_output else integrator.output_step(problem)
-    if length is None:
-        return
-    n_steps = abs(problem.t1 - problem.t0) / length
-    stored = n_steps if problem.dense_output else n_steps / problem.save_every
-    values = (stored + 1) * size
-    if values > MAX_SAVED_VALUES:
-        raise ValueError(
-            f"`t_eval` is not given, so {values:.3g} values ({values * 8 / 2**30:.3g} GiB) would be stored, more than "
-            f"{MAX_SAVED_VALUES:.0e}: choose the times with `t_eval`, or thin them with `save_every`"
-            f"{', or leave dense_output out' if problem.dense_output else ''}."
-        )

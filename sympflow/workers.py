@@ -96,7 +96,7 @@ def _versions() -> dict[str, str]:
     return found
 
 
-class Parcel:
+class PickledTask:
     """The common part of all calls: pickled once, and unpacked once by each worker; in this process it is sent as is.
 
     Parameters
@@ -129,10 +129,10 @@ class Parcel:
         return _sent, (self.pack(),)
 
 
-def _sent(packed: bytes) -> Parcel:
-    parcel = Parcel(None)
-    parcel._packed = parcel._blob = packed
-    return parcel
+def _sent(packed: bytes) -> PickledTask:
+    task = PickledTask(None)
+    task._packed = task._blob = packed
+    return task
 
 
 def _pickled(value: Any) -> bytes:
@@ -188,7 +188,7 @@ class Answer:
 class _Call:
     """A call of `function(common, item)` for a numbered item."""
 
-    def __init__(self, function: Callable[[Any, Any], Any], common: Parcel) -> None:
+    def __init__(self, function: Callable[[Any, Any], Any], common: PickledTask) -> None:
         self.function, self.common = function, common
         self.__name__ = function.__name__  # by which engines call it
 
@@ -256,7 +256,7 @@ def mapped(
         What `function` raises, at the first item for which it does.
     """
     workers = checked_workers(workers)
-    call, left, clock = _Call(function, Parcel(common)), dict(enumerate(items)), _Clock(timeout)
+    call, left, clock = _Call(function, PickledTask(common)), dict(enumerate(items)), _Clock(timeout)
     answers = _rounds(1 if isinstance(workers, int) and len(left) < 2 else workers, call, processes, clock)
     attempt = idle = 0
     while left:
@@ -290,7 +290,7 @@ def mapped(
                 workers, answers = n, _rounds(n, call, True, clock)
 
 
-class Crew:
+class WorkerPool:
     """Workers that stay from one map to the next, closed as a context; a number is one of processes.
 
     Ctrl-C is left to the program that has them: it ends them.
@@ -327,7 +327,7 @@ class Crew:
                 yield early.pop(following)
                 following += 1
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> WorkerPool:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,6 +1,7 @@
 """The code of the documentation is run: every Python block of README and docs, page by page, in order."""
 
 import importlib.util
+import json
 import os
 import re
 import runpy
@@ -58,6 +59,19 @@ def test_the_code_on_a_page_runs(page, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_printed_outputs_are_those_of_the_code(monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    outputs = runpy.run_path(str(ROOT / "docs" / "outputs.py"))
+    for name in outputs["PAGES"]:
+        text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+        assert outputs["page_with_outputs"](text) == text
+    notebook = json.loads(outputs["NOTEBOOK"].read_text(encoding="utf-8"))
+    assert any(cell.get("outputs") for cell in notebook["cells"])
+    assert outputs["notebook_with_outputs"](json.loads(json.dumps(notebook))) == notebook
+
+
+@pytest.mark.slow
 def test_the_code_of_the_gallery_draws(tmp_path, monkeypatch):
     """A hundredth of each run, by array operations; `python docs/gallery.py` runs them in full."""
 
@@ -108,7 +122,7 @@ def test_the_code_on_a_page_is_not_wider_than_it():
 
 
 def test_formulas_are_tex_that_can_be_typeset():
-    pytest.importorskip("math_core", reason='formulas need pip install "sympflow[docs]"')
+    pytest.importorskip("math_core", reason='formulas need pip install ".[docs]"')
     mathml = runpy.run_path(str(ROOT / "docs" / "typeset.py"))["mathml"]
     assert "<mfrac>" in mathml(r"\frac{1}{2}")
     with pytest.raises(ValueError, match="frca"):
@@ -129,7 +143,8 @@ def test_every_public_name_is_in_the_reference():
     reference = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
     for name in sympflow.__all__:
         home = sympflow._HOME.get(name)
-        assert home is None or any(f"::: sympflow.{home}{end}" in reference for end in (f".{name}", "\n")), name
+        known = {f"::: sympflow.{path}\n" for path in (name, home, f"{home}.{name}")}
+        assert home is None or any(words in reference for words in known), name
 
 
 RAW_TEX = re.compile(r"\$[^$\n]*[\\_^][^$\n]*\$|\\(frac|bar|nabla|partial|mathcal|sum|int)(?![a-z])|\\[()\[\]]")
@@ -168,8 +183,8 @@ class Page(HTMLParser):
 @pytest.mark.slow
 def test_the_site_is_whole(tmp_path):
     """No warning, raw TeX, dead link, page that no list leads to, image without words, or script from the network."""
-    pytest.importorskip("mkdocs", reason='the site needs pip install "sympflow[docs]"')
-    pytest.importorskip("mkdocstrings", reason='the site needs pip install "sympflow[docs]"')
+    pytest.importorskip("mkdocs", reason='the site needs pip install ".[docs]"')
+    pytest.importorskip("mkdocstrings", reason='the site needs pip install ".[docs]"')
     site = tmp_path / "site"
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(site)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
@@ -269,3 +284,15 @@ def test_every_fragment_is_included_and_says_where_it_is_from():
         assert f'--8<-- "measured/{fragment.name}"' in text, fragment.name
         source = fragment.read_text(encoding="utf-8").splitlines()[-1]
         assert re.fullmatch(r"<small>`[^`]+` · .+ · commit .+ · \d{4}-\d\d-\d\d</small>", source), fragment.name
+
+
+def test_the_table_of_where_to_add_names_what_is_there():
+    table = (ROOT / "docs" / "architecture.md").read_text().split("## Where do I add")[1].split("## ")[0]
+    rows = [row.split("|") for row in table.splitlines() if row.startswith("| a ")]
+    assert len(rows) > 8
+    for _, _, file, there, *_ in rows:
+        for path in re.findall(r"`([\w/]+\.py)`", file):
+            code = (ROOT / "sympflow" / path).read_text()
+            name = re.search(r"`([A-Za-z_]+)`(?!.*`[A-Z_]+`)", there)
+            assert name is not None, there
+            assert re.search(rf"^(class |def )?{name[1]}\b", code, re.M), f"{path} has no {name[1]}"

@@ -11,7 +11,7 @@ from conftest import KINDS
 from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems
-from sympflow.integrators.base import FINISHED, Integrator, Outcome
+from sympflow.integrators.contract import FINISHED, Integrator, Outcome
 from sympflow.integrators.interpolants import Piecewise, hermite
 from sympflow.integrators.tableaux import ADAPTIVE as TORCHDIFFEQ_ADAPTIVE
 from sympflow.kernels.explicit_loops import compiled_field
@@ -180,6 +180,7 @@ def test_a_zero_between_the_samples_of_a_flow_is_found(rotation):
 
 @pytest.mark.parametrize("method", KINDS)
 @pytest.mark.parametrize("t_end", [8.0, -8.0])
+@pytest.mark.filterwarnings("ignore:`dt` .* is too long")
 def test_the_state_of_an_event_is_the_dense_output_there(method, t_end):
     """For every kind of method; without end and with one."""
     if method == "mlp" and t_end < 0:

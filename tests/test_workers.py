@@ -133,7 +133,7 @@ def test_what_is_no_worker():
 
 
 def test_other_versions(monkeypatch):
-    packed = module.Parcel(1).pack()
+    packed = module.PickledTask(1).pack()
     assert module._sent(packed).value == 1
     mine = module._versions()
     module._unpacked.cache_clear()

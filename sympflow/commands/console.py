@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from sympflow.commands.words import Scene, Usage
+from sympflow.show.cards import cut
 from sympflow.studies.reports import Column, text_table
 
 out = Console(soft_wrap=True, highlight=False)
@@ -137,8 +138,12 @@ def show(text: str) -> None:
         print(text)
 
 
-def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table of strings, aligned left."""
+def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], width: int | None = None) -> None:
+    """A table of strings, aligned left; with a width the last column is cut so that it fits, or fits the terminal."""
+    if width is not None:
+        others = sum(2 + max(len(row[i]) for row in (titles, *rows)) for i in range(len(titles) - 1))
+        left = max(width, out.width if out.is_terminal else 0) - others
+        rows = [(*row[:-1], cut(row[-1], left)) for row in rows]
     columns = [Column(title, cells, left=True) for title, *cells in zip(titles, *rows, strict=True)]
     out.print(text_table(columns), markup=False)
 

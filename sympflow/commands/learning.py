@@ -98,7 +98,7 @@ def learn(
         out.print(f"Chosen: {learned['model']}, for {learned['reason']}", markup=False)
         formula = flow.system.expression
         show("H is the flow's own, of no formula." if formula is None else f"H = {formula}")
-        if flow.system.friction is not None:
+        if flow.system.friction:
             show(f"damping = {flow.system.friction.damping.tolist()}")
         shown = {k: v for k, v in flow.figures.items() if k.startswith(("held_out_error", "noise", "energy_scatter"))}
         out.print(", ".join(f"{k} = {v:.3g}" for k, v in shown.items() if v is not None))

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import textwrap
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sympflow.commands import completion
 from sympflow.commands.console import Quiet, print_table, reporting
 from sympflow.commands.words import Own, Systems, made, one_scene, parameters, scene_names, shown
+
+if TYPE_CHECKING:
+    from sympflow.integrators.contract import Integrator
 
 
 def systems(ctx: typer.Context, quiet: Quiet = False) -> None:
@@ -60,27 +65,49 @@ def flows(
         print_table(HEADINGS, list(shipped_flows(scene).rows()))
 
 
-def methods(ctx: typer.Context, quiet: Quiet = False) -> None:
-    """List the methods, their orders, costs and options."""
+def methods(
+    ctx: typer.Context,
+    name: Annotated[
+        str | None,
+        typer.Argument(help="One method, of which all is shown.", autocompletion=completion.one_method),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """List the methods with their orders, costs and sources; of one all that is known, its options too.
+
+    Examples:
+
+      sympflow methods
+
+      sympflow methods srkn11b
+    """
     with reporting(ctx):
         from sympflow.integrators.registry import available, get
 
+        if name is not None:
+            cls = get(name)
+            rows: list[tuple[str, ...]] = [("options", ", ".join(cls.options())), ("source", cls.summary())]
+            rows = [("order", _order(cls)), ("symplectic", _yes(cls)), ("forces a step", cls.forces_a_step()), *rows]
+            print_table((cls.name, ""), rows)
+            return
         rows = []
-        for name in available():
+        for each in available():
             try:
-                cls = get(name)
+                cls = get(each)
             except ImportError as error:
-                rows.append((name, "", "", "", "", str(error)))
+                rows.append((each, "", "", "", str(error)))
                 continue
-            order = "trained" if cls.trained else str(cls.order or "–")
-            rows.append(
-                (
-                    name,
-                    order,
-                    "yes" if cls.symplectic else "no",
-                    cls.forces_a_step(),
-                    ", ".join(cls.options()),
-                    cls.summary(),
-                )
-            )
-        print_table(("name", "order", "symplectic", "forces a step", "options", "source"), rows)
+            rows.append((each, _order(cls), _yes(cls), cls.forces_a_step(), cls.summary()))
+        print_table(("name", "order", "symplectic", "forces a step", "source"), rows, width=LISTED)
+
+
+LISTED = 100
+"""Columns of the list of methods, where the terminal has no more."""
+
+
+def _order(cls: type[Integrator]) -> str:
+    return "trained" if cls.trained else str(cls.order or "–")
+
+
+def _yes(cls: type[Integrator]) -> str:
+    return "yes" if cls.symplectic else "no"

@@ -106,7 +106,7 @@ def solve(
         if to is not None:
             write_solution(sol, to)
         worst = "" if store is None else f" in {store}"
-        if store is None and scene.system.conservative and scene.system.autonomous:
+        if store is None and scene.system.keeps_energy:
             worst = f", largest energy error {max_energy_error(sol) if len(sol.t) else np.nan:.2e}"
         out.print(in_options(sol.message, ctx), markup=False)
         out.print(f"{len(sol.t)} outputs{worst}")

@@ -13,7 +13,7 @@ from sympflow.commands import completion
 from sympflow.commands.console import Quiet, out, progress, ready_folder, reporting, show, write_comparisons
 from sympflow.commands.words import (
     Backend,
-    Method,
+    OneMethod,
     Own,
     Scene,
     State,
@@ -33,6 +33,7 @@ Methods = Annotated[
     str,
     typer.Option(
         "--methods",
+        "--method",
         help="Separated by commas; options as rk45:rtol=1e-8; also .safetensors files.",
         autocompletion=completion.methods,
     ),
@@ -244,7 +245,7 @@ def section(
     ctx: typer.Context,
     system: Systems = None,
     own: Own = None,
-    method_name: Method = "sympflow",
+    method_name: OneMethod = None,
     t_end: TEnd = None,
     y0: Annotated[
         list[str] | None,
@@ -301,7 +302,7 @@ def section(
         from sympflow.show.style import save
         from sympflow.studies.poincare import names, poincare_section
 
-        scene, chosen = one_scene(system, own), configured(method_name)
+        scene, chosen = one_scene(system, own), None if method_name is None else configured(method_name)
         span = interval(scene, t_end)
         start = None if energy is not None and not y0 else _starts(scene, y0, orbits, seed)
         if direction is not None and direction not in DIRECTIONS:
@@ -320,7 +321,7 @@ def section(
             asked |= {"n": orbits, "seed": seed}
         options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         with progress() as say:
-            say(f"{scene.key}: {method_name}")
+            say(f"{scene.key}: {method_name or 'section'}")
             found = poincare_section(scene.system, chosen, span, start, **options)
         if since is not None:
             found = found.since(since)

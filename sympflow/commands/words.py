@@ -55,14 +55,6 @@ Own = Annotated[
         autocompletion=_systems,
     ),
 ]
-Method = Annotated[
-    str,
-    typer.Option(
-        "--method",
-        help="A name, name:option=value, or a .safetensors file.",
-        autocompletion=completion.one_method,
-    ),
-]
 OneMethod = Annotated[
     str | None,
     typer.Option(
@@ -279,7 +271,7 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
     name, *pairs = word.split(":")
     name = name.replace("_", "-")
     if name not in scene_names():
-        close = difflib.get_close_matches(name, scene_names(), n=1)
+        close = difflib.get_close_matches(name, scene_names(), n=1, cutoff=0.5)
         hint = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(
             f"`system` {name!r} is unknown. {hint}Choose from {', '.join(scene_names())}, or name an own one, "

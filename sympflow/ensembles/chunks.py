@@ -10,10 +10,11 @@ from functools import cached_property
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, KernelStepper, Stepper
+from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Integrator, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
+from sympflow.integrators.steppers import Stepper
 from sympflow.kernels.protocol import Carry
 from sympflow.solver import solve
 
@@ -136,14 +137,15 @@ class Chunk:
         stepper = self._stepper
         most = max(1, MOST_VALUES // self.y0.size)
         alike = self.t_eval is None and not self.params and self.system.autonomous
-        if len(times) <= most or not alike or not isinstance(stepper, KernelStepper) or len(self) == 1:
+        kernel = None if stepper is None else stepper.kernel
+        if len(times) <= most or not alike or stepper is None or kernel is None or len(self) == 1:
             yield times, self.states(times)
             return
         grid = Grid(*self.t_span, stepper.integrator.step_length(self.system))
         carry, last = Carry(), np.full(len(self), grid.n_steps)
         for start in range(0, grid.n_steps + 1, most):
             save = np.arange(start, min(start + most, grid.n_steps + 1))
-            y, last, _ = stepper.kernel.run(grid.h, self.y0, int(save[-1]), save, carry=carry)
+            y, last, _ = kernel.run(grid.h, self.y0, int(save[-1]), save, carry=carry)
             ran_out = np.flatnonzero((last < save[-1]) & (self.status == 0))
             for row in ran_out.tolist():
                 self.fail(row, self._reason(grid.time(int(last[row])), ""))

@@ -11,7 +11,7 @@ from sympflow.arguments import check_counts
 from sympflow.arrays import is_tensor
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.solver import check_y0
+from sympflow.integrators.problems import check_y0
 from sympflow.storage.identity import digest
 
 DRAWN = 4096

@@ -23,12 +23,12 @@ from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Me
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.choosing import integrator_for
 from sympflow.integrators.contract import Integrator, Problem
+from sympflow.integrators.problems import check_backend, check_own_parameters
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import check_applies
 from sympflow.kernels.threads import at_most
-from sympflow.solver import check_backend, check_own_parameters
 from sympflow.systems.given import given_system
-from sympflow.workers import LostWorkers, Parcel, Unpicklable, checked_workers, mapped
+from sympflow.workers import LostWorkers, PickledTask, Unpicklable, checked_workers, mapped
 
 if TYPE_CHECKING:
     from sympflow.ensembles.stores import EnsembleStore
@@ -418,7 +418,7 @@ def _unpicklable(task: Task, orbits: Given | Drawn, error: Exception) -> TypeErr
     parts = {"system": task.system, "method": task.integrator, "reduce": task.reduction, "y0": orbits.sent(0, 1)}
     for name, part in parts.items():
         try:
-            Parcel(part).pack()
+            PickledTask(part).pack()
         except Unpicklable as why:
             return TypeError(
                 f"`{name}` cannot be sent to the processes of `workers` ({why}): define its functions in a module, or "

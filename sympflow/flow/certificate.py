@@ -167,5 +167,5 @@ class Certificate:
 
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0:
-        raise ValueError(f"`description` has a {name} that is no number: {value!r}.")
+        raise ValueError(f"`description` has a {name} that is not a number: {value!r}.")
     return float(value)

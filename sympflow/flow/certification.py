@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Kernel
 
 SAVED_VALUES = 1_000_000  # of a piece of the measured runs, which are never held whole
 WORST = 16  # states of a time from which the largest rate is searched
@@ -24,36 +23,8 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 FIRST_STEP, SHRINK = 0.2, 0.65  # how far these are, in standard deviations of Ω, and how much nearer each time
 
 
-class _Flow(Protocol):
-    """A flow map with a Hamiltonian, as `certify` needs it: see `sympflow.flow.flow_map.FlowMap`."""
-
-    dt: float
-
-    @property
-    def dtype(self) -> torch.dtype: ...
-
-    @property
-    def device(self) -> torch.device: ...
-
-    def __call__(self, t: Any, x: Tensor) -> Tensor: ...
-
-    def psi(self, t: Any, x: Tensor) -> Tensor: ...
-
-    def psi_and_velocity(self, t: Any, x: Tensor) -> tuple[Tensor, Tensor]: ...
-
-    def hamiltonian_unchecked(self, t: Any, x: Tensor) -> Tensor: ...
-
-    def prepare(self, t: Any, x: Tensor) -> Tensor: ...
-
-    def kernel_step(self, t: Any, x: Tensor, back: bool = False) -> Tensor: ...
-
-    def finish(self, t: Any, x: Tensor) -> Tensor: ...
-
-    def kernel_for(self, system: HamiltonianSystem) -> Kernel: ...
-
-
 def certify(
-    flow: _Flow,
+    flow: Any,
     system: HamiltonianSystem,
     domain: Domain,
     weights: str,
@@ -129,7 +100,7 @@ def _largest_nearby(
 
 @torch.no_grad()
 def _over_sample(
-    flow: _Flow, system: HamiltonianSystem, domain: Domain, x: np.ndarray, times: int, rng: np.random.Generator
+    flow: Any, system: HamiltonianSystem, domain: Domain, x: np.ndarray, times: int, rng: np.random.Generator
 ) -> tuple[Quantiles, Quantiles, Quantiles]:
     """The defect, the error of 𝓗 and δ, over states x (n, 2d)."""
     points = torch.as_tensor(x, dtype=flow.dtype, device=flow.device)
@@ -169,7 +140,7 @@ def _array(values: Tensor) -> np.ndarray:
     return values.detach().cpu().double().numpy()
 
 
-def _one_step_error(flow: _Flow, system: HamiltonianSystem, x: np.ndarray) -> Quantiles:
+def _one_step_error(flow: Any, system: HamiltonianSystem, x: np.ndarray) -> Quantiles:
     from sympflow.hamiltonian.exact_flow import reference_step
 
     with torch.no_grad():
@@ -178,7 +149,7 @@ def _one_step_error(flow: _Flow, system: HamiltonianSystem, x: np.ndarray) -> Qu
 
 
 def _energy_errors(
-    flow: _Flow, system: HamiltonianSystem, domain: Domain, x: np.ndarray, t_end: float
+    flow: Any, system: HamiltonianSystem, domain: Domain, x: np.ndarray, t_end: float
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """The largest |H − H0| of each orbit in Ω up to t_end, the same relative, how many left Ω.
 
@@ -208,7 +179,7 @@ def _energy_errors(
 
 
 @torch.no_grad()
-def _orbit(flow: _Flow, system: HamiltonianSystem, y: np.ndarray, done: int, n: int) -> np.ndarray:
+def _orbit(flow: Any, system: HamiltonianSystem, y: np.ndarray, done: int, n: int) -> np.ndarray:
     """The states at 0, 1, …, n steps of Δt, and one between every two: (2n + 1, N, 2d), in order of time.
 
     Over all steps, of which so many are done, the fractions of a step in between fill (0, 1) evenly. The flow runs in

@@ -163,7 +163,9 @@ class ClockedFlow(SystemFlow):
     def _check(system: HamiltonianSystem) -> None:
         check_for_flows(system)
         if "shift" not in system.params:
-            raise ValueError("`system` is no logarithmic Hamiltonian: make one by sympflow.time_transformed(system).")
+            raise ValueError(
+                "`system` is not a logarithmic Hamiltonian: make one by sympflow.time_transformed(system)."
+            )
 
     @property
     def dtype(self) -> torch.dtype:

@@ -65,7 +65,7 @@ class CollocationLayer(Layer):
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         flow, y, h = self.flow, torch.cat([q, p]).T, -t / self.flow.steps
-        flow.bound_system.check_conservative("so that `flow` is that of no Hamiltonian", "ask its system for H")
+        flow.bound_system.check_conservative("so `flow` has no Hamiltonian", "ask its system for H")
         K, _ = flow.stages_of(y, h)  # of the way back, whose stages are those of the step
         A = torch.as_tensor(flow.tableau[0], dtype=y.dtype, device=y.device)
         mean = (flow.weights * flow.bound_system.hamiltonian(y[:, None, :] + A @ K)).sum(-1)

@@ -167,7 +167,7 @@ class FlowMap(KnownFlow, nn.Module):
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """`hamiltonian` without checks, for inner loops."""
-        raise TypeError("`flow` is an unconstrained network, which is the flow of no Hamiltonian: use a SympFlow.")
+        raise TypeError("`flow` is an unconstrained network, which has no Hamiltonian: use a SympFlow.")
 
     # every t ------------------------------------------------------------------------------------------
 
@@ -428,7 +428,7 @@ class FlowMap(KnownFlow, nn.Module):
         """
         if not self.symplectic:
             raise TypeError(
-                "`flow` is an unconstrained network, which is the flow of no Hamiltonian, so nothing bounds its energy "
+                "`flow` is an unconstrained network, which has no Hamiltonian, so nothing bounds its energy "
                 "error: use a SympFlow for a certificate."
             )
         counts = {"states": (states, 1), "times": (times, 2), "held_out": (held_out, 1), "seed": (seed, 0)}

@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.arrays import untransformed
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.records import Provenance, numbers_checksum, read
-from sympflow.flow.tables import PrimedShape, Tables, free_numbers, substeps_of
+from sympflow.flow.tables import PrimedShape, Tables, free_numbers
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -272,9 +272,7 @@ def _tables(shape: PrimedShape, dt: float, arrays: Mapping[str, np.ndarray]) -> 
         return shape.columns(sequence, total, column)
 
     inside, outside = columns("", shape.kernel, 1.0), columns("processor_", shape.outer, None)
-    outer = {sign: substeps_of(shape.outer, outside, sign) for sign in (1, -1)}
-    substeps = *reversed(outer[-1]), *substeps_of(shape.kernel, inside, 1), *outer[1]
-    return Tables(substeps, len(shape.outer), dt, shape.monomials)
+    return Tables(shape.substeps(inside, outside), len(shape.outer), dt, shape.monomials)
 
 
 def _size(local: LocalHamiltonian) -> tuple[Any, ...]:

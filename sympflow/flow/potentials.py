@@ -75,10 +75,10 @@ class Activation:
 
 
 class _Closed(Activation):
-    """σ in closed form: σ(a), σ'(a) by a and σ(a), and σ''(a) by these."""
+    """σ in closed form: σ(a), σ'(a) by a and σ(a), and σ''(a) ȧ by these, ȧ and σ'(a) ȧ."""
 
-    def __init__(self, name: str, value: Any, slope: Any, bend: Any) -> None:
-        self.name, self._value, self._slope, self._bend = name, value, slope, bend
+    def __init__(self, name: str, value: Any, slope: Any, second: Any) -> None:
+        self.name, self._value, self._slope, self._second = name, value, slope, second
 
     def value(self, a: Tensor) -> Tensor:
         return self._value(a)
@@ -89,7 +89,8 @@ class _Closed(Activation):
 
     def tangent(self, a: Tensor, da: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         h, slope = self.slope(a)
-        return h, slope, slope * da, self._bend(a, h, slope) * da
+        dh = slope * da
+        return h, slope, dh, self._second(a, h, slope, da, dh)
 
     def __reduce__(self) -> Any:
         return activation_named, (self.name,)
@@ -125,26 +126,26 @@ class FunctionActivation(Activation):
         return activation_named, (self.name,)
 
 
-def _swish_bend(a: Tensor, h: Tensor, slope: Tensor) -> Tensor:
+def _second_of_swish(a: Tensor, h: Tensor, slope: Tensor, da: Tensor, dh: Tensor) -> Tensor:
     s = torch.sigmoid(a)
-    return s * (1 - s) * (2 + a * (1 - 2 * s))
+    return s * (1 - s) * (2 + a * (1 - 2 * s)) * da
 
 
 _FORMS: dict[str, tuple[Any, Any, Any]] = {
-    "tanh": (torch.tanh, lambda a, h: 1 - h * h, lambda a, h, s: -2 * h * s),
-    "sin": (torch.sin, lambda a, h: torch.cos(a), lambda a, h, s: -h),
-    "sigmoid": (torch.sigmoid, lambda a, h: h * (1 - h), lambda a, h, s: (1 - 2 * h) * s),
+    "tanh": (torch.tanh, lambda a, h: 1 - h * h, lambda a, h, s, da, dh: -2 * h * dh),
+    "sin": (torch.sin, lambda a, h: torch.cos(a), lambda a, h, s, da, dh: -h * da),
+    "sigmoid": (torch.sigmoid, lambda a, h: h * (1 - h), lambda a, h, s, da, dh: (1 - 2 * h) * dh),
     "softplus": (
         lambda a: torch.logaddexp(a, torch.zeros_like(a)),
         lambda a, h: torch.sigmoid(a),
-        lambda a, h, s: (1 - s) * s,
+        lambda a, h, s, da, dh: (1 - s) * dh,
     ),
     "logcosh": (
         lambda a: torch.logaddexp(a, -a) - math.log(2),
         lambda a, h: torch.tanh(a),
-        lambda a, h, s: 1 - s * s,
+        lambda a, h, s, da, dh: (1 - s * s) * da,
     ),
-    "swish": (lambda a: a * torch.sigmoid(a), lambda a, h: torch.sigmoid(a) * (1 + a - h), _swish_bend),
+    "swish": (lambda a: a * torch.sigmoid(a), lambda a, h: torch.sigmoid(a) * (1 + a - h), _second_of_swish),
 }
 
 ACTIVATIONS: dict[str, Activation] = {name: _Closed(name, *forms) for name, forms in _FORMS.items()}
@@ -251,9 +252,9 @@ def _checked_activation(name: str, activation: Any, compiled: Any = None) -> Act
     if not isinstance(value, Tensor) or value.shape != a.shape or value.dtype != a.dtype or not value.requires_grad:
         raise TypeError(f"`activation` {name!r} must be an elementwise function of tensors that torch differentiates.")
     (slope,) = torch.autograd.grad(value.sum(), x, create_graph=True)
-    bend = torch.autograd.grad(slope.sum(), x)[0] if slope.requires_grad else torch.zeros_like(a)
+    second = torch.autograd.grad(slope.sum(), x)[0] if slope.requires_grad else torch.zeros_like(a)
     slope = slope.detach()
-    expected = {"value": value.detach(), "slope": slope, "dvalue": slope * da, "dslope": bend * da}
+    expected = {"value": value.detach(), "slope": slope, "dvalue": slope * da, "dslope": second * da}
     for what, found in zip(expected, activation.tangent(a, da), strict=True):
         if not torch.allclose(found, expected[what], rtol=1e-9, atol=1e-9):
             raise ValueError(f"`activation` {name!r} has a tangent() whose {what} is not that of value(): mend it.")

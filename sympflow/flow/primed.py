@@ -42,7 +42,7 @@ from sympflow.flow.primed_potentials import (
 )
 from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Substep, Tables, columns_of, substeps_of
+from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Tables, columns_of
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.lattice_states import LatticeStates
@@ -107,9 +107,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         self.kicks, self.drifts, self.gradients, self.curvatures, self.polynomials = inside
         self.processor_kicks, self.processor_drifts, self.processor_gradients = outside[:3]
         self.processor_curvatures, self.processor_polynomials = outside[3:]
-        inner = substeps_of(shape.kernel, inside, 1)
-        outer = {sign: substeps_of(shape.outer, outside, sign) for sign in (1, -1)}
-        self.substeps: tuple[Substep, ...] = (*reversed(outer[-1]), *inner, *outer[1])
+        self.substeps = shape.substeps(inside, outside)
         self._tables: Kept[Tables] = Kept(column._parameters for column in columns_of(self.substeps))
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(map(self._layer, range(len(self.substeps))))
@@ -151,7 +149,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
                 f"`system` {system.name!r} has a kinetic energy that depends on t, and flows are primed with V(q, t) "
                 "alone: use a splitting method such as 'kahan_li8'."
             )
-        if system.friction is not None and not system.quadratic_kinetic:
+        if system.friction and not system.quadratic_kinetic:
             raise ValueError(
                 f"`system` {system.name!r} has friction, which drifts hold where the kinetic energy is ½ pᵀM⁻¹p: use a "
                 "Runge–Kutta method such as 'dop853'."
@@ -414,7 +412,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
 def _is_timed(system: HamiltonianSystem) -> bool:
     """Return True if the drifts of a kernel must add up to t."""
-    return system.friction is not None or not system.autonomous
+    return not (system.autonomous and not system.friction)
 
 
 def _check_counts(stages: Any, processor: Any) -> None:

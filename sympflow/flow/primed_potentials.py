@@ -46,18 +46,6 @@ class Sum:
         return sum((f.rate(t) for f in self.factors), 0 * t)
 
 
-Function = Callable[..., Tensor]
-"""Function of a system, x (N, d) and, where the system is driven, the times (N,)."""
-
-
-@dataclass(frozen=True)
-class Term:
-    """A function U(x) that a system defines, (N,), with its gradient (N, d)."""
-
-    value: Function
-    gradient: Function
-
-
 def _called(f: Callable[..., Array], system: HamiltonianSystem, q: Tensor, t: Tensor | None) -> Tensor:
     """f(q, t), by way of NumPy where the functions of the system take nothing else."""
     if system.takes_tensors:
@@ -71,46 +59,48 @@ def _called(f: Callable[..., Array], system: HamiltonianSystem, q: Tensor, t: Te
     return torch.as_tensor(f(q.cpu().numpy(), times), dtype=q.dtype, device=q.device)
 
 
-def _force_gradient_value(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
+def _minus_half_square(system: HamiltonianSystem, q: Tensor, t: Tensor | None) -> Tensor:
     F = _called(system.force, system, q, t)
     return -(F * system.velocity(F)).sum(-1) / 2
 
 
-def _force_gradient(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
-    return _called(lambda x, s: system.hessian_vector(x, system.velocity(system.force(x, s)), s), system, q, t)
+_FUNCTIONS: dict[str, tuple[Callable[..., Tensor], Callable[..., Tensor]]] = {
+    "potential": (
+        lambda system, q, t: _called(system.potential, system, q, t),
+        lambda system, q, t: -_called(system.force, system, q, t),
+    ),
+    "kinetic": (lambda system, p, t: system.kinetic(p, t), lambda system, p, t: system.velocity(p, t)),
+    "force gradient": (
+        _minus_half_square,
+        lambda system, q, t: _called(
+            lambda x, s: system.hessian_vector(x, system.velocity(system.force(x, s)), s), system, q, t
+        ),
+    ),
+    "curvature": (
+        lambda system, q, t: system.curvature(q, t),
+        lambda system, q, t: system.curvature_gradient(q, t),
+    ),
+}
 
 
-def _curvature(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
-    return system.curvature(q, t)
+@dataclass(frozen=True)
+class Term:
+    """A function U(x) that a system defines: x (N, d) and, where the system is driven, the times (N,)."""
+
+    name: str
+
+    def value(self, system: HamiltonianSystem, x: Tensor, t: Tensor | None = None) -> Tensor:
+        """U: (N,)."""
+        return _FUNCTIONS[self.name][0](system, x, t)
+
+    def gradient(self, system: HamiltonianSystem, x: Tensor, t: Tensor | None = None) -> Tensor:
+        """∇U: (N, d)."""
+        return _FUNCTIONS[self.name][1](system, x, t)
 
 
-def _curvature_gradient(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
-    return system.curvature_gradient(q, t)
-
-
-def _potential(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
-    return _called(system.potential, system, q, t)
-
-
-def _potential_gradient(system: HamiltonianSystem, q: Tensor, t: Tensor | None = None) -> Tensor:
-    return -_called(system.force, system, q, t)
-
-
-def _kinetic(system: HamiltonianSystem, p: Tensor, t: Tensor | None = None) -> Tensor:
-    return system.kinetic(p, t)
-
-
-def _velocity(system: HamiltonianSystem, p: Tensor, t: Tensor | None = None) -> Tensor:
-    return system.velocity(p, t)
-
-
-# Functions with names, by which pickle finds them.
-POTENTIAL = Term(_potential, _potential_gradient)
-FORCE_GRADIENT = Term(_force_gradient_value, _force_gradient)
-"""−½|∇V|²_{M⁻¹}; −∇²V M⁻¹∇V."""
-CURVATURE = Term(_curvature, _curvature_gradient)
-"""½ v·∇²V v with v = M⁻¹∇V, and its gradient."""
-KINETIC = Term(_kinetic, _velocity)
+POTENTIAL, KINETIC = Term("potential"), Term("kinetic")
+FORCE_GRADIENT, CURVATURE = Term("force gradient"), Term("curvature")
+"""−½|∇V|²_{M⁻¹} and ½ v·∇²V v with v = M⁻¹∇V; the gradient of the first is −∇²V M⁻¹∇V."""
 
 
 def _apart(system: HamiltonianSystem, x: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -180,12 +170,12 @@ class PrimedDrift(Drift):
     def _plain(self) -> bool:
         """True without friction and driving."""
         system = self._binding.system
-        return system.friction is None and system.autonomous
+        return not system.friction and system.autonomous
 
     def _moved(self, s: Time, q: Tensor, p: Tensor, passed: Time = 0.0) -> tuple[Tensor, Tensor]:
         """The linear map of a drift over s, and by how much the time moves with it."""
         system = self._binding.system
-        if system.friction is None:
+        if not system.friction:
             mean, end = _each(s) * p.T, p
         else:
             mean, end = system.friction.drift(p.T, _each(s))
@@ -217,14 +207,14 @@ class PrimedDrift(Drift):
         change = rate * system.velocity(p.T).T
         if not system.autonomous:
             change = torch.cat([change, torch.zeros_like(change[:1])])
-        if system.friction is not None:
+        if system.friction:
             dp = dp + rate * system.friction.force(p.T).T
         return q, p, dq + change, dp
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         system = self._binding.system
         system.check_conservative(
-            "with which a flow is that of no Hamiltonian", "ask for flow.velocity, or for system.hamiltonian"
+            "and a damped flow is not Hamiltonian", "ask for flow.velocity, or for system.hamiltonian"
         )
         if system.autonomous:
             return super().pull_back(t, q, p)

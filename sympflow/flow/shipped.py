@@ -328,7 +328,7 @@ def _catalogue() -> tuple[ShippedFlow, ...]:
 
 
 def _record(path: Path) -> dict[str, Any]:
-    """The record in the header of a file of our own; `flow.io` reads others, with suspicion."""
+    """The record in the header of a file of our own; `flow.files` reads others, with suspicion."""
     with path.open("rb") as file:
         (length,) = struct.unpack("<Q", file.read(8))
         return json.loads(json.loads(file.read(length))["__metadata__"]["sympflow"])

@@ -30,7 +30,7 @@ from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, exact_parts, map_evaluations
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts, map_evaluations
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
@@ -52,23 +52,23 @@ class KeptMaps:
     """
 
     def __init__(
-        self, make: Callable[[np.ndarray], list[Map]], coefficients: list[Map], dt: float, like: Tensor
+        self, make: Callable[[np.ndarray], list[SubFlow]], coefficients: list[SubFlow], dt: float, like: Tensor
     ) -> None:
         self._make, self._dt = make, dt
         self.kernel: SplitFlowKernel | None = None  # the compiled loops that were made of these last
         self._coefficients = coefficients, [m.inverse() for m in reversed(coefficients)]
         self.placement = like.dtype, like.device
-        self._maps: dict[float, list[Map]] = {}
+        self._maps: dict[float, list[SubFlow]] = {}
         self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
 
-    def maps(self, t: float) -> list[Map]:
+    def maps(self, t: float) -> list[SubFlow]:
         if t not in self._maps:
             if len(self._maps) >= MOST_KEPT:
                 self._maps.clear()
             self._maps[t] = self._make(np.array(t))
         return self._maps[t]
 
-    def coefficients(self, back: bool) -> list[Map]:
+    def coefficients(self, back: bool) -> list[SubFlow]:
         """Return the maps at all t, or those of the inverse: see `PartsKernel.step_by_coefficients`."""
         return self._coefficients[back]
 
@@ -118,7 +118,7 @@ class SplitLayer(Layer):
 
         return q, p, jvp(generator, q.new_zeros(()), q.new_ones(()))[1]
 
-    def _apply_map(self, m: Map, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    def _apply_map(self, m: SubFlow, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         parts = self.flow.parts
         y = parts.from_modes(*parts.apply([m], *parts.to_modes(torch.cat([q, p]).T))).T
         return y.chunk(2)
@@ -290,13 +290,13 @@ class SplitFlow(SystemFlow):
 
     # the maps -----------------------------------------------------------------------------------------------
 
-    def maps(self, t: Time) -> list[Map]:
+    def maps(self, t: Time) -> list[SubFlow]:
         """ψ̄_t as maps of the parts, their entries tensors of the shape of t."""
         if isinstance(t, Tensor) and t.dtype != self.dtype:
             t = t.to(self.dtype)
         return self._assemble(lambda column: column.values(t), lambda entries: torch.stack(entries, dim=-1))
 
-    def numpy_maps(self, t: np.ndarray) -> list[Map]:
+    def numpy_maps(self, t: np.ndarray) -> list[SubFlow]:
         """The same of an array of times, for the compiled loops; for t < 0 the inverse of ψ̄_|t| (one sign for all)."""
         t = np.asarray(t, dtype=float)
         return self.frozen().maps(float(t)) if t.ndim == 0 else self._numpy_maps(t)
@@ -307,13 +307,13 @@ class SplitFlow(SystemFlow):
             lambda: KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt, self._maps.first())
         )
 
-    def _numpy_maps(self, t: np.ndarray) -> list[Map]:
+    def _numpy_maps(self, t: np.ndarray) -> list[SubFlow]:
         maps = self._assemble(
             lambda column: np.moveaxis(column.at(np.abs(t)), -1, 0), lambda entries: np.stack(entries, axis=-1)
         )
         return [m.inverse() for m in reversed(maps)] if (t < 0).any() else maps
 
-    def _coefficient_maps(self) -> list[Map]:
+    def _coefficient_maps(self) -> list[SubFlow]:
         """The maps with the coefficients of the columns, (K, …), in place of their values."""
         return self._assemble(
             lambda column: to_numpy(column.table).astype(float),
@@ -321,7 +321,7 @@ class SplitFlow(SystemFlow):
             np.eye(1, self.terms)[0],
         )
 
-    def _assemble(self, values: Any, stack: Any, unity: Any = None) -> list[Map]:
+    def _assemble(self, values: Any, stack: Any, unity: Any = None) -> list[SubFlow]:
         linear = [values(column) for column in self.linear]
         weights, filters, gradients = (
             [values(c) for c in group] for group in (self.weights, self.filters, self.gradients)
@@ -331,7 +331,7 @@ class SplitFlow(SystemFlow):
         for part in self.sequence:
             i = seen[part] = seen.get(part, -1) + 1
             if part == LINEAR:
-                maps.append(Map(LINEAR, stack([column[i] for column in linear])))
+                maps.append(SubFlow(LINEAR, stack([column[i] for column in linear])))
                 continue
             slot = self._slot[part]
             phi = None
@@ -340,7 +340,7 @@ class SplitFlow(SystemFlow):
                 own = dict(zip(self._turning, filters[slot * n : (slot + 1) * n], strict=True))
                 phi = stack([own[f][i] if f in own else one for f in range(len(self.classes))])
             gradient = gradients[0][self.gradient_kicks.index(i)] if i in self.gradient_kicks else 0.0
-            maps.append(Map(part, weights[slot][i], gradient, phi))
+            maps.append(SubFlow(part, weights[slot][i], gradient, phi))
         return maps
 
     def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
@@ -352,7 +352,7 @@ class SplitFlow(SystemFlow):
     def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         return jvp(lambda s: self._map(t + s, y), y.new_zeros(()), y.new_ones(()))
 
-    def _run(self, maps: Sequence[Map], y: Tensor) -> Tensor:
+    def _run(self, maps: Sequence[SubFlow], y: Tensor) -> Tensor:
         parts = self.parts
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 

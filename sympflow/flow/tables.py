@@ -113,6 +113,11 @@ class PrimedShape:
             [column(f"polynomials.{i}", "kick", 3) for i in range(len(self.monomials))] if self.monomials else None,
         )
 
+    def substeps(self, inside: Columns, outside: Columns) -> tuple[Substep, ...]:
+        """Return χ⁻¹, K, χ by the columns of K and χ."""
+        outer = {sign: substeps_of(self.outer, outside, sign) for sign in (1, -1)}
+        return (*reversed(outer[-1]), *substeps_of(self.kernel, inside, 1), *outer[1])
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
         return {
@@ -262,8 +267,8 @@ class Tables:
             stages = self._stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
             numbers = np.array(stages, dtype=float)  # (m, columns, K)
             numbers = np.pad(numbers, ((0, 0), (0, 0), (0, max(0, 3 - numbers.shape[2]))))
-            kicks, gradients, curvatures = (numbers[:, i] for i in range(3))
-            return StageTable(self.level, kicks, numbers[:, -1], gradients, curvatures, numbers[:, 3:-1])
+            of_kick = range(3, numbers.shape[1] - 1) if self.level == POLYNOMIAL_LEVEL else (1, 2)
+            return StageTable(self.level, numbers[:, [-1, 0, *of_kick]].swapaxes(0, 1))
 
         return self.kept(("polynomials", back), make)
 

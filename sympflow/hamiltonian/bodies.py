@@ -14,7 +14,7 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arguments import check_kept, plain, real_number
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -287,7 +287,7 @@ class PairsHamiltonian(LocalHamiltonian):
 
     def energy_density(self, y: Array, *t: Array) -> Array:
         q, p = y[..., : self.ndof], self._of_bodies(y[..., self.ndof :])
-        masses = self._like(self.masses, y)
+        masses = like(self.masses, y)
         density = (p * p).sum(-1, keepdims=True) / (2 * masses[:, None])
         for pairs in self._pairs(q):
             half = pairs.values(0)[..., None] / 2
@@ -342,13 +342,6 @@ class PairsHamiltonian(LocalHamiltonian):
     def _of_bodies(self, q: Array) -> Array:
         return q.reshape(*q.shape[:-1], self.n_bodies, self.dim)
 
-    def _like(self, values: Any, like: Array) -> Any:
-        if not is_tensor(like):
-            return np.asarray(values, dtype=like.dtype)
-        import torch
-
-        return torch.as_tensor(values, dtype=like.dtype, device=like.device)
-
     def _forces(self, value: Callable[[Pairs], Array], *arrays: Array) -> Array:
         """The sum over the pairs of each body of values (..., P, dim), those of its second ends with the other sign."""
         q = arrays[0]
@@ -357,7 +350,7 @@ class PairsHamiltonian(LocalHamiltonian):
             f = value(pairs)
             if self._all_at_once:
                 *lead, _, dim = f.shape
-                sums = f.swapaxes(-1, -2).reshape(-1, len(pairs.i)) @ self._like(_incidence(self.n_bodies), f)
+                sums = f.swapaxes(-1, -2).reshape(-1, len(pairs.i)) @ like(_incidence(self.n_bodies), f)
                 out = out + sums.reshape(*lead, dim, self.n_bodies).swapaxes(-1, -2)
                 continue
             out = _added(_added(out, pairs.i, f), pairs.j, -f)
@@ -374,12 +367,12 @@ class PairsHamiltonian(LocalHamiltonian):
     def _between(self, x: Array, i: np.ndarray, j: np.ndarray, positions: bool) -> Array:
         if self._all_at_once:
             *lead, n, dim = x.shape
-            rows = x.swapaxes(-1, -2).reshape(-1, n) @ self._like(_incidence(n), x).T
+            rows = x.swapaxes(-1, -2).reshape(-1, n) @ like(_incidence(n), x).T
             difference = rows.reshape(*lead, dim, len(i)).swapaxes(-1, -2)
         else:
             difference = x[..., i, :] - x[..., j, :]
         if positions and self.box is not None:
-            box = self._like(self.box, x)
+            box = like(self.box, x)
             difference = difference - box * (difference / box).round()
         return difference
 
@@ -421,14 +414,14 @@ class Pairs:
         """2ᵏ times the k-th derivative of V by s, 0 beyond the cut-off: (..., P)."""
         local, s = self.local, self.s
         columns = [column[ends] for ends in (self.i, self.j) for column in local.columns]
-        given = [local._like(x, s) for x in (*columns, *local.constants)]
+        given = [like(x, s) for x in (*columns, *local.constants)]
         variables = (local.s, *local.first, *local.second, *local.c)
         with np.errstate(all="ignore"):  # bodies at one place
             value = local._values(f"potential {k}", lambda: [local.slopes[k]], variables, s, *given)[0] + 0 * s
         if local.cutoff is None:
             return value
         outside = s >= local.cutoff**2 + local.softening**2
-        return value.masked_fill(outside, 0.0) if is_tensor(s) else np.where(outside, 0.0, value)
+        return masked(value, outside, 0.0)
 
 
 @cache

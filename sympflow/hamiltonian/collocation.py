@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, per_state, stack, values
+from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, stack, values
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 
@@ -30,7 +30,7 @@ def counted_step(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, 
 
 
 def stage_times(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, h: Any) -> Any:
-    """The times t + c_i h of the stages, (..., s), of a driven system; None of another."""
+    """The times t + c_i h of the stages, (..., s), of a driven system; None of another, whose stages are all alike."""
     if system.autonomous:
         return None
     nodes, batch = stage_nodes(tableau), y.shape[:-1]
@@ -45,7 +45,7 @@ def stage_times(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, h
 def advanced(system: HamiltonianSystem, tableau: Tableau, y: Array, K: Array, h: Any) -> Array:
     """The state at the end of a step of length h (..., 1), or a number, with the increments K (..., s, 2d)."""
     end = y + sum(b * K[..., i, :] for i, b in enumerate(tableau[1]))
-    if system.friction is None:
+    if not system.friction:
         return end
     d = system.ndof
     return concatenate([end[..., :d], system.friction.drift(end[..., d:], h)[1]])
@@ -141,7 +141,7 @@ def _residual(system: HamiltonianSystem, y: Array, K: Array, h: Any, times: Any,
 def _field(system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, scale: Array) -> Array:
     """f of the stages Y (..., s, 2d); with friction of [q, P], [∂H/∂p, −e^{Γτ}∂H/∂q] at p = e^{−Γτ}P."""
     friction, d = system.friction, system.ndof
-    if friction is None:
+    if not friction:
         return system.vector_field(Y, times)
     tau = (A @ scale * h)[..., None]
     slope = system.gradient(concatenate([Y[..., :d], friction.drift(Y[..., d:], tau)[1]]), times)
@@ -150,15 +150,8 @@ def _field(system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, sc
 
 def decays(system: HamiltonianSystem, s: Any) -> Array:
     """e^{−Γs} for times s, a number or (...): (..., d, d)."""
-    friction = system.friction
-    assert friction is not None
-    identity = np.eye(system.ndof)
-    if is_tensor(s):
-        import torch
-
-        return friction.drift(torch.as_tensor(identity, dtype=s.dtype, device=s.device), s[..., None, None])[1]
-    s = np.asarray(s)
-    return friction.drift(identity.astype(s.dtype), s[..., None, None])[1]
+    s = s if is_tensor(s) else np.asarray(s)
+    return system.friction.drift(like(np.eye(system.ndof), s), s[..., None, None])[1]
 
 
 def newton_matrix(
@@ -169,7 +162,7 @@ def newton_matrix(
     if system.local is not None:
         system.local.check_dense(float(math.prod(Y.shape)) * s * n, "the matrix of the equations of an implicit step")
     tau: Any = None
-    if system.friction is not None:
+    if system.friction:
         tau = A @ scale * h
         p = system.friction.drift(Y[..., d:], tau[..., None])[1]
         Y = concatenate([Y[..., :d], p])
@@ -183,11 +176,7 @@ def newton_matrix(
     outer = h[..., None, None, None] if getattr(h, "ndim", 0) else h
     blocks = outer * (scale[:, None] * A)[:, None, :, None] * D[..., :, :, None, :]
     M = -blocks.reshape(*Y.shape[:-2], s * n, s * n)
-    if is_tensor(M):
-        import torch
-
-        return M + torch.eye(s * n, dtype=M.dtype, device=M.device), D
-    return M + np.eye(s * n, dtype=M.dtype), D
+    return M + like(np.eye(s * n), M), D
 
 
 def variable_sizes(y: Array, K: Array, residual: Array) -> Array:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_number, checked_states, floats, sample_count, vector
+from sympflow.arguments import check_number, check_positive, checked_states, floats, sample_count, vector
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.lattice_states import LatticeStates
 
@@ -49,8 +49,7 @@ class Ball:
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", vector("center", self.center))
         check_number("radius", self.radius)
-        if not 0 < self.radius <= sys.float_info.max:
-            raise ValueError(f"`radius` must be positive and finite; got {self.radius!r}.")
+        check_positive("radius", self.radius)
 
     @property
     def width(self) -> int:

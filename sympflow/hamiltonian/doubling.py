@@ -19,13 +19,13 @@ References
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.arguments import warn
+from sympflow.arrays import Array, concatenate, is_tensor, of_library
 from sympflow.hamiltonian.domain import Box, Domain
 from sympflow.hamiltonian.hamiltonian import ExternalForce
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -178,10 +178,9 @@ def doubled(
 
         F = SymbolicForce(system, [0] * system.ndof if force is None else force, params)
         if system.conservative and F.has_potential:
-            warnings.warn(
+            warn(
                 "`force` is that of a potential, which keeps an energy: put it into H, and solve that system.",
                 UserWarning,
-                stacklevel=2,
             )
         time = None if system.symbols.time is None else {"time": system.symbols.time, "period": system.period}
         made = DoubledSystem.from_sympy(doubled_hamiltonian(system, F), **scene, **(time or {}))  # type: ignore[assignment]
@@ -210,7 +209,7 @@ class GivenForce:
                 f"`force` must return a tensor of the shape of p, {tuple(p.shape)}; got {got}: write it with torch "
                 "functions, for states on the last axis."
             )
-        return value if is_tensor(p) else value.detach().numpy()
+        return of_library(value, p)
 
     def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         import torch
@@ -224,7 +223,7 @@ class GivenForce:
             along[..., i] = 1
             columns.append(jvp(lambda z: self(z[..., :d], z[..., d:]), x, along)[1])
         found = torch.stack(columns, dim=-1)
-        return found if is_tensor(p) else found.numpy()
+        return of_library(found, p)
 
 
 class _DoubledFunctions:

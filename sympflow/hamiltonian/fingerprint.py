@@ -79,7 +79,7 @@ def check_for_flows(system: Hamiltonian, takes_friction: bool = False, takes_dri
 
 def without_friction(mine: Sequence[float], identity: Identity | None, system: Hamiltonian) -> bool:
     """Return True if a fingerprint and an identity are those of a damped system without its friction."""
-    if system.friction is None or not same_system(mine, fingerprint(system)[:PROBES]):
+    if not system.friction or not same_system(mine, fingerprint(system)[:PROBES]):
         return False
     return identity is None or identity.agrees(system)
 
@@ -223,9 +223,8 @@ def _probed_times(system: Hamiltonian, n: int) -> np.ndarray:
 
 def _energies(system: Hamiltonian, states: np.ndarray) -> np.ndarray:
     """H at the states (n, 2d), of a driven system each at a time that its number gives."""
-    times = None if system.autonomous else _probed_times(system, len(states))
     with np.errstate(all="ignore"):
-        return to_numpy(system.hamiltonian(states, times)).astype(float)
+        return to_numpy(system.hamiltonian(states, _probed_times(system, len(states)))).astype(float)
 
 
 @lru_cache(maxsize=16)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 
-from sympflow.arrays import Array, assemble, is_tensor
+from sympflow.arrays import Array, assemble, library_name
 from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
 from sympflow.hamiltonian.jumps import refuse_deltas
 from sympflow.hamiltonian.symbolic import checked_params, generate, printable
@@ -75,7 +75,7 @@ class SymbolicForce:
         return flat.reshape(*p.shape, len(x))
 
     def _evaluated(self, expressions: list[sp.Expr], q: Array, p: Array, *t: Any) -> Array:
-        key = len(expressions), "torch" if is_tensor(p) else "numpy"
+        key = len(expressions), library_name(p)
         times = () if self.time is None else (self.time,)
         if key not in self._functions:
             self._functions[key] = generate([printable(f) for f in expressions], (*self.q, *self.p, *times), key[1])
@@ -105,7 +105,7 @@ def doubled_hamiltonian(system: HamiltonianSystem, force: SymbolicForce) -> sp.E
     assert symbols is not None
     d = system.ndof
     q, p = (sp.symbols(f"{letter}1:{2 * d + 1}", real=True) for letter in "qp")
-    G = np.zeros((d, d)) if system.friction is None else system.friction.matrix(d)
+    G = system.friction.matrix(d)
     mean = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
     terms = []
     for i, F in enumerate(force.expressions):

@@ -6,27 +6,35 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, library
+from sympflow.arrays import Array, is_tensor, library, like
 
 
 class Friction:
     """The friction of a damped system, p' = −∂H/∂q − Γp."""
 
-    def __init__(self, damping: np.ndarray) -> None:
+    def __init__(self, damping: np.ndarray | None = None) -> None:
         self.damping = damping
-        damping.setflags(write=False)
-        self.rates, self._modes = damping, None
-        if damping.ndim == 2:
+        self.rates, self._modes = np.zeros(()) if damping is None else damping, None
+        self.rates.setflags(write=False)
+        if damping is not None and damping.ndim == 2:
             rates, self._modes = np.linalg.eigh(damping)
             self.rates = np.maximum(rates, 0.0)  # −0 and what rounding leaves below it
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Friction, (self.damping.copy(),)
+        return Friction, (None if self.damping is None else self.damping.copy(),)
+
+    def __bool__(self) -> bool:
+        return self.damping is not None
+
+    @property
+    def kind(self) -> int | None:
+        """The number of axes of Γ, by which code for it is made; None without friction."""
+        return None if self.damping is None else self.damping.ndim
 
     @property
     def isotropic(self) -> bool:
         """True for Γ = γ, one rate for all momenta: then the flow is conformally symplectic."""
-        return self.damping.ndim == 0
+        return self.rates.ndim == 0
 
     @property
     def largest(self) -> float:
@@ -35,20 +43,26 @@ class Friction:
 
     def matrix(self, ndof: int) -> np.ndarray:
         """Γ as a matrix (d, d)."""
-        return self.damping if self.damping.ndim == 2 else np.diag(np.broadcast_to(self.damping, ndof))
+        if self.damping is not None and self.damping.ndim == 2:
+            return self.damping
+        return np.diag(np.broadcast_to(self.rates, ndof))
 
     def force(self, p: Array) -> Array:
         """−Γp: (..., d) to (..., d)."""
-        G = _like(self.damping, p)
+        G = like(self.rates if self.damping is None else self.damping, p)
         return -(p @ G) if G.ndim == 2 else -(G * p)
+
+    def added(self, force: Array, p: Array) -> Array:
+        """A force with −Γp added to it."""
+        return force + self.force(p) if self else force
 
     def drift(self, p: Array, s: Any) -> tuple[Array, Array]:
         """∫₀ˢ e^{−Γu}p du and e^{−Γs}p, for p (..., d) and times s: a number, or one that broadcasts against p."""
-        rates = _like(self.rates, p)
+        rates = like(self.rates, p)
         mean, decay = _factors(rates, s)
         if self._modes is None:
             return mean * p, decay * p
-        Q = _like(self._modes, p)
+        Q = like(self._modes, p)
         z = p @ Q
         return (mean * z) @ Q.T, (decay * z) @ Q.T
 
@@ -71,9 +85,5 @@ def _factors(rates: Array, s: Any) -> tuple[Array, Array]:
     return s * xp.where(still, 1.0 + 0.0 * x, -xp.expm1(-safe) / safe), xp.exp(-x)
 
 
-def _like(constant: np.ndarray, x: Array) -> Array:
-    if is_tensor(x):
-        import torch
-
-        return torch.tensor(constant, dtype=x.dtype, device=x.device)
-    return constant.astype(x.dtype, copy=False)
+FRICTIONLESS = Friction()
+"""No friction, of systems that are not damped."""

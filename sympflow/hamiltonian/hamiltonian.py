@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, per_state
+from sympflow.arrays import Array, concatenate, is_tensor, largest, library, like, of_library, per_state
 from sympflow.hamiltonian.formulas import recorded
+from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
 from sympflow.hamiltonian.times import checked_time
 
 if TYPE_CHECKING:
     from sympflow.compiler.program import Program
     from sympflow.hamiltonian.formulas import TracedHamiltonian
-    from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.poles import Poles
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -79,8 +79,8 @@ class Hamiltonian:
         A quadratic part ½ qᵀKq of V that was named, of a definition without symbols.
     functions_given : bool
         True if H is given by functions of a user, which are to be checked.
-    friction : Friction or None
-        What −Γp does, of a damped system. Whatever leaves it out must refuse the system: see `check_conservative`.
+    friction : Friction
+        The flow of −Γp; false without it. Whatever leaves it out must refuse the system: see `check_conservative`.
     autonomous : bool
         False if H depends on t: then every function takes the time after the states, a number or one for each state,
         and whatever leaves it out must refuse the system: see `check_autonomous`.
@@ -88,7 +88,7 @@ class Hamiltonian:
         The period of H in t, where one was named.
     """
 
-    friction: Friction | None = None
+    friction: Friction = FRICTIONLESS
     autonomous: bool = True
     period: float | None = None
     energy_scale: float | None = None
@@ -157,7 +157,7 @@ class Hamiltonian:
             if bool((abs(left) <= FOUND * abs(v).max()).all()):
                 return p
             try:
-                p = p + _library(left).linalg.solve(self.hessian(y, t)[..., d:, d:], left[..., None])[..., 0]
+                p = p + library(left).linalg.solve(self.hessian(y, t)[..., d:, d:], left[..., None])[..., 0]
             except (np.linalg.LinAlgError, RuntimeError):  # the latter of torch
                 break
         raise ValueError("`v` are velocities of no momenta that Newton's method finds: give p itself.")
@@ -194,8 +194,7 @@ class Hamiltonian:
         else:
             g = self._definition.gradient(y, *self._time(t, y))
             velocity, force = g[..., d:], -g[..., :d]
-        if self.friction is not None:
-            force = force + self.friction.force(y[..., d:])
+        force = self.friction.added(force, y[..., d:])
         if self.external_force is not None:
             force = force + self.external_force(y[..., :d], y[..., d:], *self._time(t, y))
         return concatenate([velocity, force])
@@ -204,14 +203,14 @@ class Hamiltonian:
         """The Jacobian of `vector_field`, J∇²H(y), with friction less Γ in the rows and columns of p: (..., 2d, 2d)."""
         d, S = self.ndof, self.hessian(y, t)
         rows = [S[..., d:, :], -S[..., :d, :]]
-        A = _library(S).cat(rows, dim=-2) if is_tensor(S) else np.concatenate(rows, axis=-2)
-        if self.friction is not None:
+        A = concatenate(rows, -2)
+        if self.friction:
             G = np.zeros((2 * d, 2 * d))
             G[d:, d:] = self.friction.matrix(d)
-            A = A - _like(G, A)
+            A = A - like(G, A)
         if self.external_force is not None:
             F = self.external_force.jacobian(y[..., :d], y[..., d:], *self._time(t, y))
-            A = A + _rows_below(F)
+            A = A + concatenate([0 * F, F], -2)
         return A
 
     def with_force(self, force: ExternalForce) -> Self:
@@ -267,12 +266,17 @@ class Hamiltonian:
     @property
     def damping(self) -> np.ndarray | None:
         """Γ of the friction −Γp, to be read only: (), one rate γ for all momenta, (d,) or (d, d); None without."""
-        return None if self.friction is None else self.friction.damping
+        return self.friction.damping
 
     @property
     def conservative(self) -> bool:
         """True without friction or an external force."""
-        return self.friction is None and self.external_force is None
+        return not self.friction and self.external_force is None
+
+    @property
+    def keeps_energy(self) -> bool:
+        """True if H is constant along solutions: without friction, an external force or a drive."""
+        return self.conservative and self.autonomous
 
     def check_conservative(self, what: str, remedy: str) -> None:
         """Refuse a system with friction where it would be left out, or what is asked does not hold with it.
@@ -290,7 +294,7 @@ class Hamiltonian:
                 "Runge–Kutta method such as 'dop853', or its doubled system by any method, and judge the physical "
                 "solution by sympflow.reference_error(sol)."
             )
-        if self.friction is not None:
+        if self.friction:
             raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
     def check_autonomous(self, what: str, remedy: str) -> None:
@@ -447,7 +451,7 @@ class Hamiltonian:
 
             x, along, other = (torch.as_tensor(each) for each in (q, v, w))
             found = jvp(lambda z: self.hessian_vector(z, other, t), x, along)[1]
-            return found if is_tensor(q) else found.numpy()
+            return of_library(found, q)
 
         return third_derivative(self, q, v, w, t)
 
@@ -480,7 +484,7 @@ class Hamiltonian:
             return self._definition.kinetic_gradient(p, *self._kinetic_time(t, p))
         if self.inverse_mass is None:
             return p
-        M = _like(self.inverse_mass, p)
+        M = like(self.inverse_mass, p)
         return p * M if M.ndim == 1 else p @ M
 
     def kinetic_hessian(self, p: Array, t: Any = None) -> Array:
@@ -488,7 +492,7 @@ class Hamiltonian:
         if not self._separable().quadratic_kinetic:
             return self._definition.kinetic_hessian(p, *self._kinetic_time(t, p))
         M = np.ones(self.ndof) if self.inverse_mass is None else self.inverse_mass
-        return _like(np.diag(M) if M.ndim == 1 else M, p)
+        return like(np.diag(M) if M.ndim == 1 else M, p)
 
     def drift(self, p: Array, t: Any, s: Any) -> Array:
         """∫_t^{t+s} ∇T(p, u) du, by which a drift moves q; s·∇T(p) if T does not depend on t.
@@ -511,6 +515,18 @@ class Hamiltonian:
         if not self.kinetic_timed:
             return per_state(s, p) * self.velocity(p)
         return self._definition.drifted(p, *self._time(t, p), checked_time(s, p, p.shape[:-1]))
+
+    def drifted(self, q: Array, p: Array, t: Any, s: Any, sign: float = 1.0) -> tuple[Array, Array]:
+        """The states after the flow of T(p, t) with friction over a time s from t on; `sign` −1 undoes it.
+
+        s is a number, or an array that broadcasts against p (..., d).
+        """
+        if self.friction:
+            mean, end = self.friction.drift(p, sign * s)
+            return q + self.velocity(mean), end
+        if self.kinetic_timed:
+            return q + sign * self.drift(p, t, s[..., 0] if getattr(s, "ndim", 0) else s), p
+        return q + (sign * s) * self.velocity(p), p
 
     def drift_jacobian(self, p: Array, t: Any, s: Any) -> Array:
         """The derivatives of `drift` in p: (..., d) to (..., d, d)."""
@@ -551,7 +567,7 @@ class Hamiltonian:
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int) -> np.ndarray:
         """Return True for each run from states (n, 2d) to others that is seen to have leapt over such a place: (n,)."""
-        return self._definition.leapt(starts, ends, n_steps, self.conservative and self.autonomous)
+        return self._definition.leapt(starts, ends, n_steps, self.keeps_energy)
 
     def leap(self, y: np.ndarray, start: np.ndarray) -> str:
         """A clause on a state (2d,) of a run from a start (2d,) that did."""
@@ -623,23 +639,8 @@ class Hamiltonian:
         return self._definition.numba_functions
 
 
-def _rows_below(F: Array) -> Array:
-    """(..., d, 2d) below as many rows of 0."""
-    xp = _library(F)
-    return xp.cat([0 * F, F], dim=-2) if is_tensor(F) else xp.concatenate([0 * F, F], axis=-2)
-
-
 def _rows(left: Array, right: Array) -> Array:
     return concatenate([left, right]).swapaxes(-1, -2)
-
-
-def _like(constant: np.ndarray, x: Array) -> Array:
-    """A constant array in the library, dtype and device of `x`."""
-    if is_tensor(x):
-        import torch
-
-        return torch.tensor(constant, dtype=x.dtype, device=x.device)
-    return constant.astype(x.dtype, copy=False)
 
 
 def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array, t: Any = None) -> Array:
@@ -648,7 +649,7 @@ def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array, t: Any =
     with np.errstate(all="ignore"):
         h = step(q, length_of_change(system, q, along, other, t))
         change = derivative(lambda x: system.hessian_vector(x, other, t), q, along, h)
-    return _largest(v) * _largest(w) * change
+    return largest(v) * largest(w) * change
 
 
 def derivative(f: Callable[[Array], Array], q: Array, along: Array, h: Array) -> Array:
@@ -660,42 +661,30 @@ def derivative(f: Callable[[Array], Array], q: Array, along: Array, h: Array) ->
 
 def direction(v: Array) -> Array:
     """v over its largest component; 0 for 0."""
-    size = _largest(v)
+    size = largest(v)
     return v / (size + (size == 0))
 
 
 def length_of_change(system: Hamiltonian, q: Array, along: Array, other: Array, t: Any = None) -> Array:
     """ℓ = ‖∇V‖ / ‖∇²V v̂‖, on which the force changes along unit vectors v̂: (..., d) to (..., 1)."""
-    xp = _library(q)
-    force, change = _largest(system.force(q, t)), _largest(system.hessian_vector(q, along, t))
+    xp = library(q)
+    force, change = largest(system.force(q, t)), largest(system.hessian_vector(q, along, t))
     first = _bounded(xp.where(change > 0, force / (change + (change == 0)), np.inf), q)
     h = xp.finfo(q.dtype).eps ** (1 / 3) * first
     twice = system.hessian_vector(q + h * along, other, t) - system.hessian_vector(q - h * along, other, t)
-    bend = _largest(twice) / (2 * h)
+    bend = largest(twice) / (2 * h)
     second = xp.sqrt(force / (bend + (bend == 0)))
     return _bounded(xp.where((bend > 0) & (second < first), second, first), q)
 
 
 def step(q: Array, length: Array) -> Array:
     """The h for which the truncation of `derivative`, (h/ℓ)⁴, and the rounding, ε max(|q|, ℓ)/h, are even."""
-    eps, xp = _library(q).finfo(q.dtype).eps, _library(q)
-    return length * (eps * xp.maximum(_largest(q) / length, 0 * length + 1)) ** 0.2
+    eps, xp = library(q).finfo(q.dtype).eps, library(q)
+    return length * (eps * xp.maximum(largest(q) / length, 0 * length + 1)) ** 0.2
 
 
 def _bounded(length: Array, q: Array) -> Array:
-    xp = _library(q)
-    size = _largest(q)
+    xp = library(q)
+    size = largest(q)
     size = size + (size == 0)
     return xp.minimum(xp.maximum(length, xp.finfo(q.dtype).eps ** 0.5 * size), xp.maximum(size, 0 * size + 1))
-
-
-def _largest(x: Array) -> Array:
-    return abs(x).amax(-1, True) if is_tensor(x) else abs(x).max(-1, keepdims=True)
-
-
-def _library(x: Array) -> Any:
-    if is_tensor(x):
-        import torch
-
-        return torch
-    return np

@@ -14,7 +14,7 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arguments import check_kept, plain, real_number
-from sympflow.arrays import Array, concatenate, is_tensor, library
+from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
@@ -440,7 +440,7 @@ class LatticeHamiltonian(LocalHamiltonian):
             if self.boundary[axis] == "fixed":  # the other half of bonds to a wall
                 nothing = 0 * _cut(V, at, 0, n - k)
                 lower, upper = [_cut(V, at, 0, k), nothing], [nothing, _cut(V, at, n, n + k)]
-                density = density + (_join(lower, at) + _join(upper, at)) / 2
+                density = density + (concatenate(lower, at) + concatenate(upper, at)) / 2
         return density
 
     # how values of bonds stand: one for each site i from −k to n − 1, that of the bond from i to i + k along an axis;
@@ -472,8 +472,8 @@ class LatticeHamiltonian(LocalHamiltonian):
     def _on_sites(self, q: Array) -> list[Array]:
         """The fields (..., *shape) of positions (..., d)."""
         fields = q.reshape(*q.shape[:-1], len(self.fields), *self.shape)
-        axis = -1 - len(self.shape)
-        return [fields.select(axis, i) if is_tensor(q) else fields.take(i, axis) for i in range(len(self.fields))]
+        rest = (slice(None),) * len(self.shape)
+        return [fields[(..., i, *rest)] for i in range(len(self.fields))]
 
     def _differences(self, x: Sequence[Array], axis: int, k: int) -> list[Array]:
         at = axis - len(self.shape)
@@ -514,15 +514,9 @@ class LatticeHamiltonian(LocalHamiltonian):
         arrays: Sequence[Array],
         parameters: Sequence[Any],
     ) -> list[Array]:
-        like = arrays[0]
-        if is_tensor(like):
-            import torch
-
-            parameters = [torch.tensor(c, dtype=like.dtype, device=like.device) for c in parameters]
-        elif like.dtype != np.float64:
-            parameters = [np.asarray(c, dtype=like.dtype) for c in parameters]
-        values = self._values(key, expressions, (*variables, *self.c), *arrays, *parameters)
-        return [value + 0 * like if not getattr(value, "ndim", 0) else value for value in values]
+        x = arrays[0]
+        values = self._values(key, expressions, (*variables, *self.c), *arrays, *(like(c, x) for c in parameters))
+        return [value + 0 * x if not getattr(value, "ndim", 0) else value for value in values]
 
     @property
     def _sites(self) -> tuple[Any, ...]:
@@ -538,7 +532,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         if boundary == "free":
             return _cut(values, at, 0, n - k)
         before = [_cut(values, at, n - k, n)] if boundary == "periodic" else [_cut(values, at, 0, 1)] * k
-        return _join([*before, values], at)
+        return concatenate([*before, values], at)
 
 
 class RestOfLattice:
@@ -576,33 +570,26 @@ def _cut(x: Array, axis: int, first: int, last: int) -> Array:
     return x[(..., slice(first, last), *[slice(None)] * (-1 - axis))]
 
 
-def _join(parts: Sequence[Array], axis: int) -> Array:
-    if is_tensor(parts[0]):
-        import torch
-
-        return torch.cat(tuple(parts), dim=axis)
-    return np.concatenate(parts, axis=axis)
-
-
 def _padded(x: Array, axis: int, k: int, boundary: str) -> Array:
     """x with k places before and behind, along an axis counted from the end; as it is where the ends are free."""
     n = x.shape[axis]
     if boundary == "free":
         return x
     if boundary == "periodic":
-        return _join([_cut(x, axis, n - k, n), x, _cut(x, axis, 0, k)], axis)
+        return concatenate([_cut(x, axis, n - k, n), x, _cut(x, axis, 0, k)], axis)
     shape = [*x.shape]
     shape[axis] = k
-    zeros = x.new_zeros(shape) if is_tensor(x) else np.zeros(shape, dtype=x.dtype)
-    return _join([zeros, x, zeros], axis)
+    zeros = like(np.zeros(shape), x)
+    return concatenate([zeros, x, zeros], axis)
 
 
 def _joined(fields: Sequence[Array], n_axes: int) -> Array:
     """The fields (..., *shape) as positions (..., d)."""
     if len(fields) > 1:
-        fields = library(fields[0]).broadcast_tensors(*fields) if is_tensor(fields[0]) else np.broadcast_arrays(*fields)
+        shape = np.broadcast_shapes(*(tuple(x.shape) for x in fields))
+        fields = [library(x).broadcast_to(x, shape) for x in fields]
     flat = [x.reshape(*x.shape[: x.ndim - n_axes], -1) for x in fields]
-    return flat[0] if len(flat) == 1 else _join(flat, -1)
+    return flat[0] if len(flat) == 1 else concatenate(flat, -1)
 
 
 def checked_shape(shape: Any, argument: str = "shape") -> tuple[int, ...]:

@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arrays import Array, is_tensor, library
+from sympflow.arrays import Array, is_tensor, like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
@@ -150,9 +150,7 @@ class LocalHamiltonian(Definition, ABC):
         """∇²V(q), dense: (..., d) to (..., d, d)."""
         d = self.ndof
         self.check_dense(np.prod(q.shape, dtype=float) * d, "∇²V")
-        xp = library(q)
-        basis = xp.eye(d, dtype=q.dtype, device=q.device) if is_tensor(q) else np.eye(d, dtype=q.dtype)
-        return self.hessian_vector(q[..., None, :], basis + 0 * q[..., None, :], *t)
+        return self.hessian_vector(q[..., None, :], like(np.eye(d), q) + 0 * q[..., None, :], *t)
 
     def check_dense(self, entries: float, what: str) -> None:
         """Refuse a matrix with more than 5e7 entries: ∇²V, or that of the equations of an implicit step."""

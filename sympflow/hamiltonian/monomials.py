@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, stack
+from sympflow.arrays import Array, like, stack
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -116,18 +116,18 @@ def value(of: Monomials, coefficients: Array, q: Array) -> Array:
     terms = powers[0][..., exponents[:, 0]]
     for j in range(1, exponents.shape[1]):
         terms = terms * powers[j][..., exponents[:, j]]
-    return (_like(coefficients, q) * terms).sum(-1)
+    return (like(coefficients, q) * terms).sum(-1)
 
 
 def gradient(of: Monomials, coefficients: Array, q: Array) -> Array:
     """The gradient of `value`: (…, d)."""
     exponents = np.array(of)
     powers = _powers(q, int(exponents.max()))
-    coefficients, columns = _like(coefficients, q), []
+    coefficients, columns = like(coefficients, q), []
     for i in range(exponents.shape[1]):
         there = np.flatnonzero(exponents[:, i])
         lowered = exponents[there]
-        factors = _like(lowered[:, i], q)
+        factors = like(lowered[:, i], q)
         lowered[:, i] -= 1
         terms = powers[0][..., lowered[:, 0]]
         for j in range(1, exponents.shape[1]):
@@ -145,11 +145,3 @@ def _powers(q: Array, highest: int) -> list[Array]:
             of_one.append(of_one[-1] * q[..., j])
         powers.append(stack(of_one))
     return powers
-
-
-def _like(numbers: Any, q: Array) -> Array:
-    if is_tensor(q):
-        import torch
-
-        return numbers if is_tensor(numbers) else torch.as_tensor(numbers, dtype=q.dtype, device=q.device)
-    return np.asarray(numbers, dtype=q.dtype)

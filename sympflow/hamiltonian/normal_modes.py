@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import fft, fftpack
 
-from sympflow.arrays import Array, is_tensor
+from sympflow.arrays import Array, is_tensor, like, moveaxis
 
 ZERO = 1e-12
 """Share of the largest squared frequency below which a mode drifts freely, as in `LinearPart`."""
@@ -229,19 +229,11 @@ class SpectralPart:
         """The matrix of each wave times the fields (..., F, *shape)."""
         if matrices is None:
             return x
-        A: Any = matrices.swapaxes(-1, -2) if transposed else matrices
-        if is_tensor(x):
-            import torch
-
-            A = torch.tensor(np.ascontiguousarray(A), dtype=x.dtype, device=x.device)
-        elif x.dtype != np.float64:
-            A = A.astype(x.dtype)
+        A = like(matrices.swapaxes(-1, -2) if transposed else matrices, x)
         if self.fields == 1:
             return x * A[..., 0, 0]
         axis = -1 - len(self.transform.shape)
-        if is_tensor(x):
-            return (A @ x.movedim(axis, -1)[..., None])[..., 0].movedim(-1, axis)
-        return np.moveaxis((A @ np.moveaxis(x, axis, -1)[..., None])[..., 0], -1, axis)
+        return moveaxis((A @ moveaxis(x, axis, -1)[..., None])[..., 0], -1, axis)
 
 
 def dispersion(couplings: Mapping[int, np.ndarray], angles: np.ndarray) -> np.ndarray:

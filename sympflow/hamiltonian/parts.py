@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, like, stack
+from sympflow.arrays import Array, concatenate, is_tensor, library, like, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 from sympflow.hamiltonian.times import probe_times, stage_time
@@ -31,7 +31,7 @@ LINEAR = 0
 
 
 @dataclass(frozen=True)
-class Map:
+class SubFlow:
     """The exact flow of a part, in units of absolute time; every entry may have a batch shape in front.
 
     Attributes
@@ -53,8 +53,8 @@ class Map:
     filters: Any = None
     at: float = 0.0
 
-    def inverse(self) -> Map:
-        return Map(self.part, -self.length, -self.gradient, self.filters, self.at)
+    def inverse(self) -> SubFlow:
+        return SubFlow(self.part, -self.length, -self.gradient, self.filters, self.at)
 
 
 class PartFunctions(SymbolicHamiltonian):
@@ -188,7 +188,7 @@ class ExactParts:
 
     # flows ----------------------------------------------------------------------------------------------
 
-    def apply(self, maps: Sequence[Map], X: Array, Y: Array, t: Any = 0.0, h: Any = 0.0) -> tuple[Array, Array]:
+    def apply(self, maps: Sequence[SubFlow], X: Array, Y: Array, t: Any = 0.0, h: Any = 0.0) -> tuple[Array, Array]:
         """The maps of a step one after another, the first first; those of parts that move in a step h from t on."""
         for m in maps:
             if m.part == LINEAR:
@@ -206,7 +206,7 @@ class ExactParts:
         return X, Y
 
     def pushed(
-        self, maps: Sequence[Map], x: tuple[Array, Array], w: tuple[Array, Array], t: Any = 0.0, h: Any = 0.0
+        self, maps: Sequence[SubFlow], x: tuple[Array, Array], w: tuple[Array, Array], t: Any = 0.0, h: Any = 0.0
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]] | None:
         """The modes (..., d) after the maps, and vectors (..., k, d) moved by the derivative of these.
 
@@ -228,7 +228,7 @@ class ExactParts:
             P = P - each_mode(length) * linear.slopes(of.hessian_vector(y[..., None, :], linear.positions(U), *time))
         return (X, Y), (U, P)
 
-    def _turned(self, m: Map, X: Array, Y: Array) -> tuple[Array, Array]:
+    def _turned(self, m: SubFlow, X: Array, Y: Array) -> tuple[Array, Array]:
         """The flow of a part that brings its own: its change alone is transformed, so that transforms add no drift."""
         y = self.from_modes(X, Y)
         change = self.rest[m.part - 1].turned(y, each_mode(m.length)) - y
@@ -241,13 +241,13 @@ class ExactParts:
         """The linear part over the times s (..., F), or by the shears that `prepared` has put in their place."""
         return sheared(X, Y, s if isinstance(s, tuple) else self._shears(s, X))
 
-    def prepared(self, maps: Sequence[Map], X: Array) -> list[Map]:
+    def prepared(self, maps: Sequence[SubFlow], X: Array) -> list[SubFlow]:
         """The maps for repeated use on states of the kind of X: the shears of the linear ones computed once."""
         return [replace(m, length=self._shears(m.length, X)) if m.part == LINEAR else m for m in maps]
 
     def _shears(self, s: Any, X: Array) -> tuple[Array, Array, Array, Array]:
         assert self.linear is not None
-        return shears(self.linear.kinds, like(self.linear.rates, X), self.by_class(matching(s, X)))
+        return shears(self.linear.kinds, like(self.linear.rates, X), self.by_class(like(s, X)))
 
     def linear_energies(self, X: Array, Y: Array) -> Array:
         """Energy of the linear part in each frequency: (..., F)."""
@@ -267,7 +267,7 @@ class ExactParts:
         g = functions.gradient(self._state(part, X, Y, filters), *t)
         linear = self.linear
         dX = g[..., :d] if linear is None else linear.slopes(g[..., :d])
-        dX = dX if filters is None else self.by_class(matching(filters, X)) * dX
+        dX = dX if filters is None else self.by_class(like(filters, X)) * dX
         if functions.of_positions:
             return dX, None
         return dX, g[..., d:] if linear is None else linear.coordinates(g[..., d:])
@@ -277,7 +277,7 @@ class ExactParts:
         functions, d, linear = self.rest[part - 1], self.ndof, self.linear
         assert linear is not None
         y = self._state(part, X, 0 * X, filters)
-        phi = 1.0 if filters is None else self.by_class(matching(filters, X))
+        phi = 1.0 if filters is None else self.by_class(like(filters, X))
         v = self.inverse_masses(X) * phi * linear.slopes(functions.gradient(y, *t)[..., :d])
         v = linear.positions(phi * v)
         return phi * linear.slopes(functions.hessian_vector(y, v, *t))
@@ -289,7 +289,7 @@ class ExactParts:
 
     def _state(self, part: int, X: Array, Y: Array, filters: Array | None) -> Array:
         """[q, p] at which a part acts; of one of positions with p = 0, which it does not see."""
-        X = X if filters is None else self.by_class(matching(filters, X)) * X
+        X = X if filters is None else self.by_class(like(filters, X)) * X
         if not self.rest[part - 1].of_positions:
             return self.from_modes(X, Y)
         q = self._positions(X)
@@ -310,13 +310,6 @@ def each_mode(value: Any) -> Any:
     return value[..., None] if getattr(value, "ndim", 0) else value
 
 
-def matching(value: Any, x: Array) -> Array:
-    """Times or filters in the library, dtype and device of `x`."""
-    if is_tensor(value):
-        return value.to(dtype=x.dtype, device=x.device)
-    return like(np.asarray(value), x)
-
-
 SPLITTER = 134217729.0  # 2²⁷ + 1
 
 
@@ -331,11 +324,7 @@ def shears(kinds: Sequence[str], rates: Array, s: Array) -> tuple[Array, Array, 
 
     The flow is X ← cX + dY, Y ← cY − dX, where c and d are 0 or ±1, then X ← X + tY, Y ← Y − σX, X ← X + tY.
     """
-    module: Any = np
-    if is_tensor(s):
-        import torch
-
-        module = torch
+    module = library(s)
     theta = rates * s
     k, r = _reduced(theta, 0.0 if is_tensor(s) else _low(rates, s, theta), module)
     one, zero = 1 + 0 * theta, 0 * theta
@@ -533,7 +522,7 @@ def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
     return part.xreplace({s: first[s.name] for s in part.free_symbols if s.name in first})
 
 
-def map_evaluations(maps: Sequence[Map], n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+def map_evaluations(maps: Sequence[SubFlow], n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Evaluations of slopes and force gradients, as `FixedStep.evaluations`; linear flows cost none."""
     counts = [sum(m.part != LINEAR for m in maps), sum(_has_gradient(m) for m in maps)]
     counts = [count * (n_steps + n_extra) for count in counts]
@@ -543,5 +532,5 @@ def map_evaluations(maps: Sequence[Map], n_steps: int, n_saved: int, n_extra: in
     return {"force_evaluations": int(counts[0]), "hessian_evaluations": int(counts[1])}
 
 
-def _has_gradient(m: Map) -> bool:
+def _has_gradient(m: SubFlow) -> bool:
     return m.gradient != 0.0 if isinstance(m.gradient, float) else bool(np.any(m.gradient))

@@ -165,5 +165,5 @@ def known_scale(system: Any, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.nd
         return np.full_like(H0, system.energy_scale)
     with np.errstate(all="ignore"):
         y = y0.astype(float)
-        terms = np.abs(y * np.asarray(system.gradient(y, None if system.autonomous else t0))).sum(-1)
+        terms = np.abs(y * np.asarray(system.gradient(y, t0))).sum(-1)
         return np.where(np.isfinite(H0) & (np.abs(H0) <= SMALLEST_SCALE * terms), np.nan, np.abs(H0))

@@ -20,7 +20,7 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arguments import check_kept, plain
-from sympflow.arrays import Array, assemble, concatenate, is_tensor
+from sympflow.arrays import Array, assemble, concatenate, library_name
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
@@ -448,7 +448,7 @@ class SymbolicHamiltonian(Definition):
         values_of_samples: list[tuple[sampled, Callable[..., Any]]] = []
 
         def function(x: Array, *times: Array, numbers: Sequence[Any] = ()) -> Array:
-            library = "torch" if is_tensor(x) else "numpy"
+            library = library_name(x)
             if library not in generated:
                 wanted, letters = with_letters([printable(f) for f in expressions()])
                 values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in letters]

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import copy
 import math
-import sys
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, floats, real_number
+from sympflow.arguments import check_flag, check_positive, warn
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.scene import UNNAMED, Scene, SceneOptions
 from sympflow.hamiltonian.times import check_period, probe_times
 from sympflow.show.cards import Card, Shown, cut, numbers
 
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import Kick
 
 MOST_DEGREES = 1_000_000
-UNNAMED = "custom"
 TYPESET = 400
 """Characters of an H that notebooks typeset."""
 GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
@@ -159,17 +157,12 @@ class HamiltonianSystem(Hamiltonian, Shown):
         time: bool = False,
         period: float | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = UNNAMED,
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
         check: bool = True,
+        **scene: Unpack[SceneOptions],
     ) -> None:
         from sympflow.hamiltonian.callables import CallableHamiltonian, DrivenCallables
 
+        settled = Scene.given(scene)
         for argument, H in (("potential", potential), ("hamiltonian", hamiltonian)):
             if isinstance(H, str):
                 raise TypeError(
@@ -186,18 +179,18 @@ class HamiltonianSystem(Hamiltonian, Shown):
         kind = DrivenCallables if time else CallableHamiltonian
         definition = kind(int(ndof), potential, hamiltonian, gradient, hessian_vector, check)
         if definition.separable:
-            super().__init__(name, definition, matrices.inverse_mass(mass, int(ndof)), True)
+            super().__init__(settled.name, definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
-            super().__init__(name, definition, None, False)
+            super().__init__(settled.name, definition, None, False)
         if stiffness_matrix is not None:
             if not definition.separable:
                 raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
             self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
             self.stiffness_matrix.setflags(write=False)
         self._set_friction(damping)
-        self._set_scene({}, domain, y0, t_span, dt, energy_scale, exact)
+        self._set_scene({}, settled)
         self._set_period(period)
 
     @classmethod
@@ -211,13 +204,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         time: str | sympy.Symbol | None = None,
         period: float | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = UNNAMED,
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """A system from one symbolic definition of H in q1 … qd, p1 … pd (or q, p).
 
@@ -255,24 +242,23 @@ class HamiltonianSystem(Hamiltonian, Shown):
 
         if q is not None or p is not None:
             expression = renamed(expression, q, p)
-        params = checked_params(params)
+        params, settled = checked_params(params), Scene.given(scene)
         symbols = SymbolicHamiltonian(expression, params, time)
         if cls._continuous:
             symbols.check_continuous()
         if symbols.ndof > MOST_WRITTEN_OUT:
-            warnings.warn(
+            warn(
                 f"`expression` has {symbols.ndof} coordinates: written out, H takes seconds to define, and a step ten "
                 "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
                 "HamiltonianSystem.pairs, from one pair. Use one of these.",
-                stacklevel=2,
             )
         self = cls.__new__(cls)
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(matrices.from_entries(M.shape, M.todok()))
-        Hamiltonian.__init__(self, name, symbols, inverse_mass, M is not None)
+        Hamiltonian.__init__(self, settled.name, symbols, inverse_mass, M is not None)
         self.symbols = symbols
         self._set_friction(damping)
-        self._set_scene(params, domain, y0, t_span, dt, energy_scale, exact)
+        self._set_scene(params, settled)
         self._set_period(period)
         return self
 
@@ -288,14 +274,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         fields: str | Sequence[str] = "q",
         params: Mapping[str, Any] | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "lattice",
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
-        time: None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """A lattice of any size, H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), by expressions for one site and one bond.
 
@@ -325,8 +304,6 @@ class HamiltonianSystem(Hamiltonian, Shown):
             the first site where the lower end is a wall.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
-        time : None
-            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -342,9 +319,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
         """
         from sympflow.hamiltonian.lattice import LatticeHamiltonian
 
-        _check_no_time(time)
         local = LatticeHamiltonian(onsite, bond, shape, boundary, kinetic, fields, params)
-        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
+        return cls._of_pieces(local, damping, Scene.given(scene, name="lattice"))
 
     @classmethod
     def pairs(
@@ -359,14 +335,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         params: Mapping[str, float] | None = None,
         bodies: Mapping[str, ArrayLike] | None = None,
         damping: float | ArrayLike | None = None,
-        name: str = "pairs",
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 1.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
-        time: None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """Bodies that interact in pairs, any number of them: H = Σ_i |p_i|²/(2 m_i) + Σ_{i<j} V(r_ij).
 
@@ -396,8 +365,6 @@ class HamiltonianSystem(Hamiltonian, Shown):
             Values that differ from body to body: of "c" the values are c1 and c2 in V.
         damping, name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
-        time : None
-            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -414,9 +381,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
         """
         from sympflow.hamiltonian.bodies import PairsHamiltonian
 
-        _check_no_time(time)
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
-        return cls._of_pieces(local, damping, name, domain, y0, t_span, dt, energy_scale, exact)
+        return cls._of_pieces(local, damping, Scene.given(scene, name="pairs", t_span=(0.0, 1.0)))
 
     @classmethod
     def planets(
@@ -487,7 +453,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         local = PlanetsHamiltonian(masses, G, start, coordinates, encounter)
         end = (0.0, 1000 * float(local.frame.periods.max())) if t_span is None else t_span
         step = local.frame.longest_step if dt is None else dt
-        return cls._of_pieces(local, None, name, domain, start, end, step, energy_scale)
+        return cls._of_pieces(local, None, Scene(name, domain, start, end, step, energy_scale))
 
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
@@ -534,8 +500,11 @@ class HamiltonianSystem(Hamiltonian, Shown):
         domain = None
         with suppress(ValueError):  # of states at rest none follow
             domain = self.local_states()
-        scene = None, self.t_span, self.dt, None
-        return HamiltonianSystem._of_pieces(local, self.damping, self.name, domain, *scene)
+        return HamiltonianSystem._of_pieces(local, self.damping, self._piece_scene(domain))
+
+    def _piece_scene(self, domain: Domain | None) -> Scene:
+        """The scene of a few of the sites or bodies."""
+        return Scene(self.name, domain, None, self.t_span, self.dt)
 
     def local_states(self) -> LatticeStates | None:
         """The states, for any size, at the energy density of the domain, or else of `y0`; None without both."""
@@ -553,9 +522,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
     @cached_property
     def _few_sites(self) -> HamiltonianSystem:
         assert self.local is not None
-        return HamiltonianSystem._of_pieces(
-            self.local.piece(), self.damping, self.name, None, None, self.t_span, self.dt, None
-        )
+        return HamiltonianSystem._of_pieces(self.local.piece(), self.damping, self._piece_scene(None))
 
     @property
     def few_sites(self) -> HamiltonianSystem:
@@ -572,14 +539,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         length: float | Sequence[float] | None = None,
         dispersion: str | sympy.Expr = "k**2/2",
         params: Mapping[str, Any] | None = None,
-        name: str = "schroedinger",
-        domain: Domain | None = None,
-        y0: ArrayLike | None = None,
-        t_span: tuple[float, float] = (0.0, 100.0),
-        dt: float | None = None,
-        energy_scale: float | None = None,
-        exact: Callable[[Any], Array] | None = None,
-        time: None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """A complex field on a periodic grid of any size, i ∂ψ/∂t = ω(−i∇)ψ + f'(|ψ|²)ψ: Schrödinger equations.
 
@@ -607,8 +567,6 @@ class HamiltonianSystem(Hamiltonian, Shown):
             Values of the other names; arrays in `onsite`, such as a potential V or disorder.
         name, domain, y0, t_span, dt, energy_scale, exact
             As for the class.
-        time : None
-            None alone: H by pieces does not depend on the time.
 
         Raises
         ------
@@ -624,32 +582,28 @@ class HamiltonianSystem(Hamiltonian, Shown):
         """
         from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian
 
-        _check_no_time(time)
         local = WaveFunctionHamiltonian(onsite, dispersion, shape, length, params)
-        return cls._of_pieces(local, None, name, domain, y0, t_span, dt, energy_scale, exact)
+        return cls._of_pieces(local, None, Scene.given(scene, name="schroedinger"))
 
     @classmethod
-    def _of_pieces(
-        cls, local: LocalHamiltonian, damping: float | ArrayLike | None, name: str, *scene: Any
-    ) -> HamiltonianSystem:
+    def _of_pieces(cls, local: LocalHamiltonian, damping: float | ArrayLike | None, scene: Scene) -> HamiltonianSystem:
         """A system by a definition of one piece."""
         self = cls.__new__(cls)
-        Hamiltonian.__init__(self, name, local, local.inverse_mass, local.quadratic_kinetic)
+        Hamiltonian.__init__(self, scene.name, local, local.inverse_mass, local.quadratic_kinetic)
         self._set_friction(damping)
-        self._set_scene(local.params, *scene)
+        self._set_scene(local.params, scene)
         return self
 
     def _set_friction(self, damping: float | ArrayLike | None) -> None:
         G = matrices.damping(damping, self.ndof)
-        self.friction = None if G is None else Friction(G)
+        self.friction = Friction(G)
 
     def _set_period(self, period: float | None) -> None:
         if period is None:
             return
         if self.autonomous:
             raise TypeError("`period` only goes with `time`, for H that depends on t: leave it out.")
-        if not real_number(period) or not 0 < period < 1e100:
-            raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+        check_positive("period", period, most=1e100)
         known = self._definition.has_period(float(period))
         if known is False:
             raise ValueError(
@@ -669,39 +623,19 @@ class HamiltonianSystem(Hamiltonian, Shown):
                 self._set_period(former)
         return self._period
 
-    def _set_scene(
-        self,
-        params: Mapping[str, Any],
-        domain: Domain | None,
-        y0: ArrayLike | None,
-        t_span: tuple[float, float],
-        dt: float | None,
-        energy_scale: float | None,
-        exact: Callable[[Any], Array] | None = None,
-    ) -> None:
+    def _set_scene(self, params: Mapping[str, Any], scene: Scene) -> None:
         self._params = Parameters(params)
-        if exact is not None and not callable(exact):
-            raise TypeError(f"`exact` must be a function of the time; got {type(exact).__name__}.")
-        self.exact = exact
-        if dt is not None and not (real_number(dt) and 0 < dt < 1e100):
-            raise ValueError(f"`dt` must be positive and finite; got {dt!r}.")
-        try:
-            t0, t1 = (float(t) for t in t_span)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.") from error
-        if not math.isfinite(t1 - t0):
-            raise ValueError(f"`t_span` must be two finite numbers, start and end; got {t_span!r}.")
-        self.t_span, self._dt = (t0, t1), None if dt is None else float(dt)
-        if energy_scale is not None and not (real_number(energy_scale) and 0 < energy_scale <= sys.float_info.max):
-            raise ValueError(f"`energy_scale` must be positive and finite; got {energy_scale!r}.")
-        self.energy_scale = energy_scale
-        self.y0 = None if y0 is None else self._checked_y0(y0)
-        if domain is not None and not isinstance(domain, Domain):
-            raise TypeError(f"`domain` must be a domain such as sympflow.Box(low, high); got {type(domain).__name__}.")
-        self.domain = None if domain is None else domain_of(domain, self)
+        self.exact, self.t_span, self._dt, self.energy_scale = scene.exact, scene.t_span, scene.dt, scene.energy_scale
+        self.y0 = scene.state(self.ndof)
+        self.domain = None if scene.domain is None else domain_of(scene.domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
         self._definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
+
+    @property
+    def scene(self) -> Scene:
+        """What the system is usually solved with, but for an `exact` solution, which is one of its parameters."""
+        return Scene(self.name, self.domain, self.y0, self.t_span, self.dt, self.energy_scale)
 
     @property
     def dt(self) -> float:
@@ -720,16 +654,6 @@ class HamiltonianSystem(Hamiltonian, Shown):
     def step_is_open(self) -> bool:
         """True if `dt` was not given, and the system has no states from which it could be chosen."""
         return self._dt is None and self.y0 is None and self.domain is None
-
-    def _checked_y0(self, y0: ArrayLike) -> np.ndarray:
-        """The default initial state: a copy of floats."""
-        try:
-            state = floats("y0", y0)
-        except OverflowError:
-            raise ValueError("`y0` must be finite: it has an integer that no float is near.") from None
-        if state.shape != (2 * self.ndof,):
-            raise ValueError(f"`y0` must have shape ({2 * self.ndof},), [q, p]; got {state.shape}.")
-        return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
@@ -798,23 +722,12 @@ class HamiltonianSystem(Hamiltonian, Shown):
         {'k': 2.5}
         """
         if self.local is not None:
-            scene = self.domain, self.y0, self.t_span, self.dt, self.energy_scale
-            return HamiltonianSystem._of_pieces(self.local.with_params(values), self.damping, self.name, *scene)
+            return HamiltonianSystem._of_pieces(self.local.with_params(values), self.damping, self.scene)
         self.check_parameters(values)
         assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.named_time
-        made = HamiltonianSystem.from_sympy(
-            H,
-            params={**self.params, **values},
-            time=time,
-            damping=self.damping,
-            name=self.name,
-            domain=self.domain,
-            y0=self.y0,
-            t_span=self.t_span,
-            dt=self.dt,
-            energy_scale=self.energy_scale,
-        )
+        params = {**self.params, **values}
+        made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
         # Values of the drive may have changed the period: it is tested where it is asked for.
         made._former_period = self._former_period if self.autonomous else self.period
         return made
@@ -852,10 +765,10 @@ class HamiltonianSystem(Hamiltonian, Shown):
         self._definition.check(probes, like, n_given, *self._probed_times())
         self._tested = self._tested | {kind: reach(probes[:, : self._arguments], self._arguments // self.ndof)}
 
-    def check_functions_along(self, y: Array) -> None:
+    def check_functions_along(self, y: Array) -> bool:
         """Test the functions of a user where a run went far beyond the states at which they were tested: `solve` does.
 
-        At the farthest of the states y a RuntimeWarning says what `check_functions` would refuse: the run is made.
+        At the farthest of the states y a RuntimeWarning says what `check_functions` would refuse, and True is returned.
 
         Parameters
         ----------
@@ -864,19 +777,20 @@ class HamiltonianSystem(Hamiltonian, Shown):
         kind = type(y), y.dtype
         reached = self._tested.get(kind)
         if reached is None:
-            return
+            return False
         from sympflow.hamiltonian.function_checks import farther_states, reach
 
         far = farther_states(one_lane(y).reshape(-1, 2 * self.ndof), reached).astype(float)
         if not len(far):
-            return
+            return False
         try:
             self._definition.check(far, y, 0, *self._probed_times())
         except (ValueError, TypeError) as error:
-            warnings.warn(f"On this run, far from its start: {error}", RuntimeWarning, stacklevel=3)
-            return
+            warn(f"On this run, far from its start: {error}", RuntimeWarning)
+            return True
         seen = np.concatenate([reached, far[:, : self._arguments]])
         self._tested = self._tested | {kind: reach(seen, self._arguments // self.ndof)}
+        return False
 
     def _probed_times(self) -> tuple[np.ndarray, ...]:
         """The times at which functions of a driven system are tested."""
@@ -964,14 +878,6 @@ class HamiltonianSystem(Hamiltonian, Shown):
 
     def __dir__(self) -> list[str]:
         return [*SHOWN_NAMES]
-
-
-def _check_no_time(time: object) -> None:
-    if time is not None:
-        raise TypeError(
-            "`time` is for systems that are written out, and those by one piece do not depend on it: leave it out, or "
-            "write H out by HamiltonianSystem.from_sympy(..., time='t')."
-        )
 
 
 def parameters_text(

@@ -9,11 +9,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arguments import real_number
-from sympflow.arrays import Array, concatenate, is_tensor
+from sympflow.arrays import Array, concatenate, library
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.function_checks import as_like
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.scene import Scene
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
 
 LARGEST_SHIFT = 1e100
@@ -89,10 +90,10 @@ def time_transformed(
     else:
         transformed = HamiltonianSystem.__new__(HamiltonianSystem)
         Hamiltonian.__init__(transformed, f"log_{system.name}", _Logarithmic(system, c), None, False)
-        transformed._set_scene({**system.params, "shift": c}, None, None, (0.0, 100.0), 0.05, 1.0)
+        transformed._set_scene({**system.params, "shift": c}, Scene(dt=0.05, energy_scale=1.0))
     transformed.domain = domain
     if system.y0 is not None:
-        transformed.y0 = transformed._checked_y0(lifted(system, system.y0, c))
+        transformed.y0 = Scene(y0=lifted(system, system.y0, c)).state(transformed.ndof)
         scale = time_scale(system, c)
         transformed.dt = system.dt * scale
         transformed.t_span = (0.0, (system.t_span[1] - system.t_span[0]) * scale)
@@ -174,7 +175,7 @@ class _Logarithmic(Definition):
         self._system.check_functions(projected(as_like(states[:n_given], like)) if n_given else None)
 
     def kinetic(self, P: Array) -> Array:
-        return _log(self._system.kinetic(P[..., :-1]) + P[..., -1])
+        return library(P).log(self._system.kinetic(P[..., :-1]) + P[..., -1])
 
     def kinetic_gradient(self, P: Array) -> Array:
         p, B = P[..., :-1], P[..., -1:]
@@ -188,7 +189,7 @@ class _Logarithmic(Definition):
         return _bordered(weight * (self._system.kinetic_hessian(p) + 0 * weight)) - g[..., :, None] * g[..., None, :]
 
     def potential(self, Q: Array) -> Array:
-        return -_log(self._c - self._system.potential(Q[..., :-1]))
+        return -library(Q).log(self._c - self._system.potential(Q[..., :-1]))
 
     def potential_gradient(self, Q: Array) -> Array:
         q = Q[..., :-1]
@@ -200,10 +201,6 @@ class _Logarithmic(Definition):
         weight = (1 / (self._c - self._system.potential(q)))[..., None, None]
         g = self.potential_gradient(Q)
         return _bordered(weight * self._system.potential_hessian(q)) + g[..., :, None] * g[..., None, :]
-
-
-def _log(x: Array) -> Array:
-    return x.log() if is_tensor(x) else np.log(x)
 
 
 def _bordered(S: Array) -> Array:

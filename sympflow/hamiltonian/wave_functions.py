@@ -12,7 +12,7 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arguments import real_number
-from sympflow.arrays import Array, concatenate, is_tensor, library, like
+from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.lattice import checked_params, checked_shape
 from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, letters, parsed
@@ -106,7 +106,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
 
     def hessian(self, y: Array) -> Array:
         """∇²H, dense: (..., 2d) to (..., 2d, 2d)."""
-        d, xp = self.ndof, library(y)
+        d = self.ndof
         if np.prod(y.shape, dtype=float) * 2 * d > MOST_DENSE:
             raise ValueError(
                 f"`system` has {d:,} sites, of which a dense ∇²H has {4.0 * d * d:.3g} entries for each state: take a "
@@ -122,7 +122,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
             concatenate([x[..., None] * basis + (L if i == j else 0 * L) for j, x in enumerate(row)])
             for i, row in enumerate(diagonals)
         ]
-        return xp.cat(rows, dim=-2) if is_tensor(y) else np.concatenate(rows, axis=-2)
+        return concatenate(rows, -2)
 
     def linear_and_rest(self, interval: float) -> tuple[SpectralPart, list[Any]]:
         kinds = np.where(self.rates != 0, "oscillator", "idle")

@@ -93,7 +93,7 @@ def _flow_holds(system: HamiltonianSystem, y0: Array, tol: float | None) -> bool
 
 def _falls_to_the_origin(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     """True if V < 0 along the rays of all positions, and −∞ at their end at q = 0."""
-    if not (system.poles and system.separable and system.conservative and system.autonomous):
+    if not (system.poles and system.separable and system.keeps_energy):
         return False
     q = y0.reshape(-1, y0.shape[-1])[:MOST_STATES, : system.ndof]
     with np.errstate(all="ignore"):
@@ -257,7 +257,7 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[fl
     """The error of a trial run, as a function of the step."""
     system, y0 = problem.system, problem.y0
     sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
-    conserved = system.autonomous and system.conservative
+    conserved = system.keeps_energy
     with np.errstate(all="ignore"):
         H0 = np.asarray(system.hamiltonian(y0, problem.t0))
     scale = known_scale(system, y0, problem.t0, H0)

@@ -18,9 +18,11 @@ import numpy as np
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.base import FixedStep, Stepper
+from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.interpolants import DenseOutput
+from sympflow.integrators.steppers import Stepper
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
 FIRST_CHUNK = 2**16  # steps, at most, before it is known how fast time goes
@@ -287,7 +289,6 @@ class PhysicalRun:
         for name, value in state.items():
             setattr(self, name, value)
         self.stepper = self._stepper()
-        self.stepper.backend = self.backend or self.stepper.backend
 
     def _most_steps(self, allowance: int) -> int:
         """Steps after which time hardly advances: before a collision they would never end, so it is evaluations."""
@@ -472,7 +473,7 @@ class PhysicalRun:
         """Times and states (n, 1, 2d) of every `save_every`-th step of a single trajectory, and of the end."""
         if path is None:
             return np.array([self.problem.t0]), projected(self.start)[None]
-        x = path.states[0]
+        x = path.kept[0]
         inside = self.sign * x[:, self.d] < self.length
         count = int(np.count_nonzero(inside))
         keep = np.arange(0, count, self.problem.save_every)
@@ -486,24 +487,22 @@ class PhysicalRun:
         return t, y[:, None]
 
 
-class _Path:
-    """Dense output in the physical time: sol(t) has shape (..., 2d) or (..., 2d, n)."""
+class _Path(DenseOutput):
+    """Dense output in the physical time."""
 
     def __init__(self, run: PhysicalRun, kept: list[tuple[np.ndarray, np.ndarray]]) -> None:
         self.run = run
-        self.states = [
+        self.kept = [
             np.concatenate([run.start[i : i + 1], *(states[i, 1 : last[i] + 1] for states, last in kept)])
             for i in range(len(run.start))
         ]
         self.t_min, self.t_max = sorted((run.problem.t0, run.problem.t1))
 
-    def __call__(self, t: Any) -> np.ndarray:
-        run, times = self.run, np.atleast_1d(np.asarray(t, dtype=float))
-        if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
-            raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
+    def states(self, times: np.ndarray) -> Array:
+        run = self.run
         target = (times - run.problem.t0).astype(run.start.dtype)
         rows = []
-        for x in self.states:
+        for x in self.kept:
             if len(x) == 1:
                 rows.append(np.repeat(projected(x), len(times), axis=0))
                 continue
@@ -512,8 +511,7 @@ class _Path:
             found[target == 0] = projected(x[:1])
             found[run.sign * target > run.sign * x[-1, run.d]] = np.nan
             rows.append(found)
-        y = np.stack(rows).swapaxes(-1, -2).reshape(*run.problem.y0.shape, len(times))
-        return y[..., 0] if np.ndim(t) == 0 else y
+        return np.stack(rows, axis=1).reshape(len(times), *run.problem.y0.shape)
 
 
 def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:

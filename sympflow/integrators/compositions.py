@@ -22,21 +22,20 @@ from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
-from sympflow.integrators.base import rollout
 from sympflow.integrators.contract import Failure
+from sympflow.integrators.steppers import ArraySteps, rollout
 from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, scheme_evaluations
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.parts import ExactParts, Map
+    from sympflow.hamiltonian.parts import ExactParts, SubFlow
     from sympflow.hamiltonian.planets import Frame
-    from sympflow.kernels.carry import Carry
-    from sympflow.kernels.protocol import Kernel
+    from sympflow.kernels.protocol import Carry, Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()
 
 
-class Composition(ABC):
+class Composition(ABC, ArraySteps):
     """A scheme composed of the exact flows of the parts of one system.
 
     Parameters
@@ -76,13 +75,8 @@ class Composition(ABC):
     ) -> None:
         self.method, self.scheme = method, scheme
 
-    def check_friction(self, dt: float) -> None:
-        """Raise a ValueError where the friction of the system asks for shorter steps than dt."""
-        raise ValueError(f"`method` {self.method!r} does not take friction: use the splitting 'kinetic'.")
-
-    def check_driving(self) -> None:
-        """Raise a ValueError where the parts of a driven system have no exact flows."""
-        raise ValueError(f"`method` {self.method!r} does not take a driven system: use the splitting 'kinetic'.")
+    def check_system(self, dt: float) -> None:
+        """Raise a ValueError where the friction or the drive of the system asks for shorter steps, or has no flow."""
 
     def longest_step(self) -> float:
         """The longest step with which the method is to be used."""
@@ -109,10 +103,6 @@ class Composition(ABC):
         return 0 * x[..., :2]
 
     @abstractmethod
-    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        """One step of length h, a number or one for each state, from y (..., 2d)."""
-
-    @abstractmethod
     def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         """The states from which `step`, with the same h and t, leads to y."""
 
@@ -124,19 +114,9 @@ class Composition(ABC):
         """The step and the vectors W (..., 2d, k) moved by its derivative; None likewise."""
         return None
 
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
-    ) -> tuple[Array, np.ndarray]:
-        """Many steps by array operations, as `base.rollout`."""
-        return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
-
     @abstractmethod
     def kernel(self, compensated: bool) -> Kernel:
         """The compiled loops; a ValueError says why there are none."""
-
-    @abstractmethod
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Evaluations of forces and their derivatives, as `FixedStep.evaluations`."""
 
 
 MOST_GROWTH = 1.0
@@ -166,16 +146,14 @@ class KineticPotential(Composition):
                 f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p, which {system.name!r} has not: use a scheme "
                 "for any separable system, such as 'kahan_li8'."
             )
-        if system.friction is not None and not system.quadratic_kinetic:
+        if system.friction and not system.quadratic_kinetic:
             raise ValueError(
                 f"`method` {method!r} solves friction exactly where the kinetic energy is ½ pᵀM⁻¹p, which "
                 f"{system.name!r} has not: use a Runge–Kutta method such as 'dop853'."
             )
 
-    def check_friction(self, dt: float) -> None:
+    def check_system(self, dt: float) -> None:
         friction = self.system.friction
-        if friction is None:
-            return
         back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
         if friction.largest * back * dt > MOST_GROWTH:
             raise ValueError(
@@ -185,8 +163,6 @@ class KineticPotential(Composition):
                 f"{MOST_GROWTH / (friction.largest * back):.3g}, or a scheme without such drifts, as 'verlet' or "
                 "'chin4c'."
             )
-
-    def check_driving(self) -> None:
         if self.system.kinetic_timed:
             self.system.drift(np.zeros(self.system.ndof), 0.0, 0.0)
 
@@ -195,9 +171,7 @@ class KineticPotential(Composition):
         return [c for s, c in zip(scheme.substeps, scheme.substep_times, strict=True) if s.kind == "kick"]
 
     def _times(self, t: Any, h: Any) -> list[Any]:
-        """The time at which each substep begins; that of a system that does not depend on it is left out."""
-        if self.system.autonomous:
-            return [None] * len(self.scheme.substeps)
+        """The time at which each substep begins."""
         return [stage_time(t, c, h) for c in self.scheme.substep_times]
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -206,7 +180,7 @@ class KineticPotential(Composition):
         times, h = self._times(t, h), per_state(h, y)
         for substep, at in zip(self.scheme.substeps, times, strict=True):
             if substep.kind == "drift":
-                q, p = _drift(system, q, p, substep.one * h, at)
+                q, p = system.drifted(q, p, at, substep.one * h)
             else:
                 p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
         return concatenate([q, p])
@@ -218,10 +192,8 @@ class KineticPotential(Composition):
         for substep, at in zip(reversed(self.scheme.substeps), reversed(times), strict=True):
             if substep.kind == "kick":
                 p = p - _kick(system, q, substep, h, self.scheme.monomials, at)
-            elif system.friction is None:
-                q, p = _drift(system, q, p, substep.one * h, at, -1.0)
             else:
-                q, p = _drift(system, q, p, -(substep.one * h))
+                q, p = system.drifted(q, p, at, substep.one * h, -1.0)
         return concatenate([q, p])
 
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
@@ -258,7 +230,7 @@ class KineticPotential(Composition):
         for substep, at in zip(self.scheme.substeps, times, strict=True):
             c = substep.one
             if substep.kind == "drift":
-                if system.friction is not None:
+                if system.friction:
                     mean, end = system.friction.drift(P.swapaxes(-1, -2), c * h[..., None])
                     U = U + _velocities(system, p, mean.swapaxes(-1, -2))
                     P = end.swapaxes(-1, -2)
@@ -266,7 +238,7 @@ class KineticPotential(Composition):
                     U = U + system.drift_jacobian(p, at, c * h[..., 0]) @ P
                 else:
                     U = U + c * h[..., None] * _velocities(system, p, P)
-                q, p = _drift(system, q, p, c * h, at)
+                q, p = system.drifted(q, p, at, c * h)
             else:
                 change = (c * h)[..., None] * _bends(system, q, U, at)
                 if substep.three:
@@ -278,7 +250,7 @@ class KineticPotential(Composition):
 
     def kernel(self, compensated: bool) -> Kernel:
         loops = _splitting_loops()(self.system)
-        if self.system.friction is None:
+        if not self.system.friction:
             return loops.kernel(self.scheme, compensated)
         return loops.damped_kernel(self.scheme, self.step)
 
@@ -292,18 +264,6 @@ def _splitting_loops() -> Callable[[HamiltonianSystem], SplittingLoops]:
     from sympflow.kernels.splitting_loops import splitting_loops
 
     return splitting_loops
-
-
-def _drift(
-    system: HamiltonianSystem, q: Array, p: Array, s: Any, t: Any = None, sign: float = 1.0
-) -> tuple[Array, Array]:
-    """The states after a drift over s from the time t on, of which friction is a part; `sign` −1 undoes one without."""
-    if system.friction is not None:
-        mean, end = system.friction.drift(p, s)
-        return q + system.velocity(mean), end
-    if system.kinetic_timed:
-        return q + sign * system.drift(p, t, s[..., 0] if getattr(s, "ndim", 0) else s), p
-    return q + (sign * s) * system.velocity(p), p
 
 
 def _kick(system: HamiltonianSystem, q: Array, kick: Substep, h: Any, monomials: Monomials, t: Any = None) -> Array:
@@ -350,9 +310,6 @@ class ExactMaps(Composition):
     takes_driving: ClassVar[bool] = True
     parts: ExactParts
 
-    def check_driving(self) -> None:
-        """Do nothing: the parts were found to be solved exactly when the composition was made."""
-
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ExactMaps) and self._key() == other._key()
 
@@ -366,7 +323,7 @@ class ExactMaps(Composition):
         return [m.at for m in known_maps(self, 1.0) if self.parts.timed(m.part)]
 
     @abstractmethod
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         """The maps of a step of length h, a number or an array (...)."""
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
@@ -408,14 +365,14 @@ class ExactMaps(Composition):
 
 
 @lru_cache(maxsize=64)
-def known_maps(composition: ExactMaps, h: float) -> Sequence[Map]:
+def known_maps(composition: ExactMaps, h: float) -> Sequence[SubFlow]:
     """The maps of a step, the same object for the same step, whose table the kernel then knows."""
     return composition.maps(h)
 
 
 def rollout_in_modes(
     parts: ExactParts,
-    maps: Sequence[Map],
+    maps: Sequence[SubFlow],
     y0: Array,
     n_steps: int,
     save: np.ndarray,
@@ -423,7 +380,7 @@ def rollout_in_modes(
     t0: float,
     carry: Carry | None = None,
 ) -> tuple[Array, np.ndarray]:
-    """`base.rollout` of exact flows, in the modes from beginning to end."""
+    """`steppers.rollout` of exact flows, in the modes from beginning to end."""
     d = parts.ndof
     start = parts.to_modes(y0)
     known = parts.prepared(maps, start[0])
@@ -435,11 +392,7 @@ def rollout_in_modes(
     states = parts.from_modes(modes[..., :d], modes[..., d:])
     if not (len(save) and save[0] == 0):
         return states, finite
-    if is_tensor(states):
-        import torch
-
-        return torch.cat([y0[None], states[1:]]), finite
-    return np.concatenate([y0[None], states[1:]]), finite
+    return concatenate([y0[None], states[1:]], 0), finite
 
 
 class LinearRest(ExactMaps):
@@ -470,16 +423,16 @@ class LinearRest(ExactMaps):
         if any(scheme.gradients) and not self.parts.has_force_gradient:
             raise ValueError(f"`method` {method!r} needs a kinetic energy ½ pᵀM⁻¹p: use 'linear_srkn6b'.")
 
-    def maps(self, h: Any) -> list[Map]:
-        from sympflow.hamiltonian.parts import LINEAR, Map
+    def maps(self, h: Any) -> list[SubFlow]:
+        from sympflow.hamiltonian.parts import LINEAR, SubFlow
 
         filters = self.filters(h)
         maps = []
         for (kind, c, c3, *_), at in zip(self.scheme.substeps, self.scheme.substep_times, strict=True):
             if kind == "drift":
-                maps.append(Map(LINEAR, self.times(c * h)))
+                maps.append(SubFlow(LINEAR, self.times(c * h)))
             elif self.parts.rest:
-                maps.append(Map(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
+                maps.append(SubFlow(1, c * h, c3 * h**3 if c3 else 0.0, filters, at))
         return maps
 
     def filters(self, h: Any) -> Any:
@@ -528,9 +481,8 @@ class MidpointLinearRest(LinearRest):
 
 def _each_class(s: Any, parts: ExactParts) -> Any:
     """A time (...) for all F frequencies: (..., F)."""
-    if is_tensor(s):
-        return s[..., None] * s.new_ones(parts.n_classes)
-    return np.asarray(s)[..., None] * np.ones(parts.n_classes, dtype=getattr(s, "dtype", float))
+    s = s if is_tensor(s) else np.asarray(s, dtype=getattr(s, "dtype", float))
+    return s[..., None] * like(np.ones(parts.n_classes), s)
 
 
 class SolvableParts(ExactMaps):
@@ -562,9 +514,9 @@ class SolvableParts(ExactMaps):
             known[parts] = exact_parts(system, parts)
         return known[parts]
 
-    def maps(self, h: Any) -> list[Map]:
+    def maps(self, h: Any) -> list[SubFlow]:
         *others, innermost = self.parts.sequence
-        maps: list[Map] = []
+        maps: list[SubFlow] = []
         for weight, start, end in zip(self.weights, self._moments, self._moments[1:], strict=False):
             outer = [self._map(k, weight * h / 2, start) for k in others]
             if self.parts.timed(innermost):
@@ -577,10 +529,10 @@ class SolvableParts(ExactMaps):
                 maps.append(m)
         return maps
 
-    def _map(self, k: int, h: Any, at: float) -> Map:
-        from sympflow.hamiltonian.parts import LINEAR, Map
+    def _map(self, k: int, h: Any, at: float) -> SubFlow:
+        from sympflow.hamiltonian.parts import LINEAR, SubFlow
 
-        return Map(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
+        return SubFlow(k, _each_class(h, self.parts) if k == LINEAR else h, at=at)
 
 
 class TwoCopies(SolvableParts):
@@ -649,8 +601,8 @@ class KeplerInteraction(Composition):
                 f"`splitting` 'kepler' has plain kicks, and the scheme of method {method!r} has force gradients: use "
                 "'leapfrog', 'aba864' or another scheme without them."
             )
-        if system.friction is not None:
-            self.check_friction(0.0)
+        if system.friction:
+            raise ValueError(f"`method` {method!r} does not take friction: use the splitting 'kinetic'.")
         known = _PARTS.setdefault(system, {})
         if "kepler" not in known:
             from sympflow.hamiltonian.planets import frame_of

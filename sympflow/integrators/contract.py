@@ -413,9 +413,14 @@ def differentiated(
     y = to_numpy(states)
     batch = y.shape[:-1]
     t, h = (np.broadcast_to(x.reshape(*x.shape, *[1] * (len(batch) - x.ndim)), batch) for x in (times, lengths))
-    start = float(t.flat[0]) if system is None or system.autonomous else t
+    start = start_of(system, t)
     with np.errstate(all="ignore"):
         return t, h, jacobian(start, y, h.astype(y.dtype)).astype(float)
+
+
+def start_of(system: HamiltonianSystem | None, t: np.ndarray) -> Any:
+    """The times t of steps of a driven system, else the first: that is what steps of other systems are given."""
+    return float(t.flat[0]) if system is None or system.autonomous else t
 
 
 @cache

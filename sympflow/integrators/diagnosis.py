@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,10 +11,12 @@ from weakref import WeakSet
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arguments import warn
+from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
+from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap, warn_of_loss
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 TAIL = 200  # steps before the end of a run, at least, from which the solution is followed
 AHEAD = 4  # steps beyond the end: an implicit method gives up before a singularity
+MOST_DIAGNOSED = 16  # sets of values of parameters
 MOST_TRIED, MOST_ROWS, MOST_STORED = 500, 4096, 10**7  # steps of the reference; trajectories at once; numbers
 RTOL = 1e-10
 LOST = 0.01  # of y·∇H: a state whose energy differs by more is no longer on the solution
@@ -47,6 +50,55 @@ that share of errors there is told."""
 _TOLD: WeakSet[Any] = WeakSet()
 
 
+def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> None:
+    """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
+    system, status = problem.system, outcome.status
+    failed = status < 0 if isinstance(status, int) else bool(np.any(np.asarray(status) < 0))
+    looked = system.poles is not None or problem.letters is not None
+    if not problem.diagnosed or not (failed or looked) or not readable(outcome.y):
+        return
+    passed, plain = False, problem.letters is None
+    if problem.store is None and looked:
+        if np.any(np.asarray(outcome.status) >= 0):
+            passed = note_poles(outcome, integrator, problem, rows)
+        if plain:
+            warn_of_cancelling(outcome, problem)
+    if plain and (failed or passed):
+        note_singularities(outcome, integrator, problem, passed)
+
+
+def diagnose(
+    outcome: Outcome,
+    integrator: Integrator,
+    problem: Problem,
+    rows: ParameterRows | None,
+    action: str,
+    interrupted: bool,
+) -> None:
+    """Look at the outcome of a run: what it shows ends it, is added to its message, or is warned of.
+
+    These are poles that it passed, terms of H that cancel, when the solution becomes infinite, singularities over which
+    it leapt, functions that do not fit, a flow of another system, its domain, and steps that are too long.
+    """
+    system, y0 = problem.system, problem.y0
+    if not interrupted:
+        diagnose_piece(outcome, integrator, problem, rows)
+    values, between, status = readable(outcome.y), system.between_impulses, outcome.status
+    failed = status < 0 if isinstance(status, int) else bool(np.any(np.asarray(status) < 0))
+    held = values and problem.store is None and not failed
+    told = held and system.leaps and problem.letters is None and warn_of_leap(outcome, system, y0)
+    if values and system.functions_given:
+        told = system.check_functions_along(outcome.y) or told
+    if integrator.trained:
+        check_system_along(outcome, integrator, between, y0)
+    if values and action != "ignore":
+        check_domain(outcome, integrator, between, action)
+        if held and between is system:
+            warn_of_loss(outcome, integrator, system, y0)
+    if held and not told and problem.diagnosed and rows is None:
+        warn_of_long_steps(outcome, integrator, problem)
+
+
 class Passage(NamedTuple):
     """The times between which a trajectory passed a pole, its name, "" of a start, and True if no solution does."""
 
@@ -56,9 +108,7 @@ class Passage(NamedTuple):
     certain: bool
 
 
-def note_poles(
-    outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None, stacklevel: int
-) -> bool:
+def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None) -> bool:
     """End a run where it passed a place at which H is infinite or no number; warn where it may have."""
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
@@ -104,17 +154,16 @@ def note_poles(
     likely = [row for row in found if row not in certain]
     if likely:
         passage, which = found[likely[0]], _which(problem, likely, values)
-        warnings.warn(
+        warn(
             f"H{which} changed for good between t = {passage.begin:.10g} and {passage.end:.10g}, where a step leapt "
             f"over a place at which it is infinite, {passage.place}: the run means nothing after that. "
             f"{_remedy(integrator, problem)}.",
             RuntimeWarning,
-            stacklevel=stacklevel + 1,
         )
     return bool(certain)
 
 
-def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> None:
+def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
     """Warn, once for a system, of a run about a value of q or p near which terms of H cancel until digits are lost."""
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
     if poles is None or not poles.cancelling or poles in _TOLD:
@@ -134,12 +183,11 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem, stacklevel: int) -> N
         if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, visited) > LOST_DIGITS:
             continue
         _TOLD.add(poles)
-        warnings.warn(
+        warn(
             f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in "
             "many digits, and at it no number. Write them by sinc, which is sin(x)/x without that, or near it by their "
             "series, in a Piecewise.",
             RuntimeWarning,
-            stacklevel=stacklevel + 1,
         )
         return
 
@@ -156,7 +204,7 @@ def _look(
     if T is not None:
         V = H - T
         scale = np.fmax.reduce(np.maximum(np.abs(T), np.abs(V - V[0])), axis=0)
-        odd |= ~(np.abs(H - H[0]) <= (OFF if system.conservative and system.autonomous else FAR_OFF) * scale)
+        odd |= ~(np.abs(H - H[0]) <= (OFF if system.keeps_energy else FAR_OFF) * scale)
     odd[0] = ~np.isfinite(H[0])
     return (odd, scale) if odd.any() else None
 
@@ -249,15 +297,10 @@ def _end(
     ).reshape(failed_at.shape)
     outcome.stats["failed_at"], outcome.finite = failed_at, False
     outcome.status = np.where(after.any(0) | ~np.isnan(failed_at), -1, outcome.status)
-    if is_tensor(outcome.y):
-        import torch
-
-        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], np.nan)
-    else:
-        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)
+    outcome.y = masked(outcome.y, after[..., None], np.nan)
 
 
-def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem, stacklevel: int) -> None:
+def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
     """Warn of what a method doubts, and where the energy of a run with fixed steps is off by `TOO_LONG` of its size.
 
     H is evaluated at the start and a few outputs, of large systems at one for every 200 steps. Its size is the largest
@@ -265,17 +308,22 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     """
     system, n = problem.system, len(outcome.t)
     if isinstance(integrator, FixedStep) and (doubt := integrator.doubt(system)):
-        warnings.warn(doubt, RuntimeWarning, stacklevel=stacklevel + 1)
-    if not isinstance(integrator, FixedStep) or integrator.trained or not (system.conservative and system.autonomous):
+        warn(doubt, RuntimeWarning)
+    if not isinstance(integrator, FixedStep) or integrator.trained or not system.keeps_energy:
         return
     seen = LOOKED_AT if system.ndof <= LARGE else min(LOOKED_AT, outcome.stats.get("n_steps", 0) // 200)
     if not n or not seen or problem.letters is not None or problem.system.between_impulses is not problem.system:
         return
     width = 2 * system.ndof
     every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
-    y = np.concatenate(
-        [to_numpy(part).reshape(-1, math.prod(problem.y0.shape[:-1]), width) for part in (problem.y0, outcome.y[every])]
-    )[:, :LOOKED_AT].astype(float)
+    if problem.y0.ndim == 1 and n <= seen and outcome.t[0] == problem.t0:
+        y = to_numpy(outcome.y)
+    else:
+        parts = (
+            to_numpy(part).reshape(-1, math.prod(problem.y0.shape[:-1]), width)
+            for part in (problem.y0, outcome.y[every])
+        )
+        y = np.concatenate([*parts])[:, :LOOKED_AT].astype(float)
     with np.errstate(all="ignore"):
         try:
             H = np.asarray(system.hamiltonian(y))
@@ -287,11 +335,10 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
             return
         off = np.max(change / np.maximum(size, system.energy_scale or 0.0), initial=0.0)
     if TOO_LONG < off < np.inf:
-        warnings.warn(
+        warn(
             f"`dt` {integrator.step_length(system):g} is too long for method {integrator.label!r}: the energy of the "
             f"run is off by {100 * off:.2g} %. Take a shorter step, or tol=1e-6, for which it is chosen.",
             RuntimeWarning,
-            stacklevel=stacklevel + 1,
         )
 
 
@@ -299,7 +346,7 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
     """Add to the message, and as `stats["blow_up_time"]`, when the solution of a failed run becomes infinite."""
     if not told:
         _note_last_state(outcome, problem)
-    if not (problem.system.conservative and problem.system.autonomous):  # a state of the solution is told by its energy
+    if not problem.system.keeps_energy:  # a state of the solution is told by its energy
         return
     y0 = to_numpy(problem.y0)
     failed = (np.atleast_1d(np.asarray(outcome.status)) < 0).reshape(-1)
@@ -451,3 +498,19 @@ def _end_of_solution(
 def _sizes(y: Array, d: int) -> np.ndarray:
     """The largest |q_i| and |p_i|: (n, 2)."""
     return np.stack([np.abs(y[..., :d]).max(-1), np.abs(y[..., d:]).max(-1)], axis=-1)
+
+
+def note_singularities_of_rows(sol: Any, integrator: Integrator, problem: Problem, rows: ParameterRows) -> None:
+    """Note when solutions with parameters of their own become infinite, of the first `MOST_DIAGNOSED` that fail."""
+    status = np.asarray(sol.status)
+    failed, times = np.flatnonzero(status < 0), np.full(len(status), np.nan)
+    for few, system, _ in itertools.islice(rows.taken(failed).distinct(), MOST_DIAGNOSED):
+        i = failed[few]
+        stats = {name: value[i] if isinstance(value, np.ndarray) else value for name, value in sol.stats.items()}
+        outcome = Outcome(sol.t, np.moveaxis(sol.y[i], -1, 0), status[i], "", stats)
+        note_singularities(outcome, integrator, replace(problem, system=system, y0=problem.y0[i], letters=None))
+        times[i] = outcome.stats.get("blow_up_time", np.nan)
+    if np.isfinite(times).any():
+        sol.stats["blow_up_time"] = times
+        first = int(np.argmax(np.isfinite(times)))
+        sol.message += f" A solution itself becomes infinite, at about t = {times[first]:.10g}: end `t_span` before."

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sympflow.arrays import Array, finite_states, has_values, is_tensor, one_lane, readable, to_numpy
+from sympflow.arguments import warn
+from sympflow.arrays import Array, finite_states, has_values, masked, one_lane, readable, to_numpy
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Outcome
@@ -68,16 +67,16 @@ def check_system_along(outcome: Outcome, integrator: Integrator, system: Hamilto
     )
 
 
-def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stacklevel: int) -> None:
-    """Warn of a run that leapt over a singularity of V, and goes on with any energy."""
+def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool:
+    """Warn, and return True, of a run that leapt over a singularity of V, and goes on with any energy."""
     n, width = len(outcome.t), 2 * system.ndof
     if not n:
-        return
+        return False
     starts, outputs = to_numpy(y0).reshape(-1, width), to_numpy(outcome.y).reshape(n, -1, width)
     n_steps = int(np.max(outcome.stats.get("n_steps", 0)))
     leapt = system.leapt(starts, outputs[-1], n_steps)
     if not leapt.any():
-        return
+        return False
     row = int(np.argmax(leapt))
     start, along = starts[row], outputs[:, row]
     first = int(np.argmax(system.leapt(np.broadcast_to(start, along.shape), along, n_steps)))
@@ -85,21 +84,19 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array, stackle
         H0, H = system.hamiltonian(np.stack([start, along[-1]]))
     after = f"between t = {outcome.t[first - 1]:.10g} and {outcome.t[first]:.10g}" if first else "by the first output"
     which = "" if len(leapt) == 1 else f" of trajectory {row}, the first of {leapt.sum()},"
-    warnings.warn(
+    warn(
         f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run means nothing after "
         f"that. It was lost {after}, where {system.leap(along[first], start)}.",
         RuntimeWarning,
-        stacklevel=stacklevel + 1,
     )
+    return True
 
 
-def warn_of_loss(
-    outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array, stacklevel: int
-) -> None:
+def warn_of_loss(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, y0: Array) -> None:
     """Warn of a run that left the domain of its flow and lost far more energy than the flow does inside."""
     flow = integrator.known_flow(system)
     certificate = None if flow is None else flow.certified
-    if certificate is None or "domain_exit" not in outcome.stats or not (system.conservative and system.autonomous):
+    if certificate is None or "domain_exit" not in outcome.stats or not system.keeps_energy:
         return
     width = 2 * system.ndof
     with np.errstate(all="ignore"):
@@ -111,12 +108,11 @@ def warn_of_loss(
         return
     row = int(np.argmax(np.where(off, error, 0)))
     which = "" if len(off) == 1 else f" of trajectory {row}, the worst of {off.sum()} such,"
-    warnings.warn(
+    warn(
         f"The state left the domain of the flow at t = {outcome.stats['domain_exit']:.10g}, and the relative energy "
         f"error{which} is {error[row]:.2g} at t = {outcome.t[-1]:.10g}: the flow is certified for {held:.2g} inside. "
         "Start inside its `domain`, train a flow on one that holds these states, or take a scheme such as 'srkn11b'.",
         RuntimeWarning,
-        stacklevel=stacklevel + 1,
     )
 
 
@@ -188,9 +184,4 @@ def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
     outside = np.logical_or.accumulate(~inside, axis=0)
     after = np.concatenate([np.zeros_like(outside[:1]), outside[:-1]])  # the exit itself is kept
     outcome.status = np.where(outside[-1], -1, outcome.status)
-    if is_tensor(outcome.y):
-        import torch
-
-        outcome.y = outcome.y.masked_fill(torch.as_tensor(after, device=outcome.y.device)[..., None], math.nan)
-    else:
-        outcome.y = np.where(after[..., None], np.nan, outcome.y).astype(outcome.y.dtype)
+    outcome.y = masked(outcome.y, after[..., None], np.nan)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from sympflow.arguments import warn
 from sympflow.arrays import Array, to_numpy
 from sympflow.events import EventSearch
 from sympflow.integrators.contract import Interrupted, Outcome, Problem
+from sympflow.integrators.interpolants import DenseOutput
 
 if TYPE_CHECKING:
     from sympflow.storage.runs import RunStore
@@ -38,19 +39,14 @@ class Extension(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Projected:
+class Projected(DenseOutput):
     """The dense output of a run on an extended phase space."""
 
-    sol: Callable[[Any], Array]
-    extension: Extension
+    def __init__(self, sol: Any, extension: Extension) -> None:
+        self.sol, self.extension, self.t_min, self.t_max = sol, extension, sol.t_min, sol.t_max
 
-    def __call__(self, t: Any) -> Array:
-        x = self.sol(t)
-        if np.ndim(t) == 0:
-            return self.extension.project(x)
-        from_last = np.moveaxis if isinstance(x, np.ndarray) else type(x).movedim
-        return from_last(self.extension.project(from_last(x, -2, -1)), -1, -2)
+    def states(self, times: np.ndarray) -> Array:
+        return self.extension.project(self.sol.states(times))
 
 
 def extended_run(run: Callable[[Problem], Outcome], extension: Extension, problem: Problem) -> Outcome:
@@ -119,10 +115,9 @@ def _ratio(found: np.ndarray) -> np.ndarray:
 
 
 def _warn(extension: Extension, apart: float, which: str) -> None:
-    warnings.warn(
+    warn(
         f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g} of the size of "
         "the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which the "
         "copies are bound.",
         RuntimeWarning,
-        stacklevel=5,
     )

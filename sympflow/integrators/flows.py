@@ -20,7 +20,7 @@ from sympflow.flow.shipped import choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
-from sympflow.integrators.base import FixedStep, GridRun, KernelStepper, OwnStepper, Stepper, compiled_loops, rollout
+from sympflow.integrators.base import FixedStep
 from sympflow.integrators.clocks import (
     ARRAYS_ONLY,
     LogarithmicClock,
@@ -31,7 +31,9 @@ from sympflow.integrators.clocks import (
 )
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
-from sympflow.kernels.carry import Carry
+from sympflow.integrators.grid_runs import GridRun
+from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
+from sympflow.kernels.protocol import Carry
 
 if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do without
     from sympflow.flow.flow_map import FlowMap
@@ -80,7 +82,7 @@ def flow_named(name: str) -> FlowMap:
 
 
 @dataclass(frozen=True)
-class FlowIntegrator(OwnStepper):
+class FlowIntegrator(FixedStep):
     """A trained flow ψ̄ on the grid t0 + k·Δt: ψ_t = ψ̄_{t−kΔt} ∘ (ψ̄_Δt)^k, and its exact inverse for t < t0.
 
     Parameters
@@ -181,18 +183,16 @@ class FlowIntegrator(OwnStepper):
         """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
         return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend)
 
-    def own_stepper(self, problem: Problem) -> FlowStepper | CompiledFlowStepper:
+    def own_stepper(self, problem: Problem) -> Stepper:
         flow = self.known_flow(problem.system)
         flow.warn_of_drive(problem.t0, problem.t1 - problem.t0)
         if type(problem.y0) is np.ndarray and problem.y0.dtype == np.float64:  # a kernel tells the flow's own dtype
             kernel = self.kernel(flow, problem)
             if kernel is not None:
-                return CompiledFlowStepper(self, problem, flow, kernel)
+                return Stepper(self, problem, FlowSteps(flow, True), kernel)
         flow = self.flow_like(problem.system, problem.y0)
         kernel = self.kernel(flow, problem)
-        if kernel is not None:
-            return CompiledFlowStepper(self, problem, flow, kernel)
-        return FlowStepper(self, problem, flow)
+        return Stepper(self, problem, FlowSteps(flow, kernel is not None), kernel)
 
     def run(self, problem: Problem) -> Outcome:
         run = GridRun(self, problem)
@@ -217,14 +217,13 @@ class FlowIntegrator(OwnStepper):
         return super().tangent(system, t, y, h)
 
 
-class FlowStepper(Stepper):
-    """A run of a flow by tensor operations: of ψ̄ = χ ∘ K ∘ χ⁻¹ the χ between two steps cancel."""
+class FlowSteps(ArraySteps):
+    """Steps of a flow by tensor operations: of ψ̄ = χ ∘ K ∘ χ⁻¹ the χ between two steps cancel."""
 
-    takes_carry = True
-
-    def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: FlowMap) -> None:
-        super().__init__(integrator, problem)
-        self.flow, self.backend = flow, "torch"
+    def __init__(self, flow: KnownFlow, compiled: bool) -> None:
+        self.flow: Any = flow
+        self.stages = flow.iterated if compiled else 0
+        self.backend = "compiled" if compiled else "torch"
 
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
@@ -254,11 +253,14 @@ class FlowStepper(Stepper):
         start = int(np.count_nonzero(save == 0))  # `save` is sorted
         return torch.cat([y0.expand(start, *y0.shape), states[start:]]), finite
 
-    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         return _apply(self.flow, y, h, t)
 
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        return self.flow.evaluations(n_steps, n_saved, n_extra, self.backend)
+    def check_lengths(self, h: Any) -> None:
+        self.flow.warn_of_times(h)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
 
 
 def _as_tensors(carry: Carry | None) -> Carry | None:
@@ -268,28 +270,6 @@ def _as_tensors(carry: Carry | None) -> Carry | None:
     import torch
 
     return Carry(carry.steps, torch.from_numpy(carry.running))
-
-
-class CompiledFlowStepper(KernelStepper):
-    """A run of a flow in its compiled loops."""
-
-    def __init__(self, integrator: FlowIntegrator, problem: Problem, flow: KnownFlow, kernel: Any) -> None:
-        super().__init__(integrator, problem, kernel)
-        self.flow = flow
-
-    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        self.flow.warn_of_times(h)
-        return super().shorter(y, h, t)
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        if self.flow.iterated:
-            n = self.iterations * self.flow.iterated
-            return {"force_evaluations": n, "hessian_evaluations": n}
-        counted = self.kernel.evaluations(n_steps, n_saved, n_extra)
-        return self.flow.evaluations(n_steps, n_saved, n_extra, "compiled") if counted is None else counted
-
-    def more_stats(self) -> dict[str, int]:
-        return {"newton_iterations": self.iterations} if self.iterations else {}
 
 
 def _apply(function: Any, y: Array, h: float | Array, t: Any) -> Array:

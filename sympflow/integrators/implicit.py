@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,12 +13,9 @@ from sympflow.hamiltonian import collocation
 from sympflow.hamiltonian.collocation import Tableau, gauss_legendre
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
-from sympflow.integrators.base import KernelStepper, OwnStepper, Problem, Stepper, compiled_loops, rollout
-from sympflow.integrators.contract import Failure
-
-if TYPE_CHECKING:
-    from sympflow.kernels.carry import Carry
-    from sympflow.kernels.one_steps import OneStepKernel
+from sympflow.integrators.base import FixedStep
+from sympflow.integrators.contract import Failure, Problem
+from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops
 
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
 _SYMPLECTIC = (
@@ -28,7 +24,7 @@ _SYMPLECTIC = (
 
 
 @dataclass(frozen=True)
-class Gauss(OwnStepper):
+class Gauss(FixedStep):
     """A Gauss method: K_i = h f(y + Σ_j a_ij K_j), y + Σ_i b_i K_i, solved by Newton's method with the Hessian of H.
 
     The coefficients satisfy b_i a_ij + b_j a_ji = b_i b_j without rounding, for which from three stages on the unknowns
@@ -89,7 +85,7 @@ class Gauss(OwnStepper):
         sizes = collocation.variable_sizes(y, K, 0 * M[..., 0])
         dK = collocation.solved(M, slopes, sizes).reshape(*y.shape[:-1], s, n, n)
         J = np.eye(n, dtype=y.dtype) + np.einsum("i,...ijk->...jk", b, dK)
-        if system.friction is not None:
+        if system.friction:
             E = collocation.decays(system, h[..., 0])
             J = np.concatenate([J[..., : n // 2, :], E @ J[..., n // 2 :, :]], axis=-2)
         return collocation.advanced(system, self.tableau, y, K, h), J
@@ -102,8 +98,8 @@ class Gauss(OwnStepper):
     def takes_driving(self) -> bool:
         return True
 
-    def own_stepper(self, problem: Problem) -> CompiledGauss | ArrayGauss:
-        from sympflow.kernels.implicit_loops import implicit_kernel
+    def own_stepper(self, problem: Problem) -> Stepper:
+        from sympflow.kernels.newton import implicit_kernel
 
         told: list[str] = []
         kernel = compiled_loops(
@@ -113,48 +109,17 @@ class Gauss(OwnStepper):
             self.compensated,
             told=told,
         )
-        return ArrayGauss(self, problem, told) if kernel is None else CompiledGauss(self, problem, kernel)
+        return Stepper(self, problem, GaussSteps(problem.system, self.tableau), kernel, told)
 
 
-class _Counts:
-    """Counts of a run of a Gauss method: Newton's iterations, each with the force and the Hessian at every stage."""
+class GaussSteps(ArraySteps):
+    """Steps of a Gauss method by array operations, with the count of Newton's iterations."""
 
-    gauss: Gauss
-    iterations: int
-    counts_itself: ClassVar[bool] = True
+    def __init__(self, system: HamiltonianSystem, tableau: Tableau) -> None:
+        self.system, self.tableau, self.stages = system, tableau, len(tableau[1])
 
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        n = self.iterations * len(self.gauss.tableau[1])
-        return {"force_evaluations": n, "hessian_evaluations": n}
-
-    def more_stats(self) -> dict[str, int]:
-        return {"newton_iterations": self.iterations}
-
-
-class CompiledGauss(_Counts, KernelStepper):
-    """A run of a Gauss method in compiled loops."""
-
-    def __init__(self, gauss: Gauss, problem: Problem, kernel: OneStepKernel) -> None:
-        super().__init__(gauss, problem, kernel)
-        self.gauss = gauss
-
-
-class ArrayGauss(_Counts, Stepper):
-    """A run of a Gauss method by array operations."""
-
-    takes_carry = True
-
-    def __init__(self, gauss: Gauss, problem: Problem, told: Sequence[str]) -> None:
-        super().__init__(gauss, problem, told)
-        self.gauss, self.iterations = gauss, 0
-
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
-    ) -> tuple[Array, np.ndarray]:
-        return rollout(lambda k, y: self.shorter(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
-
-    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        y_next, iterations = collocation.counted_step(self.system, self.gauss.tableau, t, y, h)
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        y_next, iterations = collocation.counted_step(self.system, self.tableau, t, y, h)
         self.iterations += iterations
         return y_next
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, join
+from sympflow.arrays import Array, concatenate
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Interrupted, Outcome, Problem, finished, interrupted
 from sympflow.integrators.grid import EPS, jumps_met
@@ -134,7 +134,7 @@ def _merged(found: list[Outcome], problem: Problem, pieces: list[Any], impulses:
     if impulses < len(found) - 1:
         stats["jumps"] = len(found) - 1 - impulses
     message = finished(problem) if not np.any(np.asarray(status)) else (failed or last).message
-    outcome = Outcome(t, join([each.y for each in found]), status, message, stats)
+    outcome = Outcome(t, concatenate([each.y for each in found], 0), status, message, stats)
     if problem.dense_output:
         solutions = tuple(each.sol for each in found if each.sol is not None)
         outcome.sol = Pieces(solutions, np.array(pieces)[: len(found), :2])

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sympflow.arguments import check_not_followed
-from sympflow.arrays import Array, is_tensor, stack
-
-if TYPE_CHECKING:
-    from sympflow.integrators.contract import Outcome
+from sympflow.arrays import Array, is_tensor, last, moveaxis, stack
 
 Time = Any
 """A number, or a tensor that carries a gradient."""
@@ -56,7 +53,26 @@ def hermite(t0: Time, t1: Time, y0: Array, y1: Array, f0: Array, f1: Array) -> I
     return Interpolant(t0, t1, [y0, h * f0, 3 * rise - h * (2 * f0 + f1), h * (f0 + f1) - 2 * rise])
 
 
-class Piecewise:
+class DenseOutput:
+    """A solution as a function of t: a number gives (..., 2d), times (n,) give (..., 2d, n)."""
+
+    t_min: float
+    t_max: float
+
+    def states(self, times: np.ndarray) -> Array:
+        """Return the states at times (n,) in the interval: (n, ..., 2d)."""
+        raise NotImplementedError
+
+    def __call__(self, t: float | np.ndarray) -> Array:
+        check_not_followed("t", t)
+        times = np.atleast_1d(np.asarray(t, dtype=float))
+        if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
+            raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
+        y = last(self.states(times))
+        return y[..., 0] if np.ndim(t) == 0 else y
+
+
+class Piecewise(DenseOutput):
     """Dense output: the interpolants of consecutive steps, up to t_end."""
 
     def __init__(self, steps: Sequence[Interpolant], y0: Array, t0: float, t_end: float) -> None:
@@ -77,14 +93,9 @@ class Piecewise:
             return stack(begin, axis=0), stack(length, axis=0), coefficients
         return np.array(begin), np.array(length), coefficients
 
-    def __call__(self, t: float | np.ndarray) -> Array:
-        check_not_followed("t", t)
-        times = np.atleast_1d(np.asarray(t, dtype=float))
-        if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
-            raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
+    def states(self, times: np.ndarray) -> Array:
         if not self.steps:
-            y = stack([self.y0] * len(times)) if times.size else self.y0[..., None][..., :0]
-            return y[..., 0] if np.ndim(t) == 0 else y
+            return stack([self.y0] * len(times), axis=0) if times.size else self.y0[None][:0]
         begin, length, coefficients = self._stacked
         k: Any = np.minimum(np.searchsorted(self.sign * self._ends, self.sign * times), len(self.steps) - 1)
         x: Any
@@ -95,32 +106,40 @@ class Piecewise:
             x = ((torch.as_tensor(times) - torch.as_tensor(begin)[k]) / torch.as_tensor(length)[k]).to(self.y0)
         else:
             x = ((times - begin[k]) / length[k]).astype(self.y0.dtype)
-        y = _horner([c[k] for c in coefficients], x.reshape(-1, *[1] * self.y0.ndim))
-        y = y.movedim(0, -1) if is_tensor(y) else np.moveaxis(y, 0, -1)
-        return y[..., 0] if np.ndim(t) == 0 else y
+        return _horner([c[k] for c in coefficients], x.reshape(-1, *[1] * self.y0.ndim))
 
 
-class Batch:
-    """The dense output of a batch that was run in parts: (..., 2d) or (..., 2d, n), NaN after the end of a part."""
+class Constant(DenseOutput):
+    """The dense output of an interval of length zero."""
 
-    def __init__(self, sources: Sequence[tuple[Outcome, int]], batch: tuple[int, ...], t_span: tuple[float, float]):
-        self.batch, (self.t_min, self.t_max) = batch, sorted(t_span)
-        self.places = [(run.sol, j) for run, j in sources]
+    def __init__(self, y: Array, t: float) -> None:
+        self.y, self.t_min, self.t_max = y, t, t
 
-    def __call__(self, t: float | np.ndarray) -> Array:
-        check_not_followed("t", t)
-        times = np.atleast_1d(np.asarray(t, dtype=float))
-        if times.size and not (times.min() >= self.t_min and times.max() <= self.t_max):
-            raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
+    def states(self, times: np.ndarray) -> Array:
+        return stack([self.y] * len(times), axis=0) if times.size else self.y[None][:0]
+
+
+class Batch(DenseOutput):
+    """The dense output of a batch by those of its parts, NaN after the end of a part.
+
+    Parameters
+    ----------
+    places : sequence of (callable, int)
+        For each trajectory the dense output of the run that it was part of, and its place there.
+    """
+
+    def __init__(self, places: Sequence[tuple[Any, int]], batch: tuple[int, ...], t_span: tuple[float, float]):
+        self.batch, (self.t_min, self.t_max), self.places = batch, sorted(t_span), places
+
+    def states(self, times: np.ndarray) -> Array:
         found: dict[int, Array] = {}
         for sol, _ in self.places:
-            if isinstance(sol, Piecewise) and id(sol) not in found:
+            if id(sol) not in found:
                 y = sol(times.clip(sol.t_min, sol.t_max))
                 y[..., np.flatnonzero((times < sol.t_min) | (times > sol.t_max))] = np.nan
                 found[id(sol)] = y.reshape(-1, *y.shape[-2:])
         y = stack([found[id(sol)][j] for sol, j in self.places], axis=0)
-        y = y.reshape(*self.batch, *y.shape[1:])
-        return y[..., 0] if np.ndim(t) == 0 else y
+        return moveaxis(y.reshape(*self.batch, *y.shape[1:]), -1, 0)
 
 
 def _horner(coefficients: Sequence[Array], x: Any) -> Array:

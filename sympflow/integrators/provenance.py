@@ -42,8 +42,8 @@ def provenance(
     if system.symbols is not None and len(system.symbols.text) <= LONGEST_EXPRESSION:
         told["hamiltonian"] = str(system.symbols.written[0])
     told["params"] = json.dumps(_plain(system.params))
-    if system.friction is not None:
-        told["damping"] = json.dumps(system.friction.damping.tolist())
+    if system.damping is not None:
+        told["damping"] = json.dumps(system.damping.tolist())
     told |= {"method": name_of(integrator), "options": option_text(integrator), "t_span": list(t_span)}
     step = integrator.step_length(system)
     if step is not None:

@@ -300,7 +300,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
     own_words = system.conservative or _speaks_for_itself(mro, "takes_friction")
     if system.external_force is not None and not (integrator.takes_forces and own_words):
         system.check_conservative(f"which method {integrator.name!r} does not take", "")
-    if system.friction is not None and not (integrator.takes_friction and own_words):
+    if system.friction and not (integrator.takes_friction and own_words):
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",
@@ -331,7 +331,7 @@ def _speaks_for_itself(bases: tuple[type, ...], what: str) -> bool:
     return not any(_DUTIES & vars(base).keys() for base in others)
 
 
-_DUTIES = {"step", "inverse", "tangent", "run", "steps", "stepper", "own_stepper", "rollout", "substep", "composed"}
+_DUTIES = {"step", "inverse", "tangent", "run", "steps", "stepper", "own_stepper", "rollout", "composed"}
 """The methods of an integrator that make its steps."""
 
 

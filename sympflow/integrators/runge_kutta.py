@@ -33,7 +33,7 @@ class ExplicitStep(ByVectorField):
 
     def step(self, system: HamiltonianSystem, t: Any, y: Array, h: float | Array) -> Array:
         """One step without error control."""
-        times, h = self._stage_times(system, t, h), per_state(h, y)
+        times, h = self._stage_times(t, h), per_state(h, y)
         K: list[Array] = []
         for row, at in zip(self.A, times, strict=False):
             K.append(system.vector_field(y + h * weighted(row, K) if K else y, at))
@@ -54,17 +54,14 @@ class ExplicitStep(ByVectorField):
 
         return getattr(explicit_loops, name)(system, *arguments)
 
-    def _stage_times(self, system: HamiltonianSystem, t: Any, h: Any) -> list[Any]:
-        """The times t + c_i h of the stages, of a driven system; None for each of another."""
-        rows = self.A[: len(self.B)]
-        if system.autonomous:
-            return [None] * len(rows)
-        return [stage_time(t, math.fsum(map(float, row)), h) for row in rows]
+    def _stage_times(self, t: Any, h: Any) -> list[Any]:
+        """The times t + c_i h of the stages."""
+        return [stage_time(t, math.fsum(map(float, row)), h) for row in self.A[: len(self.B)]]
 
     def tangent(self, system: HamiltonianSystem, t: Any, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian, the step length held fixed: each stage differentiated as it is executed."""
         y = to_numpy(y)
-        times, h = self._stage_times(system, t, np.asarray(h)), np.asarray(h, dtype=y.dtype)[..., None]
+        times, h = self._stage_times(t, np.asarray(h)), np.asarray(h, dtype=y.dtype)[..., None]
         if not system.has_hessian_vector:
             system.hessian(y, times[0])  # which says so, before anything large is made
         identity = np.eye(y.shape[-1], dtype=y.dtype)

@@ -21,6 +21,7 @@ from sympflow.integrators.base import Recorder
 from sympflow.integrators.contract import ENDED, FINISHED, Interrupted, Outcome, Problem, Steps, interrupted
 from sympflow.integrators.grid import MOST_OPEN_STEPS, Grid
 from sympflow.integrators.impulses import pieces_of
+from sympflow.integrators.interpolants import Batch, Constant
 from sympflow.integrators.runge_kutta import RungeKutta, hopeless
 
 MOST_STEPS = 10_000_000
@@ -133,7 +134,7 @@ class _Scipy(RungeKutta):
         status = np.array([run.status for run in runs]).reshape(batch)
         outcome = Outcome(t_eval, y.reshape(len(t_eval), *problem.y0.shape), status, message, stats)
         if problem.dense_output:
-            outcome.sol = _BatchSolution([run.sol for run in runs], batch)
+            outcome.sol = Batch([(run.sol, 0) for run in runs], batch, (problem.t0, problem.t1))
         return outcome
 
     def _run_one(self, problem: Problem, y0: np.ndarray, t_eval: np.ndarray | None) -> Outcome:
@@ -195,7 +196,7 @@ class _Scipy(RungeKutta):
         elif failure:
             stats["failed_at"] = float(reached)
         if problem.dense_output:
-            outcome.sol = OdeSolution(times, interpolants) if interpolants else _Constant(y0)
+            outcome.sol = OdeSolution(times, interpolants) if interpolants else Constant(y0, t0)
         if stopped:
             raise interrupted(outcome, float(reached))
         return outcome
@@ -260,27 +261,6 @@ class _Lazily:
 
     def __call__(self, t: float) -> np.ndarray:
         return self.output(t)
-
-
-class _Constant:
-    """Dense output of an interval of length zero."""
-
-    def __init__(self, y: np.ndarray) -> None:
-        self.y = y
-
-    def __call__(self, t: Any) -> np.ndarray:
-        return self.y if np.ndim(t) == 0 else np.repeat(self.y[:, None], len(t), axis=1)
-
-
-class _BatchSolution:
-    """The dense outputs of the trajectories of a batch, stacked: (..., 2d) or (..., 2d, n)."""
-
-    def __init__(self, solutions: list[Any], batch: tuple[int, ...]) -> None:
-        self.solutions, self.batch = solutions, batch
-
-    def __call__(self, t: Any) -> np.ndarray:
-        y = np.stack([sol(t) for sol in self.solutions])
-        return y.reshape(*self.batch, *y.shape[1:])
 
 
 @dataclass(frozen=True)

@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import copyreg
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, check_number
+from sympflow.arguments import check_flag, check_number, check_one_of
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
-from sympflow.integrators.base import FixedStep, KernelStepper, OwnStepper, Stepper, compiled_loops
+from sympflow.integrators.base import FixedStep
 from sympflow.integrators.clocks import ARRAYS_ONLY, LogarithmicClock, scale_of, transformed_system
 from sympflow.integrators.compositions import SPLITTINGS, Composition
-from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, differentiated, forward_tangent, in_blocks
+from sympflow.integrators.contract import (
+    Failure,
+    Outcome,
+    Problem,
+    Steps,
+    differentiated,
+    forward_tangent,
+    in_blocks,
+    start_of,
+)
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
+from sympflow.integrators.steppers import Stepper, compiled_loops
 from sympflow.schemes import CORRECTORS, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
-    from sympflow.kernels.carry import Carry
-    from sympflow.kernels.protocol import Kernel
     from sympflow.kernels.tangents import TangentKernel
 
 
@@ -121,7 +129,7 @@ class Kept:
 
 
 @dataclass(frozen=True, repr=False)
-class Splitting(OwnStepper):
+class Splitting(FixedStep):
     """A scheme, a table of numbers, composed of the exact flows of the parts of H.
 
     Parameters
@@ -203,8 +211,7 @@ class Splitting(OwnStepper):
         check_flag("compensated", self.compensated)
         for name, known in (("splitting", SPLITTINGS), ("clock", CLOCKS)):
             value = getattr(self, name)
-            if not isinstance(value, str) or value not in known:
-                raise ValueError(f"`{name}` must be one of {', '.join(map(repr, known))}; got {value!r}.")
+            check_one_of(name, value, known)
         if self.compensated and not SPLITTINGS[self.splitting].compensates:
             raise ValueError("`compensated` sums are for the splitting 'kinetic': leave it out.")
         if self.shift is not None:
@@ -305,8 +312,8 @@ class Splitting(OwnStepper):
 
     def takes_letters(self, problem: Problem) -> bool:
         composition = self.composed(problem.system)
-        asked = any(map(self.overrides, ("step", "rollout", "substep", "evaluations")))
-        if self.clock != "physical" or asked or not composition.takes_values:
+        asked = map(self.overrides, ("step", "rollout", "evaluations"))
+        if self.clock != "physical" or any(asked) or not composition.takes_values:
             return False
         kernel = compiled_loops(
             lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
@@ -324,14 +331,11 @@ class Splitting(OwnStepper):
             self.on_clock(system)
             return
         composition = self.composed(system)
-        if not system.autonomous:
-            composition.check_driving()
-        if system.friction is not None:
-            composition.check_friction(self.step_length(system))
-            if self.compensated:
-                raise ValueError(
-                    "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
-                )
+        composition.check_system(self.step_length(system))
+        if system.friction and self.compensated:
+            raise ValueError(
+                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
+            )
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
         return any(not END < c < 1 - END for c in self._force_times(system))
@@ -379,7 +383,7 @@ class Splitting(OwnStepper):
         for times, states, lengths in self.steps(system, t_span, y0):
             for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
                 at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
-                start = float(at.flat[0]) if system.autonomous else at
+                start = start_of(system, at)
                 yield at, length, partial(self.pushed, system, start, y, length.astype(y.dtype))
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
@@ -420,11 +424,9 @@ class Splitting(OwnStepper):
         kernel = compiled_loops(
             lambda: composition.kernel(compensated), problem.y0, problem.backend, compensated, told=told
         )
-        if kernel is None:
-            return ArrayComposition(self, problem, composition, told)
         if problem.letters is not None:
             kernel = kernel.varied(problem.letters)
-        return CompiledComposition(self, problem, composition, kernel)
+        return Stepper(self, problem, composition, kernel, told)
 
     def run(self, problem: Problem) -> Outcome:
         clock = self.on_clock(problem.system)
@@ -440,40 +442,6 @@ class Splitting(OwnStepper):
         composition = self.composed(system)
         for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
             yield times, composition.project(states), lengths
-
-
-class ArrayComposition(Stepper):
-    """A run of a composition by array operations."""
-
-    takes_carry = True
-
-    def __init__(
-        self, integrator: FixedStep, problem: Problem, composition: Composition, told: Sequence[str] = ()
-    ) -> None:
-        super().__init__(integrator, problem, told)
-        self.composition = composition
-
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
-    ) -> tuple[Array, np.ndarray]:
-        return self.composition.rollout(y0, h, n_steps, save, t0, carry)
-
-    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        return self.composition.step(y, h, t)
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        return self.composition.evaluations(n_steps, n_saved, n_extra, self.backend)
-
-
-class CompiledComposition(KernelStepper):
-    """A run of a composition in compiled loops."""
-
-    def __init__(self, integrator: FixedStep, problem: Problem, composition: Composition, kernel: Kernel) -> None:
-        super().__init__(integrator, problem, kernel)
-        self.composition = composition
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        return self.composition.evaluations(n_steps, n_saved, n_extra, "compiled")
 
 
 # classes of triples -------------------------------------------------------------------------------
@@ -518,8 +486,7 @@ def splitting_method(
     """
     table = checked_scheme(scheme_named(scheme) if isinstance(scheme, str) else scheme)
     for argument, value, known in (("splitting", splitting, SPLITTINGS), ("clock", clock, CLOCKS)):
-        if not isinstance(value, str) or value not in known:
-            raise ValueError(f"`{argument}` must be one of {', '.join(map(repr, known))}; got {value!r}.")
+        check_one_of(argument, value, known)
     if name is None:
         row = _row_of(table, splitting, clock)
         if row is not None:

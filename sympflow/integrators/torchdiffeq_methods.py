@@ -28,12 +28,13 @@ from sympflow.arrays import (
     transformed,
 )
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, KernelStepper, Recorder, Stepper, compiled_loops
+from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
 from sympflow.integrators.contract import ENDED, ByVectorField, Integrator, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
+from sympflow.integrators.steppers import Stepper, compiled_loops, rollout
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
 Visit = Callable[[Interpolant], bool]
@@ -253,7 +254,7 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
         stats,
     )
     if problem.dense_output:
-        outcome.sol = Batch(source, batch, (problem.t0, problem.t1))
+        outcome.sol = Batch([(run.sol, j) for run, j in source], batch, (problem.t0, problem.t1))
     return outcome
 
 
@@ -567,7 +568,7 @@ class FixedGrid(ExplicitStep, FixedStep):
     compiles: ClassVar[bool] = True
     tableau: ClassVar[Tableau]
 
-    def stepper(self, problem: Problem) -> Stepper:
+    def own_stepper(self, problem: Problem) -> Stepper:
         told: list[str] = []
         kernel = compiled_loops(
             lambda: self.compiled(problem.system, "explicit_kernel", self.tableau),
@@ -575,12 +576,15 @@ class FixedGrid(ExplicitStep, FixedStep):
             problem.backend,
             told=told,
         )
-        return Stepper(self, problem, told) if kernel is None else KernelStepper(self, problem, kernel)
+        return Stepper(self, problem, OwnSteps(self, problem), kernel, told)
 
     def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
         """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact."""
         if not readable(problem.y0):
-            return super().rollout(problem, h, n_steps, save)
+            states, finite = rollout(
+                lambda k, y: self.step(problem.system, problem.t0 + k * h, y, h), problem.y0, n_steps, save
+            )
+            return states, finite, "torch"
         import torch
         from torchdiffeq import odeint
 

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, full_of_nan, is_tensor, readable
+from sympflow.arrays import Array, concatenate, full_of_nan, is_tensor, readable
 from sympflow.integrators.contract import Problem
-from sympflow.kernels.carry import Carry
+from sympflow.integrators.steppers import Stepper
+from sympflow.kernels.protocol import Carry
 
 SECONDS = 0.2
 """The time that a window is to take."""
@@ -29,24 +30,7 @@ MOST_SAVED = 2**21
 """Numbers that a window saves, at most."""
 
 
-class Steps(Protocol):
-    """The steps of a run: see `base.Stepper`."""
-
-    compiled: bool
-
-    @property
-    def takes_carry(self) -> bool:
-        """True if `rollout` takes a carry."""
-        ...
-
-    def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
-    ) -> tuple[Array, np.ndarray]:
-        """States after the steps `save`, and the last finite step of each trajectory."""
-        ...
-
-
-def first_window(stepper: Steps, problem: Problem, n_steps: int, n_saved: int) -> int:
+def first_window(stepper: Stepper, problem: Problem, n_steps: int, n_saved: int) -> int:
     """Return the steps of the first window of a run of n_steps; 0 for a run in one piece."""
     if n_steps <= FEW_STEPS and problem.progress is None:
         return 0
@@ -83,7 +67,7 @@ class Pieces:
     """A run in pieces."""
 
     def __init__(
-        self, stepper: Steps, problem: Problem, h: float, carry: Carry, finite: np.ndarray | None = None
+        self, stepper: Stepper, problem: Problem, h: float, carry: Carry, finite: np.ndarray | None = None
     ) -> None:
         self.stepper, self.problem, self.h = stepper, problem, h
         self.carry, self.finite = carry, finite
@@ -128,8 +112,5 @@ class Saved:
         if self.whole is not None:
             self.whole[known:] = np.nan
             return self.whole[:n]
-        import torch
-
-        empty = self.y0[None][:0]
         unknown = [full_of_nan(self.y0)[None]] * (n - known)
-        return torch.cat([empty, *self.parts, *unknown])[:n]
+        return concatenate([self.y0[None][:0], *self.parts, *unknown], 0)[:n]

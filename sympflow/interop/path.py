@@ -15,10 +15,11 @@ from torch.autograd.function import once_differentiable
 
 from sympflow.arrays import differentiable, one_lane, readable, to_numpy, unfollowed, values_of_times
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Problem, rollout
+from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
+from sympflow.integrators.steppers import rollout
 
 MAX_EVENT_STEPS = 1_000_000
 _EPS = 4 * float(np.finfo(float).eps)

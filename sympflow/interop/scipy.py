@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copyreg
 import math
-import warnings
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,12 +11,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from scipy.integrate import DenseOutput, OdeSolver
 
-from sympflow.arguments import as_float
+from sympflow.arguments import as_float, warn
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FixedStep, Problem, Stepper
+from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid, no_event, open_end
 from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import check_applies, naming_plugin
+from sympflow.integrators.steppers import Stepper
 from sympflow.interop.matching import Comparison, fixed_step
 
 if TYPE_CHECKING:
@@ -127,10 +127,9 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         if extraneous:
             own = sorted(set(extraneous) & set(self.integrator.options()))
             remedy = f"leave them out; {', '.join(own)} is an option of as_scipy" if own else "leave them out"
-            warnings.warn(
+            warn(
                 f"The options {', '.join(sorted(extraneous))} have no effect on a fixed-step method: {remedy}.",
                 UserWarning,
-                stacklevel=3,
             )
         if not as_float(max_step) > 0:
             raise ValueError(f"`max_step` must be positive; got {max_step!r}.")
@@ -143,7 +142,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             system.check_times(t0, t_bound)
             told, _ = landings(self.integrator, system, t0, t_bound, able=False)
             if told:
-                warnings.warn(told, RuntimeWarning, stacklevel=4)
+                warn(told, RuntimeWarning)
         self._grid = Grid(t0, open_end(t0, t_bound, dt), dt)
         self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, self._grid.t1, self.y))
         self._parts = max(1, math.ceil(abs(self._grid.h) / max_step * (1 - 1e-12)))
@@ -264,7 +263,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
 
     def _shorter(self, h: float) -> np.ndarray:
         with naming_plugin(self.integrator), np.errstate(all="ignore"):
-            y = self._stepper.shorter_from(self._t_anchor, self._anchor, h)
+            y = self._stepper.shorter(self._anchor, h, self._t_anchor)
         self._counts.shorter += 1
         return y
 
@@ -316,6 +315,6 @@ class FlowOutput(DenseOutput):
         states[times == self.t] = self._y
         if moving.any():
             with naming_plugin(self._integrator), np.errstate(all="ignore"):
-                states[moving] = self._stepper.shorter_from(self._t_anchor, states[moving], h[moving])
+                states[moving] = self._stepper.shorter(states[moving], h[moving], self._t_anchor)
             self._counts.shorter += int(np.count_nonzero(moving))
         return states.T if t.ndim else states[0]

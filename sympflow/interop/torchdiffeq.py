@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import sys
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -19,7 +18,7 @@ import torch
 import torchdiffeq
 from torch import Tensor
 
-from sympflow.arguments import check_not_traced
+from sympflow.arguments import check_not_traced, warn
 from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed, unfollowed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
@@ -106,10 +105,9 @@ def _integrated(
 ) -> Any:
     """`odeint` by one of our methods, along a path."""
     if (rtol, atol) != (_RTOL, _ATOL):
-        warnings.warn(
+        warn(
             f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.",
             UserWarning,
-            stacklevel=3,
         )
     direction = _direction(t)
     integrator, system = _build(func, method, options)
@@ -265,11 +263,10 @@ def odeint_adjoint(
             "own steps: leave it out."
         )
     if not (adjoint_rtol is None and adjoint_atol is None and adjoint_options is None):
-        warnings.warn(
+        warn(
             f"`adjoint_rtol`, `adjoint_atol` and `adjoint_options` have no effect on the fixed-step method "
             f"{_name(method)!r}, whose gradients are exact: leave them out.",
             UserWarning,
-            stacklevel=2,
         )
     given = None if adjoint_params is None else tuple(adjoint_params)
     if given is None and isinstance(func, torch.nn.Module):
@@ -309,11 +306,10 @@ def register(method: str) -> None:
     fixed_step(method, {}, "torchdiffeq")
     table = _their_table()
     if method in table and not issubclass(table[method], _Solver):
-        warnings.warn(
+        warn(
             f"`method` {method!r} is torchdiffeq's own in this release, and stays so in its table: for ours call "
             "sympflow.interop.torchdiffeq.odeint.",
             UserWarning,
-            stacklevel=2,
         )
         return
     table[method] = type(f"{method.title()}Solver", (_Solver,), {"method": method})
@@ -399,10 +395,9 @@ def _announced(
     """torchdiffeq's `callback_step`, if `func` has it: called before each step with its time, state and length."""
     others = {name for name in _CALLBACKS if getattr(func, name, None) is not None}
     if others:
-        warnings.warn(
+        warn(
             f"Method {integrator.name!r} does not support the callbacks {sorted(others)}: only callback_step.",
             UserWarning,
-            stacklevel=4,
         )
     callback = getattr(func, "callback_step", None)
     if callback is None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.parts import ExactParts, Map
+from sympflow.hamiltonian.parts import ExactParts, SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
@@ -94,7 +94,7 @@ class PrimedFlowKernel(Kernel):
     def __init__(
         self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False, step: ArrayStep | None = None
     ) -> None:
-        if system.friction is not None and compensated:
+        if system.friction and compensated:
             raise ValueError(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
@@ -106,7 +106,7 @@ class PrimedFlowKernel(Kernel):
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated
-        self._step = None if system.friction is None else step
+        self._step = step if system.friction else None
         self._ranges = self._splitting.ranges(tables.level, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
@@ -222,11 +222,11 @@ def _stepped_by(step: ArrayStep, y: np.ndarray, h: np.ndarray, t: Any = 0.0) -> 
 class MapSource(Protocol):
     """The maps of a split flow, which do not change."""
 
-    def maps(self, t: float) -> Sequence[Map]:
+    def maps(self, t: float) -> Sequence[SubFlow]:
         """The maps of a step, for t < 0 those of the inverse; the same object for the same t."""
         ...
 
-    def coefficients(self, back: bool) -> Sequence[Map]:
+    def coefficients(self, back: bool) -> Sequence[SubFlow]:
         """The maps of all steps, or of their inverses: see `PartsLoops.step_by_coefficients`."""
         ...
 
@@ -347,7 +347,7 @@ class CollocatedFlowKernel(Kernel):
     saves_finite = False
 
     def __init__(self, system: HamiltonianSystem, tableau: Tableau, steps: int) -> None:
-        from sympflow.kernels.implicit_loops import implicit_kernel
+        from sympflow.kernels.newton import implicit_kernel
 
         self._kernel, self._steps = implicit_kernel(system, tableau), steps
 

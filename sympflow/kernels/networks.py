@@ -28,6 +28,7 @@ from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_state
 from sympflow.kernels.rollouts import Columns, Rollouts, aligned
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.threads import run_rows
+from sympflow.lazy import needed
 
 __all__ = ["MLPFlowKernel", "NetworkLayer"]
 
@@ -338,7 +339,7 @@ def _by_numba(function: Any) -> Any:
     except ImportError as error:
         raise ValueError(
             "`compiled`, with which the activation of the flow was registered, has branches or calls functions, which "
-            'Numba compiles: pip install "sympflow[numba]", or write it by operators.'
+            f"Numba compiles: {needed('numba', 'numba')}, or write it by operators."
         ) from error
 
     compiled = function if hasattr(function, "py_func") else njit(error_model="numpy")(function)

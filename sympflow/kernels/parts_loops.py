@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
-from sympflow.compiler.functions import fma, times
+from sympflow.compiler.functions import fma, is_zero, times
 from sympflow.compiler.program import Program, gradient
 from sympflow.hamiltonian.formulas import recorded
-from sympflow.hamiltonian.parts import LINEAR, ExactParts, Map, PartFunctions, shears
+from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlow, shears
 from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
@@ -41,7 +41,7 @@ MOST_OPERATIONS = 300  # of all kinds of columns
 SAME_TIME = 1e-12  # of a step: rounding of sums of weights
 KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
 
-Maps = Callable[[np.ndarray], Sequence[Map]]
+Maps = Callable[[np.ndarray], Sequence[SubFlow]]
 """The maps of a step of length h (...), their entries of that batch shape."""
 
 
@@ -248,7 +248,7 @@ def _combined(weights: Sequence[Any], values: Sequence[Any]) -> Any:
     """Σ weights_i values_i, without those that are 0."""
     total: Any = 0.0
     for w, x in zip(weights, values, strict=True):
-        if isinstance(w, float) and w == 0:
+        if is_zero(w):
             continue
         term = x if isinstance(w, float) and w == 1 else times(w, x)
         total = term if isinstance(total, float) else total + term
@@ -305,7 +305,7 @@ class PartsLoops:
         self.parts, self.driven = parts, parts.driven
         self._maps: dict[bool, PartMaps] = {False: PartMaps(parts, False)}
         self._codes: dict[tuple[bool, tuple[tuple[int, ...], ...]], PartsCode] = {}
-        self._tables: dict[int, tuple[Sequence[Map], _Table]] = {}
+        self._tables: dict[int, tuple[Sequence[SubFlow], _Table]] = {}
 
     def kernel(self, maps: Maps) -> PartsKernel:
         """The loops of one splitting, whose step of length h is `maps(h)`.
@@ -314,12 +314,12 @@ class PartsLoops:
         """
         return PartsKernel(self, maps)
 
-    def step_by_coefficients(self, sequence: Sequence[Map], dt: float, t: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def step_by_coefficients(self, sequence: Sequence[SubFlow], dt: float, t: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from each row of y (N, 2d), each of its own length t (N,) > 0, by maps that are functions of t.
 
         Parameters
         ----------
-        sequence : sequence of Map
+        sequence : sequence of SubFlow
             With coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
             are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
         """
@@ -340,10 +340,10 @@ class PartsLoops:
         maps = []
         for m in sequence:
             g = valued(m.gradient, 3) if has_gradient(m) else 0.0
-            maps.append(Map(m.part, valued(m.length, 1), g, None if m.filters is None else valued(m.filters, 0)))
+            maps.append(SubFlow(m.part, valued(m.length, 1), g, None if m.filters is None else valued(m.filters, 0)))
         return self.stepped(maps, y)
 
-    def stepped(self, sequence: Sequence[Map], y: np.ndarray, t: Any = 0.0, h: Any = 0.0) -> np.ndarray:
+    def stepped(self, sequence: Sequence[SubFlow], y: np.ndarray, t: Any = 0.0, h: Any = 0.0) -> np.ndarray:
         """The maps applied once to every row of `y` (N, 2d), their entries of its own, at the time t in steps h."""
         maps, start = self._of(sequence), self.modes(y)
         codes, entries = self.table(sequence, len(y), maps)
@@ -355,7 +355,7 @@ class PartsLoops:
         code.run(columns, batch, False)
         return self.states(batch.out[:, 0])
 
-    def step_modes(self, sequence: Sequence[Map], modes: np.ndarray) -> np.ndarray:
+    def step_modes(self, sequence: Sequence[SubFlow], modes: np.ndarray) -> np.ndarray:
         """The maps applied once to every row [X, Y] of `modes` (N, 2d), which stay modes."""
         maps, out = self._of(sequence), np.empty_like(modes)
         codes, entries = self.table(sequence, 1, maps)
@@ -394,7 +394,7 @@ class PartsLoops:
         center = np.concatenate([np.broadcast_to(self.parts.center, C.shape), np.zeros_like(C)])
         return center, np.concatenate([inverse, C]), np.concatenate([C, inverse])
 
-    def _of(self, sequence: Sequence[Map]) -> PartMaps:
+    def _of(self, sequence: Sequence[SubFlow]) -> PartMaps:
         """The code of maps with what these have."""
         if any(map(has_gradient, sequence)) and not self.parts.has_force_gradient:
             raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
@@ -415,7 +415,7 @@ class PartsLoops:
         bent = [WITH_GRADIENT + k for k in numbers if self.parts.has_force_gradient]
         return self._code(maps, [(k,) for k in (IDLE, *([LINEAR] if self.parts.linear else []), *numbers, *bent)])
 
-    def table(self, sequence: Sequence[Map], n: int, maps: PartMaps) -> tuple[np.ndarray, np.ndarray]:
+    def table(self, sequence: Sequence[SubFlow], n: int, maps: PartMaps) -> tuple[np.ndarray, np.ndarray]:
         """Codes (m,) and numbers (n, m, size), those of the time, of a driven system, still 0: see `timed`."""
         d, F = self.parts.ndof, self.parts.n_classes
         codes = np.array([*map(_code_of, sequence)], dtype=np.int64)
@@ -434,7 +434,7 @@ class PartsLoops:
                 raw[:, j, 2 : 2 + d] = self.parts.by_class(np.asarray(m.filters))
         return codes, maps.entries(codes, raw)
 
-    def timed(self, sequence: Sequence[Map], tables: np.ndarray, t: Any, h: Any) -> np.ndarray:
+    def timed(self, sequence: Sequence[SubFlow], tables: np.ndarray, t: Any, h: Any) -> np.ndarray:
         """Tables (..., m, W) of steps h (...) that begin at t (...): a copy with the times, if the system is driven."""
         if not self.driven:
             return tables
@@ -451,7 +451,7 @@ class PartsLoops:
         t, sigma, c, d = shears(kinds, linear.rates[linear.representatives], s)
         return np.stack([t, sigma, c, d, c - t * d, d + t * c], axis=-1)
 
-    def run_table(self, sequence: Sequence[Map], h: float = 0.0, t0: float = 0.0) -> tuple[PartsCode, Columns]:
+    def run_table(self, sequence: Sequence[SubFlow], h: float = 0.0, t0: float = 0.0) -> tuple[PartsCode, Columns]:
         """The code and the columns of a run, of steps h from t0 on."""
         known = self._tables.get(id(sequence))
         if known is None or known[0] is not sequence:
@@ -464,11 +464,11 @@ class PartsLoops:
         columns, kinds = table.code.columns(table.groups, self.timed(table.maps, table.entries, t0, h))
         return table.code, (columns[0], kinds)
 
-    def _table(self, sequence: Sequence[Map]) -> _Table:
+    def _table(self, sequence: Sequence[SubFlow]) -> _Table:
         """The columns [opening, inner …, link, closing], of as many maps each as the code may hold."""
         of, first, last = self._of(sequence), sequence[0], sequence[-1]
         merged = self._merged(last, first) if len(sequence) > 1 else None
-        rest, link, closing = [*sequence[1:]], first, Map(IDLE, 0.0)
+        rest, link, closing = [*sequence[1:]], first, SubFlow(IDLE, 0.0)
         if merged is not None:  # what closes a step is executed after it
             rest, link, closing = [*sequence[1:-1]], merged, replace(last, at=last.at - 1)
         for size in range(len(rest) + 1, 0, -1):
@@ -483,7 +483,7 @@ class PartsLoops:
         columns, numbers = code.columns(codes, entries)
         return _Table(code, maps, codes, entries, (columns[0], numbers))
 
-    def _merged(self, last: Map, first: Map) -> Map | None:
+    def _merged(self, last: SubFlow, first: SubFlow) -> SubFlow | None:
         """The last map of a step and the first of the next, if they are one: of parts that move at the same time."""
         together = not self.parts.timed(last.part) or abs(last.at - 1 - first.at) < SAME_TIME
         merged = merge(last, first) if together else None
@@ -494,7 +494,7 @@ class _Table(NamedTuple):
     """The tables of a run of a sequence of maps: the maps in groups, their numbers, and the columns of these."""
 
     code: PartsCode
-    maps: list[Map]
+    maps: list[SubFlow]
     groups: list[tuple[int, ...]]
     entries: np.ndarray
     columns: Columns
@@ -519,22 +519,22 @@ class PartsKernel(Kernel):
         return Steps(self.loops.stepped(self.maps(lengths), y, t, lengths))
 
 
-def _code_of(m: Map) -> int:
+def _code_of(m: SubFlow) -> int:
     return m.part + WITH_GRADIENT * has_gradient(m)
 
 
-def has_gradient(m: Map) -> bool:
+def has_gradient(m: SubFlow) -> bool:
     plain = isinstance(m.gradient, float) and m.gradient == 0.0
     return not plain and bool(np.any(m.gradient))
 
 
-def merge(one: Map, other: Map) -> Map | None:
+def merge(one: SubFlow, other: SubFlow) -> SubFlow | None:
     """The map that is `other` after `one`, if it is one map."""
     if one.part != other.part:
         return None
     if one.part != LINEAR and not _same(one.filters, other.filters):
         return None
-    return Map(one.part, one.length + other.length, one.gradient + other.gradient, one.filters)
+    return SubFlow(one.part, one.length + other.length, one.gradient + other.gradient, one.filters)
 
 
 def _same(a: Any, b: Any) -> bool:

@@ -3,17 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.kernels.carry import Carry
 from sympflow.kernels.threads import NEVER, given, run_rows
 
 __all__ = ["Batch", "Carry", "Kernel", "Run", "Steps", "Task", "run_states"]
 
 NOTHING: Any = np.empty(0)
+
+
+@dataclass
+class Carry:
+    """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
+
+    The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
+    state is another one, and compensated sums have errors. A run that is given a carry goes on from it, and leaves in
+    it where it ends; one that is interrupted leaves it as it was.
+
+    Attributes
+    ----------
+    steps : int
+        The steps made so far; 0 before a run.
+    running : ndarray of shape (K,), or (N, K) of a batch; or None
+        The kernel's own; None before a run. NaN where a trajectory has ended. Of array operations the states (..., K),
+        an array or a tensor.
+    spare : ndarray, optional
+        An array that the next running state of a batch may be written into, where it fits: that before the last one.
+    """
+
+    steps: int = 0
+    running: Any = None
+    spare: Any = None
+
+    def advance(self, steps: int, running: Any) -> None:
+        """Take the place after so many steps."""
+        self.steps, self.running = steps, running
 
 
 class Task(NamedTuple):
@@ -236,19 +264,4 @@ class Kernel:
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int] | None:
         """Count the evaluations of the system's functions in a run; None where the method itself counts them."""
-        return None
-
-    def reach_times(
-        self,
-        h: float,
-        y0: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        numbers: tuple[float, ...] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The states of rows of `y0` (N, 2d) at elapsed times, of steps that are equal in another time.
-
-        See `elapsed_times.reach_times`. None where there is no such pass.
-        """
         return None

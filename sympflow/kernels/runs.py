@@ -23,6 +23,7 @@ __all__ = [
     "Memory",
     "Numbers",
     "Room",
+    "assign",
     "finished",
     "groups",
     "map_function",
@@ -335,16 +336,16 @@ class _Registers:
 
     def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
         state = self._end if end else self._state
-        _set(state, column(j, [x.value for x in state], step))
+        assign(state, column(j, [x.value for x in state], step))
 
     def look(self, look: Callable[[Any], Any]) -> None:
-        _set(self._state, look([x.value for x in self._state]))
+        assign(self._state, look([x.value for x in self._state]))
 
     def remember(self) -> None:
         self._before = [x.value for x in self._state]
 
     def restore(self) -> None:
-        _set(self._state, self._before)
+        assign(self._state, self._before)
 
     def end(self) -> None:
         self._end = [self.code.variable(x.value) for x in self._state]
@@ -643,7 +644,7 @@ class ColumnStage:
         return self._stage(values, self.numbers(j, chunk), self.kind(j), step)
 
 
-def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:
+def assign(variables: Sequence[Variable], values: Sequence[Value]) -> None:
     for variable, value in zip(variables, values, strict=True):
         variable.value = value
 

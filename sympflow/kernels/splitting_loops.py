@@ -143,11 +143,11 @@ class SplittingLoops:
                 from sympflow.kernels.pairs import few, pair_code
 
                 self._written, self.values = few(system.local)
-                self._compile = partial(pair_code, system.local, system.friction is not None)
+                self._compile = partial(pair_code, system.local, bool(system.friction))
             else:
                 from sympflow.kernels.lattices import lattice_code
 
-                self._compile = partial(lattice_code, system.local, system.friction is not None)
+                self._compile = partial(lattice_code, system.local, bool(system.friction))
             self._has_force_gradient = system.quadratic_kinetic
             self.traced = self._written is not None
         else:
@@ -258,7 +258,7 @@ class SplittingLoops:
         """The kicks and drifts of a level, of a system whose loops are made of traced numbers."""
         from sympflow.kernels.splittings import Splitting
 
-        ndim, driving = None if self.friction is None else self.friction.damping.ndim, self._driving
+        ndim, driving = self.friction.kind, self._driving
         if self._written is not None:
             return self._written(level, monomials, compensated, ndim)
         symbols = self._form.parametric if parametric and driving is None and not ranges else self._form
@@ -298,7 +298,7 @@ class SplittingLoops:
         With friction the maps of the drifts are among them, of numbers for one h. Those of a driven system read the
         time too, that of a step h that begins at t0. Those of `varied` loops have room for the values of any kicks.
         """
-        if self.friction is not None:
+        if self.friction:
             table = _with_friction(table, self.friction)
         if self.driven:
             return table.timed_rows(self.values, h, t0)
@@ -402,7 +402,7 @@ class VariedKernel(SplittingKernel):
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         lengths, times = (np.broadcast_to(np.asarray(x, dtype=np.float64), len(y)) for x in (h, t))
         scheme, rows = self.scheme, self._with_values(y)
-        if self.loops.friction is not None:
+        if self.loops.friction:
             return Steps(self._damped_step(lengths, rows, times))
         table, given = step_table(scheme), (scheme.monomials, times)
         return Steps(self.loops.step_rows(table, lengths, lengths, rows, *given, varied=True))
@@ -444,7 +444,6 @@ class DampedKernel(SplittingKernel):
         self._step = step
 
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
-        assert self.loops.friction is not None
         table = _damped_stages(self.scheme, h, self.loops.friction)
         if self.loops.driven:
             return table.timed_rows(self.loops.values, h, t0)

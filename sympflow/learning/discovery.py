@@ -31,6 +31,7 @@ from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
 from sympflow.learning.trajectories import Run, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
+from sympflow.show.style import new_figure
 from sympflow.training.session import Session
 
 if TYPE_CHECKING:
@@ -163,11 +164,7 @@ class Discovery:
 
     def figure(self) -> Figure:
         """The path of models: the residual over the noise against the number of terms."""
-        try:
-            from matplotlib.figure import Figure
-        except ImportError as error:
-            raise ImportError('Figures need matplotlib: pip install "sympflow[plot]".') from error
-        figure = Figure(figsize=(6.4, 3.6), layout="constrained", facecolor="white")
+        figure = new_figure(6.4, 3.6)
         ax = figure.add_subplot()
         counts = [len(model.terms) for model in self.path]
         ax.plot(counts, [model.residual for model in self.path], "o-", color="#0072B2", label="fitted trajectories")

@@ -49,7 +49,7 @@ from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
 from sympflow.training.starts import suited_step
 from sympflow.training.trainer import train
-from sympflow.workers import Crew
+from sympflow.workers import WorkerPool
 
 HELD_OUT = 0.2  # of the trajectories
 TIME_BUDGET = 60.0  # seconds
@@ -184,7 +184,7 @@ def learn(
     dt = plain(dt)
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
-    session = Session(checkpoint, resume, plain(time_budget), progress, callback, Crew(workers))
+    session = Session(checkpoint, resume, plain(time_budget), progress, callback, WorkerPool(workers))
     smooth = smoothed(data)
     rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
     seen = smooth.sigma if data.n_points >= ROUGH else None
@@ -201,7 +201,7 @@ def learn(
     search = Search(_cut(data, rate), folds, said, setting, seed, identity=identity, whole=data)
     if resume is not None:
         search.resume(resume)
-    with session.interruption, session.crew:
+    with session.interruption, session.pool:
         search.run(chosen, session)
         search.diagnose(session)
         flow = search.flow(dt, name, session)
@@ -282,7 +282,7 @@ def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
     if not isinstance(known, HamiltonianSystem):
         raise TypeError(f"`known` must be a HamiltonianSystem, a part of H; got {known!r}.")
     symbols = known.symbols
-    if symbols is None or known.ndof != d or not known.autonomous or known.friction is not None:
+    if symbols is None or known.ndof != d or not known.autonomous or known.friction:
         raise ValueError(
             f"`known` must be a symbolic system of {d} degrees of freedom that depends on no time and has no friction: "
             "define it by HamiltonianSystem.from_sympy."
@@ -854,7 +854,7 @@ class Search:
         flow.figures = {**flow.figures, **self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
         self._check_flow(flow)
         flow.history = self.history
-        damping = None if system.friction is None else system.friction.damping.tolist()
+        damping = None if system.damping is None else system.damping.tolist()
         flow.recipe = {**flow.recipe, "learned": {**self._learned, "damping": damping}}
         flow.take_learned(system)
         return flow
@@ -945,7 +945,7 @@ class Search:
     @staticmethod
     def _energy(flow: FlowMap, states: np.ndarray) -> np.ndarray:
         """𝓗 of the flow at states (n, 2d), averaged over [0, Δt]; with friction H."""
-        if flow.system is not None and flow.system.friction is not None:  # the maps of a damped flow have no 𝓗
+        if flow.system is not None and flow.system.friction:  # the maps of a damped flow have no 𝓗
             return flow.system.hamiltonian(states)
         x = torch.as_tensor(states)
         times = flow.dt * np.arange(OVER_TIMES) / (OVER_TIMES - 1)

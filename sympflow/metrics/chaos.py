@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import as_float, check_counts, check_t_eval, floats
+from sympflow.arguments import as_float, check_counts, check_one_of, check_t_eval, floats
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import compiled_loops
 from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
+from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.show.cards import Card, Shown, numbers
 from sympflow.systems.given import given_system
@@ -310,8 +310,7 @@ def indicator(
     """An indicator of checked orbits, by so many vectors and a kind of their spread; that of growth is 0."""
     integrator, system = orbits.integrator, orbits.system
     check_followed(orbits)
-    if not isinstance(backend, str) or backend not in BACKENDS:
-        raise ValueError(f"`backend` must be one of {', '.join(map(repr, BACKENDS))}; got {backend!r}.")
+    check_one_of("backend", backend, BACKENDS)
     t0, t1 = orbits.t_span
     times = np.empty(0) if t_eval is None else check_t_eval(t_eval, t0, t1)
     scale = weights(system)

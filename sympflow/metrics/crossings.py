@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.base import FINISHED, FixedStep, Integrator, Problem
+from sympflow.integrators.base import FixedStep, Integrator, Problem
+from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.registry import naming_plugin
 from sympflow.solver import solve
@@ -159,7 +160,7 @@ class _Search:
             piece = Problem(self.system, float(t[0]), float(t[-1]) + step, y[0])
             stepper = self.integrator.stepper(piece)
             states, _ = stepper.rollout(y[0], step, n, np.arange(n + 1), float(t[0]))
-            end = states[-1] if step == grid.h else stepper.shorter_from(float(t[0]), y[0], step)
+            end = states[-1] if step == grid.h else stepper.shorter(y[0], step, float(t[0]))
         return np.asarray(end)
 
     def search(self, t: np.ndarray, y: np.ndarray, h: np.ndarray, y_end: np.ndarray) -> None:
@@ -195,7 +196,7 @@ class _Search:
         self.found.append((np.nonzero(crossed)[1], t + h * high, self._step(t, y, h * high)))
 
     def _step(self, t: np.ndarray, y: np.ndarray, h: np.ndarray) -> np.ndarray:
-        return self.integrator.step(self.system, 0.0 if self.system.autonomous else t, y, h)  # type: ignore[arg-type]
+        return self.integrator.step(self.system, t, y, h)  # type: ignore[arg-type]
 
     def _located(self, width: int, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The crossings that were found, by trajectory and along the run."""

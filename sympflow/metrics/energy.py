@@ -38,7 +38,7 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
         If `sol` is not a Solution.
     """
     check_solution(sol)
-    return energy_change(sol, relative, stacklevel=3)
+    return energy_change(sol, relative)
 
 
 def energy_scale(sol: Solution) -> np.ndarray:

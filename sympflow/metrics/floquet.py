@@ -12,20 +12,20 @@ References
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import real_number
+from sympflow.arguments import check_positive, real_number, warn
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import build, check_applies
 from sympflow.metrics.crossings import dividing_step
-from sympflow.solver import check_y0, solve
+from sympflow.solver import solve
 from sympflow.systems.given import given_system
 
 GROWS = 1e-5
@@ -124,8 +124,7 @@ def floquet_multipliers(
     T = system.period if period is None else period
     if T is None:
         raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
-    if not real_number(T) or not 0 < T < math.inf:
-        raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+    check_positive("period", T)
     if not real_number(t0) or not math.isfinite(t0):
         raise ValueError(f"`t0` must be a finite number; got {t0!r}.")
     if is_tensor(y0):
@@ -154,11 +153,10 @@ def floquet_multipliers(
     scale = weights(system)
     sizes = [float(np.abs(scale * y).max()) for y in (start, system.y0) if y is not None]
     if not np.linalg.norm(scale * (to_numpy(end) - start)) <= CLOSED * (max(sizes) or 1.0):
-        warnings.warn(
+        warn(
             f"The orbit is not periodic: after {T:g} it is {mismatch:.3g} from `y0`. Take a state of a periodic orbit, "
             "its period, or a smaller `dt`.",
             RuntimeWarning,
-            stacklevel=2,
         )
     M = np.eye(len(start))
     for _, _, jacobians in integrator.executed(system, t_span, start):
@@ -168,11 +166,10 @@ def floquet_multipliers(
     found = found[np.argsort(-np.abs(found), kind="stable")].astype(complex)
     pairing = _pairing(system, scale[:, None] * M / scale, float(T))
     if pairing > UNPAIRED:
-        warnings.warn(
+        warn(
             f"The multipliers are not in pairs, to {pairing:.2g}: steps of {integrator.name!r} are too long for "
             "deviations from the orbit. Use a splitting method such as 'kahan_li8', or a smaller `dt`.",
             RuntimeWarning,
-            stacklevel=2,
         )
     return FloquetMultipliers(found, M, float(T), mismatch, pairing)
 
@@ -180,8 +177,8 @@ def floquet_multipliers(
 def _pairing(system: HamiltonianSystem, M: np.ndarray, T: float) -> float:
     """The defect of the form that M keeps, or shrinks: see `FloquetMultipliers`."""
     friction = system.friction
-    if system.external_force is not None or (friction is not None and not friction.isotropic):
+    if system.external_force is not None or not friction.isotropic:
         return math.nan
-    rate, d = 0.0 if friction is None else friction.largest, system.ndof
+    rate, d = friction.largest, system.ndof
     J = np.block([[np.zeros((d, d)), np.eye(d)], [-np.eye(d), np.zeros((d, d))]])
     return float(np.linalg.norm(M.T @ J @ M - math.exp(-rate * T) * J, 2) / np.linalg.norm(M, 2) ** 2)

@@ -13,8 +13,8 @@ from sympflow.arrays import is_tensor
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.choosing import integrator_for
 from sympflow.integrators.contract import Integrator
+from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import check_applies
-from sympflow.solver import check_y0
 from sympflow.systems.given import given_system
 
 

@@ -63,7 +63,7 @@ def reference(
         Accuracy that is enough.
     """
     y0 = to_numpy(y0).astype(float)
-    if not (system.conservative and system.autonomous):
+    if not system.keeps_energy:
         return _dop853(system, t_span, y0, t, target)
     exact = _linear_flow(system, t - t_span[0], y0)
     if exact is not None:

@@ -7,14 +7,13 @@ hundred steps. The Jacobian of the whole run is never formed: on a chaotic orbit
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_counts
+from sympflow.arguments import check_counts, warn
 from sympflow.arrays import jvp, to_numpy
 from sympflow.hamiltonian.scales import MOST_DENSE, natural_scale
 from sympflow.metrics.energy import failed
@@ -78,11 +77,10 @@ def volume_error(sol: Solution, over_time: bool = False) -> np.floating | np.nda
     if first_fold is not None:
         k, time, sign_there, is_finite = first_fold
         what = "not finite" if not is_finite else "zero" if sign_there == 0 else "negative"
-        warnings.warn(
+        warn(
             f"The determinant of step {k + 1}, from t = {time:.9g}, is {what}: the volume error is infinite. "
             "Reduce `dt`, or take a method that preserves volume.",
             RuntimeWarning,
-            stacklevel=2,
         )
     if not over_time:
         return np.where(lost, np.inf, total)[()]
@@ -250,14 +248,14 @@ def conformal_defect(sol: Solution, relative: bool = False, scale: ArrayLike | N
     if sol.system.external_force is not None:
         sol.system.check_conservative("by which its flow is not conformally symplectic", "")
     friction = sol.system.friction
-    if friction is not None and not friction.isotropic:
+    if not friction.isotropic:
         raise ValueError(
             f"`sol` is of {sol.system.name!r}, whose momenta have different rates of friction: its flow is not "
             "conformally symplectic. Use sympflow.reference_error(sol)."
         )
     if sol.varied:
         return gathered(sol, lambda part: conformal_defect(part, relative, scale))
-    return _form_defect(sol, 0.0 if friction is None else friction.largest, relative, scale)
+    return _form_defect(sol, friction.largest, relative, scale)
 
 
 def _form_defect(sol: Solution, rate: float, relative: bool, scale: ArrayLike | None) -> np.floating | np.ndarray:
@@ -349,10 +347,9 @@ def loop_area_error(sol: Solution) -> np.ndarray:
     spectrum = np.abs(np.fft.rfft(loops, axis=-2))[..., 1:, :]
     tail = spectrum[..., 2 * spectrum.shape[-2] // 3 :, :].max((-2, -1))
     if (tail > 1e-3 * spectrum.max((-2, -1))).any():
-        warnings.warn(
+        warn(
             f"The loop of {y0.shape[-2]} points has become too stretched to be resolved: its area is uncertain. "
             "Start from more points.",
             RuntimeWarning,
-            stacklevel=2,
         )
     return loop_area(loops) / np.asarray(start)[..., None] - 1

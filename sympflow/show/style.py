@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.arguments import naming_path, writable
+from sympflow.lazy import needed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +40,7 @@ def new_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError('Figures need matplotlib: pip install "sympflow[plot]".') from error
+        raise ImportError(f"Figures need matplotlib: {needed('matplotlib', 'plot')}.") from error
     return Figure(figsize=(width, height), layout="constrained", facecolor="white")
 
 

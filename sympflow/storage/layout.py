@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sympflow.lazy import needed
+
 if TYPE_CHECKING:
     import pandas
     import xarray
@@ -70,7 +72,7 @@ def imported(library: str, what: str) -> Any:
     try:
         return import_module(library)
     except ImportError as error:
-        raise ImportError(f'{what} needs {library}: pip install "sympflow[data]".') from error
+        raise ImportError(f"{what} needs {library}: {needed(library, 'data')}.") from error
 
 
 # tables --------------------------------------------------------------------------------------------------------------

@@ -15,13 +15,14 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import check_counts, check_dt, check_t_eval, check_t_span
 from sympflow.hamiltonian.system import HamiltonianSystem, parameters_text
 from sympflow.integrators.base import FixedStep, Integrator
+from sympflow.integrators.problems import check_y0
 from sympflow.metrics.accuracy import check_problem, states_of
 from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.energy_balance import jumps_in_time
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
-from sympflow.solver import check_y0, solve
+from sympflow.solver import solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import (
     Attempt,
@@ -170,7 +171,7 @@ def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
     if system.conservative:
         energy = ("energy", "drift") if system.autonomous else () if jumps_in_time(system) else ("balance",)
         return ("error", *energy, "volume", "symplecticity")
-    shrinks_evenly = system.external_force is None and system.friction is not None and system.friction.isotropic
+    shrinks_evenly = system.external_force is None and system.friction and system.friction.isotropic
     return ("error", "conformal") if shrinks_evenly else ("error",)
 
 

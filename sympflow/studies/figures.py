@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from sympflow.arguments import check_one_of
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -84,8 +85,7 @@ def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
     ImportError
         Without matplotlib.
     """
-    if kind not in KINDS:
-        raise ValueError(f"`kind` must be one of {', '.join(map(repr, KINDS))}; got {kind!r}.")
+    check_one_of("kind", kind, KINDS)
     if kind == "overview":
         return portrait(comparison) if _drawable(comparison) == ("portrait",) else overview([comparison])
     if kind not in _drawable(comparison):
@@ -392,8 +392,7 @@ def precision_figure(rows: Sequence[Row], heading: str, measure: str = "energy_e
     ValueError
         For another measure than "energy_error", "balance_error" or "error".
     """
-    if measure not in MEASURES:
-        raise ValueError(f"`measure` must be one of {', '.join(map(repr, MEASURES))}; got {measure!r}.")
+    check_one_of("measure", measure, MEASURES)
     sizes = sorted({row.trajectories for row in rows})
     figure = new_figure(9.6, 0.8 + 3.9 * len(sizes))
     axes = figure.subplots(len(sizes), 2, squeeze=False, sharex=False)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_counts
+from sympflow.arguments import check_counts, check_positive
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
@@ -213,8 +213,7 @@ def _checked_period(system: HamiltonianSystem, period: float | None, plane: list
             raise ValueError(
                 f"`period` and `{plane[0]}` ask for two kinds of section, after each period and in a plane: give one."
             )
-        if not (_is_number(period) and 0 < period < math.inf):
-            raise ValueError(f"`period` must be positive and finite; got {period!r}.")
+        check_positive("period", period)
         return float(period)
     if plane or system.autonomous:
         return None

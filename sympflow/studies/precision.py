@@ -17,13 +17,14 @@ from sympflow.arguments import check_counts, check_t_span, positive_numbers
 from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
+from sympflow.integrators.problems import check_y0
 from sympflow.metrics.energy import failed
 from sympflow.metrics.energy_balance import jumps_in_time
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.show.style import saved
 from sympflow.solution import Solution
-from sympflow.solver import check_y0, solve
+from sympflow.solver import solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, shown_compile_time, tolerance_of
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table

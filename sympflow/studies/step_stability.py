@@ -19,12 +19,13 @@ from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
+from sympflow.integrators.problems import check_y0
 from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.linear_stability import LinearStability, SmallOscillations, of_method, small_oscillations
 from sympflow.metrics.symplectic import symplecticity_defect, volume_error
 from sympflow.show.style import saved
 from sympflow.solution import Solution
-from sympflow.solver import check_y0, solve
+from sympflow.solver import solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Metric, Row, candidates
 from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 
 import numpy as np
 
+from sympflow.arguments import check_positive
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.domain import Ball, Box, Tube
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -41,8 +41,7 @@ def fput(omega: float = 50.0, m: int = 3) -> HamiltonianSystem:
     ----------
     .. [1] E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., Springer 2006, I.5.1.
     """
-    if not (isinstance(omega, int | float) and 0 < omega < math.inf):
-        raise ValueError(f"`omega` must be positive and finite; got {omega!r}.")
+    check_positive("omega", omega)
     whole = not isinstance(m, bool) and isinstance(m, int | float | np.integer) and 1 <= m <= SPRINGS and int(m) == m
     if not whole:
         raise ValueError(f"`m` must be a positive integer, at most {SPRINGS}, the number of stiff springs; got {m!r}.")

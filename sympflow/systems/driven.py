@@ -7,6 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from sympflow.arguments import check_positive
 from sympflow.hamiltonian.domain import Box
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -294,8 +295,7 @@ def _not_zero(name: str, value: float) -> float:
 
 
 def _positive(name: str, value: float) -> float:
-    if not (_is_number(value) and 0 < value < 1e100):
-        raise ValueError(f"`{name}` must be positive and finite; got {value!r}.")
+    check_positive(name, value, most=1e100)
     return value
 
 

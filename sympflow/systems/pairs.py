@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.lazy import needed
+
 OPTIONS = {"error_model": "numpy", "fastmath": {"contract"}}
 
 
@@ -35,7 +37,7 @@ def pair_functions(pair: Callable[..., Any], strength: np.ndarray, dim: int) -> 
         from numba import njit
     except ImportError as error:
         raise ImportError(
-            '`pair` must be a Numba function, for which Numba is needed: pip install "sympflow[numba]", or give the '
+            f"`pair` must be a Numba function, for which Numba is needed: {needed('numba', 'numba')}, or give the "
             "potential of a pair to HamiltonianSystem.pairs."
         ) from error
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from sympflow.arguments import check_positive
 from sympflow.arrays import Array
 from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -139,8 +140,7 @@ def pendulum_separatrix(energy: float = 2.0) -> HamiltonianSystem:
     ----------
     .. [1] V. I. Arnold, "Mathematical Methods of Classical Mechanics", 2nd ed., Springer 1989, § 4.
     """
-    if not (isinstance(energy, int | float) and 0 < energy < math.inf):
-        raise ValueError(f"`energy` must be positive and finite; got {energy!r}.")
+    check_positive("energy", energy)
     p = math.sqrt(5.0)
     return HamiltonianSystem.from_sympy(
         _H,
@@ -171,8 +171,7 @@ def double_well(energy: float = 0.25) -> HamiltonianSystem:
     .. [1] J. Guckenheimer, P. Holmes, "Nonlinear Oscillations, Dynamical Systems, and Bifurcations of Vector Fields",
        Springer 1983, 2.2 and 4.5 (Duffing's equation).
     """
-    if not (isinstance(energy, int | float) and 0 < energy < math.inf):
-        raise ValueError(f"`energy` must be positive and finite; got {energy!r}.")
+    check_positive("energy", energy)
     q, p = math.sqrt(1 + math.sqrt(2)), 1.0
     return HamiltonianSystem.from_sympy(
         "p**2/2 + (q**2 - 1)**2/4",
@@ -237,8 +236,7 @@ def henon_heiles_escape(energy: float = 0.245) -> HamiltonianSystem:
 
     The domain is the bounded well below 1/6, as for `henon_heiles`.
     """
-    if not (isinstance(energy, int | float) and 0 < energy < math.inf):
-        raise ValueError(f"`energy` must be positive and finite; got {energy!r}.")
+    check_positive("energy", energy)
     return _scene("henon_heiles_escape", [0.0, 0.0, 0.0, math.sqrt(2 * energy)])
 
 
@@ -334,8 +332,7 @@ def nonseparable(amplitude: float = 3.0) -> HamiltonianSystem:
     .. [1] M. Tao, "Explicit symplectic approximation of nonseparable Hamiltonians: algorithm and long time
        performance", Phys. Rev. E 94 (2016) 043303.
     """
-    if not (isinstance(amplitude, int | float) and 0 < amplitude < math.inf):
-        raise ValueError(f"`amplitude` must be positive and finite; got {amplitude!r}.")
+    check_positive("amplitude", amplitude)
     widest = 1.1 * amplitude  # of q and of p
     return HamiltonianSystem.from_sympy(
         "(q**2 + 1)*(p**2 + 1)/2",

@@ -9,7 +9,6 @@ import os
 import sys
 import tomllib
 from collections.abc import Callable
-from copy import copy
 from functools import cache, wraps
 from pathlib import Path
 from types import ModuleType
@@ -17,7 +16,8 @@ from typing import Any
 
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
 from sympflow.hamiltonian.lattice_states import LatticeStates
-from sympflow.hamiltonian.system import UNNAMED, HamiltonianSystem
+from sympflow.hamiltonian.scene import UNNAMED
+from sympflow.hamiltonian.system import HamiltonianSystem
 
 DOMAINS: dict[str, tuple[str, ...]] = {
     "Ball": ("center", "radius"),
@@ -152,10 +152,8 @@ def _answering(function: Callable[..., Any], name: str, file: Path) -> Callable[
 
 def _named(system: HamiltonianSystem, name: str) -> HamiltonianSystem:
     """The system, by the name that it has in its file where it has none of its own."""
-    if system.name != UNNAMED:
-        return system
-    system = copy(system)
-    system.name = name
+    if system.name == UNNAMED:
+        system.name = name
     return system
 
 

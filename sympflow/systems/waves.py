@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import check_positive
 from sympflow.hamiltonian.domain import Box
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -427,8 +428,7 @@ def _is_number(value: object) -> bool:
 
 
 def _positive(name: str, value: float) -> float:
-    if not (_is_number(value) and 0 < value < 1e100):
-        raise ValueError(f"`{name}` must be positive and finite; got {value!r}.")
+    check_positive(name, value, most=1e100)
     return float(value)
 
 

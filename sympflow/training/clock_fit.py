@@ -15,6 +15,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from sympflow.flow.clocked import ClockedFlow
+from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
@@ -29,18 +30,15 @@ NEWTON_STEPS = 5  # to the nearest point of an orbit
 FRACTIONAL_TIMES = 50
 
 
-def train_clock(system: HamiltonianSystem, fit: ClockedFit | None = None) -> ClockedFlow:
-    """A flow with a trained clock for a separable system with a domain, with its record."""
-    fit = ClockedFit() if fit is None else fit
+def train_clock(system: HamiltonianSystem, fit: ClockedFit, domain: Domain) -> ClockedFlow:
+    """A flow with a trained clock for a separable system, with its record."""
     dt, points, label_times, seed = 1.0 if fit.dt is None else fit.dt, fit.points or 1, fit.label_times, fit.seed
     scheme, terms = fit.scheme, fit.terms
-    if system.domain is None:
-        raise ValueError(f"`system` {system.name!r} has no domain to sample: give it one.")
     started, cpu = time.perf_counter(), time.process_time()
     shift = default_shift(system)
     transformed = time_transformed(system, shift)
     flow = ClockedFlow(transformed.ndof, scheme, terms, dt * time_scale(system, shift), transformed)
-    x = lifted(system, states(system.domain, points, seed, Stream.RESIDUAL), shift)
+    x = lifted(system, states(domain, points, seed, Stream.RESIDUAL), shift)
     s = np.repeat(flow.dt * np.arange(1, label_times + 1) / label_times, len(x))
     late = _lateness(flow, system, np.tile(x, (label_times, 1)), s)[1]
     B = np.tile(x[:, -1], label_times)
@@ -58,10 +56,10 @@ def train_clock(system: HamiltonianSystem, fit: ClockedFit | None = None) -> Clo
             "system": system.name,
             "shift": shift,
             "fingerprint": list(system.fingerprint),
-            "identity": Identity.of(system, system.domain).to_dict(),
+            "identity": Identity.of(system, domain).to_dict(),
         },
     }
-    flow.figures = {"step": dt, **clock_errors(flow, system, seed)}
+    flow.figures = {"step": dt, **clock_errors(flow, system, domain, seed)}
     flow.figures["training_seconds"] = round(time.perf_counter() - started, 3)
     flow.figures["training_cpu_seconds"] = round(time.process_time() - cpu, 3)
     return flow
@@ -90,11 +88,12 @@ def _lateness(
     return end, t - held
 
 
-def clock_errors(flow: ClockedFlow, system: HamiltonianSystem, seed: int, points: int = 100) -> dict[str, float]:
+def clock_errors(
+    flow: ClockedFlow, system: HamiltonianSystem, domain: Domain, seed: int, points: int = 100
+) -> dict[str, float]:
     """‖[q, p] of ψ̄_s(x) − φ_t(x)‖, t the time that ψ̄_s(x) holds: at Δ, and its mean over fractional steps."""
-    assert system.domain is not None
     shift = flow.recipe["transforms"]["shift"]
-    x = lifted(system, states(system.domain, points, seed, Stream.REFERENCE), shift)
+    x = lifted(system, states(domain, points, seed, Stream.REFERENCE), shift)
     kernel = flow.kernel_for(flow.system)  # type: ignore[arg-type]
     differences = []
     for s in flow.dt * np.append((np.arange(FRACTIONAL_TIMES) + 0.5) / FRACTIONAL_TIMES, 1.0):

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import plain
+from sympflow.arguments import plain, real_number
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
@@ -42,13 +42,10 @@ WEIGHTS = ("residual_weight", "matching_weight", "label_weight")
 # checks ---------------------------------------------------------------------------------------------------------
 
 
-def is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
 def check_counts(**values: Any) -> None:
     """Positive integers, or None where a choice is left open."""
-    for name, value in values.items():
+    for name, given in values.items():
+        value = plain(given)
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
             raise ValueError(f"`{name}` must be a positive integer; got {value!r}: give 1 or more, or leave it out.")
 
@@ -56,14 +53,14 @@ def check_counts(**values: Any) -> None:
 def check_positive(**values: Any) -> None:
     """Positive finite numbers, or None where a choice is left open."""
     for name, value in values.items():
-        if value is not None and not (is_number(value) and 0 < value < math.inf):
+        if value is not None and not (real_number(value) and 0 < value < math.inf):
             raise ValueError(f"`{name}` must be positive and finite; got {value!r}: leave it out for the default.")
 
 
 def check_weights(**weights: Any) -> None:
     """Weights of the losses, of which some may be 0, but not all."""
     for name, value in weights.items():
-        if not (is_number(value) and 0 <= value < math.inf):
+        if not (real_number(value) and 0 <= value < math.inf):
             raise ValueError(f"`{name}` must be finite and at least 0; got {value!r}: 0 leaves the loss out.")
     if not any(weights.values()):
         *most, last = (f"`{name}`" for name in weights)
@@ -77,13 +74,11 @@ def check_of(name: str, value: Any, known: Iterable[str]) -> None:
 
 
 class _Options:
-    """A frozen dataclass of options, with NumPy's numbers as Python's, which a checkpoint can compare."""
+    """A frozen dataclass of options."""
 
     COUNTS: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        for f in fields(self):  # type: ignore[arg-type]
-            object.__setattr__(self, f.name, plain(getattr(self, f.name)))
         check_counts(**{name: getattr(self, name) for name in self.COUNTS})
 
     @classmethod
@@ -112,8 +107,9 @@ class GaussNewton(_Options):
     steps : int, optional
         The most steps: by default 1000 of each fit of a primed flow, 150 of a split one, 200 of a network.
     restarts : int, optional
-        Starts of the search for a primed or a split flow: the flow as it is, then random tables. By default 24 and 8;
-        72 for a primed flow in up to three degrees of freedom of which nothing else is said.
+        Starts of the search for a primed or a split flow: the flow as it is, then random tables. By default 24 and 8.
+        Without `budget` a new primed flow has 72 in up to three degrees of freedom of a symbolic system, and fewer than
+        24 beyond six degrees of freedom.
     refresh, validate_every, checkpoint_every : int
         Of other flows, in steps: how long points are kept, None for the whole run; how often held-out figures are
         taken, and a checkpoint is written.
@@ -248,9 +244,10 @@ class Fit(_Options):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+        seed = plain(self.seed)
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise ValueError(f"`seed` must be a non-negative integer; got {self.seed!r}: give 0 or more.")
-        if self.dt is not None and not (is_number(self.dt) and 0 < self.dt < math.inf):
+        if self.dt is not None and not (real_number(self.dt) and 0 < self.dt < math.inf):
             raise ValueError(f"`dt` must be a positive finite number; got {self.dt!r}: leave it out for the default.")
 
     @property
@@ -275,7 +272,7 @@ class Fit(_Options):
         mine |= {name: getattr(solver, name) for name in solver.names()}
         mine |= {"data": None if data is None else _checksum(data)}
         found = {"optimizer": solver.name, "loss": self.losses, **mine}
-        return {name: value for name, value in found.items() if value is not None}
+        return {name: plain(value) for name, value in found.items() if value is not None}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -371,7 +368,7 @@ class PrimedFit(_LossFit):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(frozen_weight=self.frozen_weight)
-        if not (is_number(self.energy_weight) and 0 <= self.energy_weight < math.inf):
+        if not (real_number(self.energy_weight) and 0 <= self.energy_weight < math.inf):
             raise ValueError(
                 f"`energy_weight` must be finite and at least 0; got {self.energy_weight!r}: 0 leaves the energy out."
             )
@@ -433,6 +430,8 @@ class SplitFit(Fit):
         Of the new flow, see `SympFlow.split`.
     frozen_weight : float
         Weight of the residuals at t = Δt; those at other times have 1.
+    loss : str, optional
+        "labels", the only one.
     points, label_times, seed, reference_states
         See `Fit`.
     """
@@ -444,6 +443,7 @@ class SplitFit(Fit):
     terms: int = 8
     force_gradient: Which | None = None
     frozen_weight: float = 30.0
+    loss: str | None = None
 
     kind: ClassVar[str] = "split"
     OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "turn", "stages", "terms", "force_gradient")
@@ -451,6 +451,8 @@ class SplitFit(Fit):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(frozen_weight=self.frozen_weight, turn=self.turn)
+        if self.loss not in (None, "labels"):
+            raise ValueError(f"`loss` {self.loss!r} is not one that Gauss–Newton fits split flows by: use 'labels'.")
 
     def flow(self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None) -> Any:
         dt = self.turn / float(system.linear_part.frequencies.max()) if self.dt is None else self.dt
@@ -609,10 +611,8 @@ def keywords() -> list[str]:
 
 def said(options: Mapping[str, Any]) -> dict[str, Any]:
     """The keywords that say something: not those that are None, or what is so without them."""
-    nothing = object()
-    plainly = {name: plain(value) for name, value in options.items()}
-    kept = {name: value for name, value in plainly.items() if value is not None or name == "clip"}
-    return {n: v for n, v in kept.items() if not (is_number(v) or isinstance(v, str)) or v != DEFAULTS.get(n, nothing)}
+    kept = {name: plain(value) for name, value in options.items() if value is not None or name == "clip"}
+    return {name: value for name, value in kept.items() if name not in DEFAULTS or value != DEFAULTS[name]}
 
 
 def from_keywords(options: Mapping[str, Any], kind: str, by: str | None, flow: FlowMap | None) -> tuple[Fit, Solver]:

@@ -52,7 +52,7 @@ class Loss:
     def __post_init__(self) -> None:
         if self.matching_weight:
             self.system.check_conservative(
-                "with which a flow is that of no Hamiltonian, so there is none to match",
+                "and a damped flow is not Hamiltonian, so there is nothing to match",
                 "pass matching_weight=0, or fit by the labels",
             )
 

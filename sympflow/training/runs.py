@@ -59,38 +59,38 @@ class Run(ABC):
         return self.fit.record(self.solver)
 
     @property
-    @abstractmethod
     def done(self) -> int:
         """Steps, or what else `UNIT` names, that were taken."""
+        return 0
 
     @property
-    @abstractmethod
     def planned(self) -> int:
         """The most there may be."""
+        return 0
 
     @abstractmethod
     def begin(self, session: Session) -> None:
         """Get ready for the first; an exception ends the run."""
 
-    @abstractmethod
     def over(self, session: Session) -> bool:
         """Return whether to take no more."""
+        return True
 
-    @abstractmethod
     def advance(self, session: Session) -> Advance:
         """Take one."""
+        raise NotImplementedError
 
     @abstractmethod
     def end(self, session: Session) -> str | None:
         """Make the flow that is returned; why the run ended early, if it did."""
 
-    @abstractmethod
     def achieved(self) -> dict[str, float]:
         """The figures of that flow."""
+        return dict(self.flow.figures)
 
-    @abstractmethod
     def missed(self) -> tuple[float, float] | None:
         """The share of what a step of Δt moves a state that the flow misses, see `shares_missed`; None if unknown."""
+        return None
 
     def missed_by_verlet(self) -> tuple[float, float] | None:
         """The same of one Verlet step of Δt; None if there is none to compare with."""
@@ -109,9 +109,9 @@ class Run(ABC):
     def remarks(self, reason: str | None) -> dict[str, Any]:
         """The record of the run, beside its options, in the recipe of the flow."""
 
-    @abstractmethod
     def kept(self) -> dict[str, Any]:
         """The state that a checkpoint keeps: `best` and `optimizer`."""
+        raise NotImplementedError
 
     @abstractmethod
     def restore(self, state: dict[str, Any]) -> None:
@@ -224,46 +224,23 @@ class Unstarted(Run):
 
     UNIT: ClassVar[str] = "steps"
 
-    @property
-    def done(self) -> int:
-        return 0
-
-    @property
-    def planned(self) -> int:
-        return 0
-
     def begin(self, session: Session) -> None:
         self.history = list(self.flow.history)
-
-    def over(self, session: Session) -> bool:
-        return True
-
-    def advance(self, session: Session) -> Advance:
-        raise AssertionError
 
     def end(self, session: Session) -> str | None:
         return INTERRUPTED if session.interruption.asked else NO_LABELS
 
     def ended_early(self, reason: str) -> str:
         if reason == INTERRUPTED:
-            return f"Training did not start because {reason}. What it was to start from is returned, the best so far."
+            return f"Training did not start because {reason}. The flow that it was to start from is returned."
         return (
-            f"Training did not start because {reason}: {self.reached}. What it was to start from is returned. Give a "
-            "longer `time_budget`, a shorter `dt`, or fewer `points`, `label_times` and `reference_states`; or a "
+            f"Training did not start because {reason}: {self.reached}. The flow that it was to start from is returned. "
+            "Give a longer `time_budget`, a shorter `dt`, fewer `points`, `label_times` and `reference_states`, or a "
             "`domain` without states at which H has a kink or is nearly singular, near which exact solutions take long."
         )
 
-    def achieved(self) -> dict[str, float]:
-        return dict(self.flow.figures)
-
-    def missed(self) -> tuple[float, float] | None:
-        return None
-
     def remarks(self, reason: str | None) -> dict[str, Any]:
         return {"ended_early": f"{reason}: {self.reached}"}
-
-    def kept(self) -> dict[str, Any]:
-        raise AssertionError  # it has nothing to keep
 
     def restore(self, state: dict[str, Any]) -> None:
         self.flow.load_state_dict(state["best"])
@@ -295,7 +272,7 @@ class SearchRun(Run):
 
     minima: list[Minimum] = field(default_factory=list, kw_only=True)
     coming: Generator[Minimum] | None = field(default=None, init=False, repr=False)
-    """The minima of a round of starts, as the crew finds them."""
+    """The minima of a round of starts, as the pool finds them."""
 
     UNIT: ClassVar[str] = "starts"
     SEARCH_SHARE: ClassVar[float] = 0.5  # of a time budget

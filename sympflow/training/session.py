@@ -16,7 +16,7 @@ from typing import Any
 
 from sympflow.arguments import real_number
 from sympflow.training.checkpoint import check_writable
-from sympflow.workers import Crew, Unpicklable, available_cores
+from sympflow.workers import Unpicklable, WorkerPool, available_cores
 
 Path = str | os.PathLike[str]
 Callback = Callable[[int, dict[str, float]], None]
@@ -66,10 +66,10 @@ class Session:
     time_budget: float | None = None
     progress: bool | None = False
     callback: Callback | None = None
-    crew: Crew = field(default_factory=Crew)
+    pool: WorkerPool = field(default_factory=WorkerPool)
     interruption: Interruption = field(default_factory=Interruption)
     cut: bool = field(default=False, init=False)
-    crew_is_busy: bool = field(default=False, init=False)
+    pool_is_busy: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         self._began = time.perf_counter()
@@ -104,43 +104,43 @@ class Session:
         deadline: Deadline,
         threads: bool = False,
     ) -> Generator[Any]:
-        """Yield `function(common, item)` of each item in order, done by the crew; the function is one of a module.
+        """Yield `function(common, item)` of each item in order, done by the pool; the function is one of a module.
 
-        Where the crew is this thread alone, and the work is compiled code for the most part, `threads` share it, as
-        many as there are cores. What a piece of work does itself by `each` it does alone. While the crew works Ctrl-C
+        Where the pool is this thread alone, and the work is compiled code for the most part, `threads` share it, as
+        many as there are cores. What a piece of work does itself by `each` it does alone. While the pool works Ctrl-C
         raises KeyboardInterrupt here; threads see that it asked for the end. After that, or when workers do not answer
         soon after the deadline, as while they start, this thread does the rest.
         """
         ended = self.interruption.asked or deadline.left <= 0
         n_threads = min(available_cores(), len(items)) if threads else 1
-        if self.crew_is_busy or ended or len(items) < 2 or (self.crew.alone and n_threads < 2):
+        if self.pool_is_busy or ended or len(items) < 2 or (self.pool.alone and n_threads < 2):
             for item in items:
                 yield function(common, item)
             return
-        if not self.crew.alone:
-            yield from self._shared(self.crew, function, common, items, deadline)
+        if not self.pool.alone:
+            yield from self._shared(self.pool, function, common, items, deadline)
             return
-        pool = ThreadPoolExecutor(n_threads)
+        executor = ThreadPoolExecutor(n_threads)
         try:
-            yield from self._shared(Crew(pool), function, common, items, deadline)
+            yield from self._shared(WorkerPool(executor), function, common, items, deadline)
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            executor.shutdown(wait=False, cancel_futures=True)
 
     def _shared(
         self,
-        crew: Crew,
+        pool: WorkerPool,
         function: Callable[[Any, Any], Any],
         common: Any,
         items: Sequence[Any],
         deadline: Deadline,
     ) -> Generator[Any]:
         patience = None if deadline.end == math.inf else deadline.left + GRACE
-        answers, interruption = crew.map(function, common, items, patience), self.interruption
-        self.crew_is_busy = True
+        answers, interruption = pool.map(function, common, items, patience), self.interruption
+        self.pool_is_busy = True
         try:
             for left in reversed(range(len(items))):
                 armed = interruption.armed
-                interruption.armed = armed and crew is not self.crew
+                interruption.armed = armed and pool is not self.pool
                 try:
                     answer = next(answers)
                 except TimeoutError:
@@ -152,12 +152,12 @@ class Session:
                     ) from error
                 finally:
                     interruption.armed = armed
-                self.crew_is_busy = left > 0
+                self.pool_is_busy = left > 0
                 yield answer
             else:
                 return
         finally:
-            self.crew_is_busy = False
+            self.pool_is_busy = False
         for item in items[-left - 1 :]:
             yield function(common, item)
 

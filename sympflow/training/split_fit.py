@@ -11,21 +11,23 @@ Gauss–Newton steps do not see.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 
 from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.parts import Map
+from sympflow.hamiltonian.parts import SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.training.fits import GaussNewton, Resolved
 from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
-from sympflow.training.points import Labels, Stream, shares_missed, states, stream_seed
+from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors, stream_seed
 from sympflow.training.runs import LABEL_SHARE, SearchRun
 from sympflow.training.session import Deadline, Session
 
@@ -160,14 +162,15 @@ class SplitProblem:
                 unit[[j, d + j]] = math.sqrt(energy / linear.rates[j])  # type: ignore[union-attr]
         return unit
 
+    def _joined(self, half: Callable[[Column, int], Any]) -> np.ndarray:
+        """What a function gives of each column and the length of its first half, one after another: (n,)."""
+        return np.concatenate([np.broadcast_to(half(c, m := (c.n + 1) // 2), m) for c in self.columns])
+
     def units(self, t: float) -> np.ndarray:
         """The units of the coefficients: t^m / n for weights and angles, 1 for filters."""
-        out = np.empty(self.n)
-        for c, part in zip(self.columns, self.slices, strict=True):
-            out[part] = t**c.power / (c.n**c.power if c.power else 1)
-        return out
+        return self._joined(lambda c, m: t**c.power / (c.n**c.power if c.power else 1))
 
-    def maps(self, u: np.ndarray) -> list[Map]:
+    def maps(self, u: np.ndarray) -> list[SubFlow]:
         """The maps with the numbers u of the first half."""
         entries = {}
         for c, part in zip(self.columns, self.slices, strict=True):
@@ -192,17 +195,11 @@ class SplitProblem:
 
     def frozen(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Offset (n,) and design (n, f) of numbers that are bound by Σ s = t alone, in their units."""
-        offset, blocks = np.zeros(self.n), []
-        unit = self.units(t)
-        for c, part in zip(self.columns, self.slices, strict=True):
-            bare = Column(c.n, 1, t, c.power, c.total if c.total == "always" else None)
-            own, design = bare.affine(np.array([t]))
-            m = (c.n + 1) // 2
-            offset[part] = own[0, :m]
-            block = np.zeros((self.n, design.shape[-1]))
-            block[part] = design[0, :m] / t**c.power * unit[part][:, None]
-            blocks.append(block)
-        return offset, np.concatenate(blocks, axis=1)
+        bare = [Column(c.n, 1, t, c.power, c.total if c.total == "always" else None) for c in self.columns]
+        affine = [c.affine(np.array([t])) for c in bare]
+        offset = np.concatenate([own[0, : (c.n + 1) // 2] for c, (own, _) in zip(bare, affine, strict=True)])
+        blocks = [d[0, : (c.n + 1) // 2] / t**c.power for c, (_, d) in zip(bare, affine, strict=True)]
+        return offset, self.units(t)[:, None] * block_diag(*blocks)
 
     def minimize(self, u: np.ndarray, j: int, iterations: int, stop: Stop, pull: float = 0.0) -> Minimum:
         """The numbers at the j-th time that fit the labels best, pulled towards equal steps."""
@@ -227,32 +224,23 @@ class SplitProblem:
 
     def equal(self, t: float) -> np.ndarray:
         """The numbers of equal steps without filters and force gradients."""
-        u = self.units(t)
-        for c, part in zip(self.columns, self.slices, strict=True):
-            if c.power > 1:
-                u[part] = 0.0
-        return u
+        return self.units(t) * self._joined(lambda c, m: c.power <= 1)
 
     def current(self, t: float) -> np.ndarray:
         """The numbers of the flow as it is."""
-        u = np.empty(self.n)
-        for c, part in zip(self.columns, self.slices, strict=True):
-            u[part] = c.at(np.array(t))[: (c.n + 1) // 2]
-        return u
+        return self._joined(lambda c, m: c.at(np.array(t))[:m])
 
     def random(self, restart: int) -> np.ndarray:
         rng = np.random.default_rng([stream_seed(self.fit.seed, Stream.RESTARTS), restart])
-        u, dt = np.empty(self.n), self.flow.dt
-        for c, part in zip(self.columns, self.slices, strict=True):
-            m = (c.n + 1) // 2
+        dt = self.flow.dt
+
+        def half(c: Column, m: int) -> Any:
             if c.power == 1:
                 w = rng.normal(1, SPREAD, m)
-                u[part] = dt * w / np.concatenate([w, w[: c.n // 2]]).sum()
-            elif c.power == 0:
-                u[part] = rng.uniform(0.2, 1.2, m)
-            else:
-                u[part] = rng.choice([0.0, 1 / 12]) * (dt / c.n) ** 3
-        return u
+                return dt * w / np.concatenate([w, w[: c.n // 2]]).sum()
+            return rng.uniform(0.2, 1.2, m) if c.power == 0 else rng.choice([0.0, 1 / 12]) * (dt / c.n) ** 3
+
+        return self._joined(half)
 
     # all times ----------------------------------------------------------------------------------------------
 
@@ -275,17 +263,17 @@ class SplitProblem:
         weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.fit.frozen_weight, 1.0)
         weight /= math.sqrt(len(self.t))
 
-        equal, bend = np.array([self.equal(t) for t in self.t]), (weight * pulls)[:, None] / scale
+        equal, pulled = np.array([self.equal(t) for t in self.t]), (weight * pulls)[:, None] / scale
 
         def residuals(theta: np.ndarray) -> np.ndarray:
             u = offsets + designs @ theta
             data = [weight[j] * self.residuals(u[j], j) for j in range(len(self.t))]
-            return np.concatenate([*data, *(bend * (u - equal))])
+            return np.concatenate([*data, *(pulled * (u - equal))])
 
         def linearized(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             u = offsets + designs @ theta
             data = [weight[j] * self.jacobian(u[j], j) @ designs[j] for j in range(len(self.t))]
-            return residuals(theta), np.concatenate([*data, *(bend[..., None] * designs)])
+            return residuals(theta), np.concatenate([*data, *(pulled[..., None] * designs)])
 
         m = levenberg_marquardt(residuals, linearized, theta, iterations=self.solver.steps, stop=stop)
         self.assign(m.x)
@@ -305,40 +293,25 @@ class SplitProblem:
 
     def polynomials(self) -> tuple[np.ndarray, np.ndarray]:
         """Offsets (J, n) and designs (J, n, f) of the numbers at the label times by the flow's parameters."""
-        offsets, blocks = np.zeros((len(self.t), self.n)), []
-        for c, part in zip(self.columns, self.slices, strict=True):
-            offset, design = c.affine(self.t)
-            m = (c.n + 1) // 2
-            offsets[:, part] = offset[:, :m]
-            block = np.zeros((len(self.t), self.n, design.shape[-1]))
-            block[:, part] = design[:, :m]
-            blocks.append(block)
-        return offsets, np.concatenate(blocks, axis=-1)
+        halves = [tuple(part[:, : (c.n + 1) // 2] for part in c.affine(self.t)) for c in self.columns]
+        offsets, designs = np.concatenate([offset for offset, _ in halves], axis=1), [design for _, design in halves]
+        return offsets, np.stack([block_diag(*(design[j] for design in designs)) for j in range(len(self.t))])
 
     def assign(self, theta: np.ndarray) -> None:
         """Put the parameters into the flow."""
         put_weights([c.free for c in self.columns], torch.as_tensor(theta))
 
+    def differences(self, j: int) -> np.ndarray:
+        """ψ̄_t(x) − φ_H,t(x) in modes, at the held-out states and the j-th of their times: (N, 2d)."""
+        t, z = self.held_out.t, self._modes(self.held_out.x)
+        return self.kernel.step_modes(self.flow.numpy_maps(np.array(t[j])), z) - self._modes(self.held_out.y[j])
+
     def missed(self) -> tuple[float, float]:
         """See `shares_missed`: at the last of the held-out times, which is next to Δt."""
-        t, z = self.held_out.t, self._modes(self.held_out.x)
-        modes = Labels(t[-1:], z, self._modes(self.held_out.y[-1])[None])
-        end = self.kernel.step_modes(self.flow.numpy_maps(np.array(t[-1])), z)
-        return shares_missed(end - modes.y[-1], modes, self.unit)
+        of = self.held_out
+        modes = Labels(of.t[-1:], self._modes(of.x), self._modes(of.y[-1])[None])
+        return shares_missed(self.differences(-1), modes, self.unit)
 
     def errors(self) -> dict[str, float]:
-        """‖ψ̄_t(x) − φ_H,t(x)‖ of held-out states, in the units of the modes."""
-        t, z = self.held_out.t, self._modes(self.held_out.x)
-        error = np.array(
-            [
-                np.linalg.norm(
-                    (self.kernel.step_modes(self.flow.numpy_maps(np.array(s)), z) - self._modes(y)) / self.unit, axis=-1
-                )
-                for s, y in zip(t, self.held_out.y, strict=True)
-            ]
-        )
-        return {
-            "one_step_error": float(error[-1].mean()),
-            "one_step_error_max": float(error[-1].max()),
-            "fractional_error": float(error[:-1].mean()),
-        }
+        """Figures of ψ̄_t(x) − φ_H,t(x) of held-out states, in the units of the modes."""
+        return step_errors(np.stack([self.differences(j) for j in range(len(self.held_out.t))]) / self.unit)

@@ -188,7 +188,7 @@ def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
 def _fastest_met(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
     """The fastest rate that the orbits of a few of the states meet while they cross these several times."""
     y, d = y[:: max(1, len(y) // ORBITS)][:ORBITS], system.ndof
-    time = None if system.autonomous else 0.0
+    time = 0.0
     speeds = np.abs(system.vector_field(y, *(() if time is None else (np.zeros(len(y)),)))[:, :d])
     span = CROSSINGS * float(np.max(np.ptp(y[:, :d], axis=0) / np.maximum(np.median(speeds, axis=0), 1e-300)))
 

@@ -78,10 +78,10 @@ class TableStep:
                 "Gauss–Newton steps: use optimizer='bfgs'."
             )
         self.ndof, self.sequence, self._driven = system.ndof, tuple(sequence), not system.autonomous
-        self.balanced = self._driven and system.friction is None
+        self.balanced = self._driven and not system.friction
         self._inverse_mass = _inverse_mass(system, 1.0)
         self._times_inverse_mass, self._friction = _velocities(system, 1.0), system.friction
-        if self._driven and system.friction is not None:
+        if self._driven and system.friction:
             self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
         self._forces_of = system, level, monomials, compiled
         n, terms = len(sequence), len(monomials) or level
@@ -147,14 +147,14 @@ class TableStep:
 
     def _drifted(self, p: np.ndarray, s: np.ndarray, velocity: Callable[[np.ndarray], np.ndarray]) -> Any:
         """The change of q and the p after drifts of times s (P,) or (1,), of momenta (..., d, P)."""
-        if self._friction is None:
+        if not self._friction:
             return s * velocity(p), p
         mean, end = self._friction.drift(p.swapaxes(-1, -2), s[:, None])
         return velocity(mean.swapaxes(-1, -2)), end.swapaxes(-1, -2)
 
     def _slowing(self, p: np.ndarray) -> np.ndarray:
         """−Γp of momenta (d, P), their rate in a drift."""
-        return np.zeros_like(p) if self._friction is None else self._friction.force(p.T).T
+        return np.zeros_like(p) if not self._friction else self._friction.force(p.T).T
 
     def with_jacobian(
         self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None, t0: np.ndarray | None = None
@@ -224,7 +224,7 @@ class TableStep:
                 velocity, slowing = passed[i]
                 J[i] = _apply(after_q, velocity)
                 by_velocity = np.einsum("rkP,kj->rjP", after_q, self._inverse_mass)
-                if self._friction is None:
+                if not self._friction:
                     after_p += c[i] * by_velocity
                     continue
                 J[i] += _apply(after_p, slowing)
@@ -589,14 +589,14 @@ def _generated(
 
     from sympflow.hamiltonian.symbolic import without_deltas
 
-    letters: dict[Any, Any] = {}
+    samples_at: dict[Any, Any] = {}
     expressions = [without_deltas(f) for f in expressions]
     if samples:
         from sympflow.hamiltonian.driving import with_letters
 
-        expressions, letters = with_letters(expressions)
-    sampled = [(samples[a.name_of_samples], a.order, sp.lambdify(variables, a.at, modules="numpy")) for a in letters]
-    function = sp.lambdify((*variables, *letters.values()), expressions, modules="numpy", cse=True)
+        expressions, samples_at = with_letters(expressions)
+    sampled = [(samples[a.name_of_samples], a.order, sp.lambdify(variables, a.at, modules="numpy")) for a in samples_at]
+    function = sp.lambdify((*variables, *samples_at.values()), expressions, modules="numpy", cse=True)
 
     def evaluate(q: np.ndarray) -> np.ndarray:
         values = function(*q, *(each(at(*q), order) for each, order, at in sampled))

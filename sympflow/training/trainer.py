@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.arguments import plain
+from sympflow.arguments import plain, real_number
 from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
@@ -26,7 +26,6 @@ from sympflow.systems.given import given_system
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.clock_fit import train_clock
-from sympflow.training.energy_runs import check_runs, runs_of
 from sympflow.training.fits import (
     FITTED,
     KINDS,
@@ -45,11 +44,10 @@ from sympflow.training.fits import (
     SplitFit,
     check_of,
     from_keywords,
-    is_number,
     keywords,
     said,
 )
-from sympflow.training.lattice_fit import LatticePiece, on_piece
+from sympflow.training.lattice_fit import LatticePiece, check_runs, on_piece, runs_of
 from sympflow.training.network_fit import LossRun
 from sympflow.training.points import Stream, handed_in, start_times, unlabelled, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted
@@ -57,13 +55,14 @@ from sympflow.training.session import Deadline, OutOfTime, Path, Session
 from sympflow.training.split_fit import SplitRun
 from sympflow.training.starts import check_step, default_primed, scaling_of, warn_of_domain
 from sympflow.training.table_fit import MadeRuns, TableRun
-from sympflow.workers import Crew
+from sympflow.workers import WorkerPool
 
 DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
 BUDGET = 60.0  # seconds of a fit of which nothing else is said
 SHORT_BUDGET = 15.0  # the least of such a fit that has trials
 STARTS = 72  # of such a fit, where it is compiled: these take a second
-BOUGHT = 1000  # starts that a time budget buys at most
+SOME, SMALL, FEWEST = 24, 6, 3  # of other systems, up to so many degrees of freedom, and of the largest
+BOUGHT = 1000  # starts that a budget buys at most
 
 
 def train(
@@ -107,9 +106,10 @@ def train(
     budget : float, optional
         Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled. All counts: trials (at
         most two thirds of it), labels (at most 0.3 of what is left, each set), starts, fits, held-out figures. Where
-        labels take longer the flow is returned as it was, and a warning says how far they came. A new primed flow of
-        which nothing is said has 60, and a warning where that is not enough; with a budget it has as many starts as two
-        fifths of the time allow, up to 1000, in up to three degrees of freedom of a symbolic system.
+        labels take longer the flow is returned as it was, and a warning says how far they came. Without a budget a new
+        primed flow has 60 seconds: enough in up to three degrees of freedom of a symbolic system, or there is a
+        warning; for others the search may take fewer starts, which the recipe records. With a budget such a system has
+        as many starts as two fifths of the time allow, up to 1000.
     checkpoint : path, optional
         Write the state of the run there at intervals, atomically; of a primed flow after each start of the search, and
         first as soon as there is a run: of one that is killed in the trials nothing is kept.
@@ -161,12 +161,17 @@ def train(
     --------
     >>> flow = train(system, PrimedFit(stages=3, processor=6), solver=GaussNewton(restarts=24), budget=15)
     """
-    if is_number(fit := plain(fit)):
+    if real_number(fit := plain(fit)):
         fit, options = None, {"dt": fit, **options}
     _refuse_unknown(options)
     system = _known_system(system, fit.data if isinstance(fit, LossFit | PrimedFit) else options.get("data"))
-    start, limit = None, options.pop("time_budget", budget)
-    session = Session(checkpoint, resume, plain(limit), progress, callback, Crew(workers))
+    start, budget = None, plain(budget)
+    if budget is not None and "time_budget" in options:
+        raise TypeError("`budget` and `time_budget` are the same limit: leave out one of them.")
+    if budget is not None and not (real_number(budget) and 0 < budget < math.inf):
+        raise ValueError(f"`budget` must be a positive number of seconds; got {budget!r}: leave it out.")
+    limit = options.pop("time_budget", budget)
+    session = Session(checkpoint, resume, plain(limit), progress, callback, WorkerPool(workers))
     if fit is None or not isinstance(fit, Fit):
         fit, solver, start = _described(system, fit, solver, flow, said(options))
     elif options:
@@ -194,7 +199,7 @@ def fit_flow(
     primed = isinstance(fit, PrimedFit)
     check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind in DRIVEN)
     if isinstance(fit, ClockedFit):
-        return train_clock(system, fit)
+        return train_clock(system, fit, domain)
     if isinstance(fit, PrimedFit):
         if fit.runs is not None:
             check_runs(system, fit)
@@ -204,7 +209,7 @@ def fit_flow(
             runs = None if fit.runs is None else partial(runs_of, piece, fit.runs, fit.seed)
             fitted = _fitted(piece.system, small, kind, replace(fit, runs=None), solver, piece.domain, session, runs)
             return piece.whole(fitted)
-    if not (primed or isinstance(fit, SplitFit) or session.crew.alone):
+    if not (primed or isinstance(fit, SplitFit) or session.pool.alone):
         raise TypeError(
             "`workers` share the starts of a search by 'gauss-newton' for primed and split flows, and this fit is one "
             "run of steps: leave it out."
@@ -229,7 +234,7 @@ def _fitted(
     by_default = open_starts and session.time_budget is None
     if by_default:
         session.time_budget = BUDGET
-    with session.interruption, session.crew, np.errstate(divide="ignore", invalid="ignore"):
+    with session.interruption, session.pool, np.errstate(divide="ignore", invalid="ignore"):
         tried = None
         if new and fit.dt is not None:
             check_step(system, domain, fit.dt)
@@ -246,14 +251,16 @@ def _fitted(
         system.vector_field(
             domain.sample(1, 0), start_times(system, 0.0, 1, 0, Stream.LABELS)
         )  # what is compiled for it counts, but not as labels
-        bought = open_starts and session.checkpoint is None and trials.can_try(system)
+        compiled = trials.can_try(system)
+        bought = open_starts and session.checkpoint is None and (compiled or by_default)
         if bought and isinstance(solver, GaussNewton):
-            solver = replace(solver, restarts=STARTS if by_default else BOUGHT)
+            few = max(FEWEST, round(SOME * min(1.0, (SMALL / system.ndof) ** 2)))
+            solver = replace(solver, restarts=few if not compiled else STARTS if by_default else BOUGHT)
         run = _run_of(system, domain, kind, flow, tried, fit, solver, session.deadline, runs)
         if session.resume is not None:
             run.load(session.resume)
         reason = run.go(session)
-    return run.finish(reason, expected=bought and not by_default)
+    return run.finish(reason, expected=bought and not (by_default and compiled))
 
 
 # arguments --------------------------------------------------------------------------------------------------------
@@ -272,7 +279,7 @@ def _refuse_unknown(options: dict[str, Any]) -> None:
                 raise TypeError(f"`{name}` is an option of {by}: pass flow={by}(system, ..., {name}={value!r}).")
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"is `{close[0]}` meant? There are" if close else "choose from"
-        raise TypeError(f"`{name}` is no option of train(): {hint} {', '.join(known)}.")
+        raise TypeError(f"`{name}` is not an option of train(): {hint} {', '.join(known)}.")
 
 
 def _known_system(system: Any, data: Any) -> HamiltonianSystem:
@@ -332,7 +339,7 @@ def _described(
     if fit is not None:
         raise TypeError(f"`fit` must be a fit of sympflow.training, such as PrimedFit(); got {fit!r}: or Δt, a number.")
     dt, by = options.get("dt"), options.pop("optimizer", None) if solver is None else getattr(solver, "name", solver)
-    if dt is not None and not (is_number(dt) and 0 < dt < math.inf):
+    if dt is not None and not (real_number(dt) and 0 < dt < math.inf):
         raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
     searches = by in (None, GaussNewton.name)
     kind, of_flow = options.pop("kind", None), (*OF_PRIMED, *OF_NETWORKS, "dtype", "device")

@@ -120,8 +120,8 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         work = good(tried)
         return min(work, key=work.__getitem__)
 
-    bends = costs[CURVATURE] <= DEAREST * costs[FORCE_GRADIENT]
-    with session.bar(len(starts) + bends + 2 * len(SHAPES), f"{system.name} trials") as bar:
+    with_curvature = costs[CURVATURE] <= DEAREST * costs[FORCE_GRADIENT]
+    with session.bar(len(starts) + with_curvature + 2 * len(SHAPES), f"{system.name} trials") as bar:
 
         def attempt(wanted: list[PrimedFit]) -> None:
             answers = session.each(_trial_of, (system, domain, deadline), wanted, deadline)
@@ -132,7 +132,7 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
                 try:
                     made = next(answers)
                 except KeyboardInterrupt:  # while others work
-                    if session.crew.alone or not interruption.armed:
+                    if session.pool.alone or not interruption.armed:
                         raise
                     interruption.asked = True
                 if deadline.over():  # then it says nothing
@@ -145,16 +145,16 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
         if not found:
             _warn_if_cut(session, 0, starts)
             return Trial(starts[0], math.inf)
-        straight = best([*found])
-        bent = replace(straight, curvature=True)
-        if bends:
-            attempt([bent])
-        both = [straight, bent]
-        chosen = best(both) if bent in found else straight
-        shorter = replace(starts[max(0, starts.index(straight) - 1)], curvature=chosen.curvature)
+        plainest = best([*found])
+        curved = replace(plainest, curvature=True)
+        if with_curvature:
+            attempt([curved])
+        both = [plainest, curved]
+        chosen = best(both) if curved in found else plainest
+        shorter = replace(starts[max(0, starts.index(plainest) - 1)], curvature=chosen.curvature)
         others = list(dict.fromkeys([*shaped(chosen), *shaped(shorter)]))
         attempt(others)
-        _warn_if_cut(session, len(found), {*starts, *others, *([bent] if bends else [])})
+        _warn_if_cut(session, len(found), {*starts, *others, *([curved] if with_curvature else [])})
         work = good([chosen, *(start for start in others if start in found)])
         long = {} if deadline.over() else _long_work(work, found, system, domain)
         first = min(work, key=work.__getitem__)
@@ -179,7 +179,7 @@ def _long_work(
     """The estimated work of those that are nearly as good as the best, by their energy errors in long runs."""
     near = [start for start in sorted(work, key=work.__getitem__) if work[start] <= NEAR * min(work.values())][:NEAREST]
     flows = [flow for start in near if (flow := found[start].flow) is not None]
-    if len(near) < 2 or len(flows) < len(near) or not (system.autonomous and system.conservative):
+    if len(near) < 2 or len(flows) < len(near) or not system.keeps_energy:
         return {}
     errors = long_errors(flows, system, domain)
     return {

@@ -66,7 +66,7 @@ def test_a_failed_orbit_is_a_row():
 
 
 def test_no_orbit_is_asked_when_its_solution_becomes_infinite(monkeypatch):
-    monkeypatch.setattr("sympflow.solver.note_singularities", lambda *_: 1 / 0)
+    monkeypatch.setattr("sympflow.integrators.diagnosis.note_singularities", lambda *_: 1 / 0)
     states = np.array([STATES[0], [60.0, 60.0, 0.0, 0.0]])
     result = sympflow.ensemble(SYSTEM, "verlet", SPAN, states, dt=DT, reduce="final")
     assert result.status.tolist() == [0, -1]
@@ -244,7 +244,7 @@ def test_a_reduction_returns_what_it_tells():
 
 def test_what_is_sent_to_processes_is_small_and_can_be_sent():
     task = sweep.Task(SYSTEM, sympflow.get("verlet")(dt=DT), SPAN, None, {}, reductions.States(), "auto")
-    assert len(workers.Parcel(task).pack()) < 20_000
+    assert len(workers.PickledTask(task).pack()) < 20_000
     lock = threading.Lock()
     with pytest.raises(TypeError, match="`reduce` cannot be sent to the processes of `workers`"):
         kept(reduce=lambda t, y: float(lock.locked()), workers=2)

@@ -129,7 +129,7 @@ def test_older_certificates_have_no_limit():
     older = found.to_dict()
     del older["relative_limit"]
     assert Certificate.from_dict(older).relative_limit is None
-    with pytest.raises(ValueError, match="relative_limit that is no number"):
+    with pytest.raises(ValueError, match="relative_limit that is not a number"):
         Certificate.from_dict({**older, "relative_limit": "small"})
 
 
@@ -246,8 +246,8 @@ def test_a_flow_in_another_precision_is_saved_without_its_certificate(tmp_path):
     [
         (lambda c: c.pop("delta"), "not one of a certificate"),
         (lambda c: c.update(delta=3.0), "delta that is not made of quantiles"),
-        (lambda c: c["delta"].update(median="0"), "median that is no number"),
-        (lambda c: c["delta"].update(median=-1.0), "median that is no number"),
+        (lambda c: c["delta"].update(median="0"), "median that is not a number"),
+        (lambda c: c["delta"].update(median=-1.0), "median that is not a number"),
         (lambda c: c.update(states=True), "states that is no int"),
         (lambda c: c.update(weights="0"), "certificate is one of other weights"),
     ],

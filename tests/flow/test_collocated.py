@@ -66,7 +66,7 @@ def test_with_friction_it_is_conformally_symplectic_and_the_flow_of_no_hamiltoni
     flow = SympFlow.collocated(DAMPED, dt=0.5, steps=1)
     sol = solve(DAMPED, flow, (0, 5))
     assert np.max(conformal_defect(sol)) < 1e-13
-    with pytest.raises(ValueError, match="flow` is that of no Hamiltonian"):
+    with pytest.raises(ValueError, match="so `flow` has no Hamiltonian"):
         flow.hamiltonian(0.1, torch.as_tensor(DAMPED.y0))
 
 

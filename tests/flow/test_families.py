@@ -84,7 +84,7 @@ def test_what_is_asked_of_a_flow_map(name):
     if flow.symplectic:
         assert flow.hamiltonian(0.1, x, **begun).shape == ()
     else:
-        with pytest.raises(TypeError, match="the flow of no Hamiltonian"):
+        with pytest.raises(TypeError, match="which has no Hamiltonian"):
             flow.hamiltonian(0.1, x)
 
 

@@ -482,7 +482,7 @@ def test_options_of_primed_are_none_of_train():
         TypeError, match=r"^`palindromic` is .*: pass flow=SympFlow.primed\(system, ..., palindromic=False\)"
     ):
         train(HH, palindromic=False)
-    with pytest.raises(TypeError, match=r"^`restart` is no option of train\(\): is `restarts` meant\?"):
+    with pytest.raises(TypeError, match=r"^`restart` is not an option of train\(\): is `restarts` meant\?"):
         train(HH, restart=2)
 
 

@@ -15,6 +15,8 @@ from sympflow.interop.scipy import as_scipy
 from sympflow.systems.chains import EPSILON, MASS, SIGMA
 from sympflow.systems.pairs import pair_functions
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarning")
+
 Y1, Y2 = np.array([1.0, 0.3]), np.array([0.3, 0.6, 0.1, 0.2])
 SQUARE = {"potential": lambda q: (q**2).sum(-1) / 2, "ndof": 1}
 QUARTIC = {"potential": lambda q: (q**4).sum(-1) / 4, "ndof": 2}
@@ -234,6 +236,7 @@ def test_a_run_tests_only_where_no_run_was_and_never_by_check_false():
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", "`dt` .* is too long")
         solve(HamiltonianSystem(**FAR, check=False), "verlet", (0, 4))
         system = HamiltonianSystem(**FAR | {"gradient": gradient})
         counts = []
@@ -390,7 +393,7 @@ def test_sums_over_pairs_by_numba_functions_are_those_by_a_formula():
 
 def test_without_numba_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    with pytest.raises(ImportError, match=r"^`pair` must be a Numba function.*sympflow\[numba\]"):
+    with pytest.raises(ImportError, match=r"^`pair` must be a Numba function.*pip install numba"):
         pair_functions(lennard_jones, np.ones((2, 2)), 2)
 
 

@@ -178,6 +178,7 @@ def test_only_lattices_have_an_energy_density():
         sf.systems.pendulum().energy_density(np.zeros(2))
 
 
+@pytest.mark.filterwarnings("ignore:`dt` .* is too long")
 def test_symplecticity_by_random_directions_is_that_of_the_jacobians():
     """‖E‖_F/√(2d) of the worst step, of a method that is not symplectic, within four standard errors."""
     system = HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=5, boundary="fixed")

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 
 from sympflow import HamiltonianSystem, SympFlow, solve, time_transformed
 from sympflow.hamiltonian.linear_part import LinearPart
-from sympflow.hamiltonian.parts import ExactParts, Map, exact_parts
+from sympflow.hamiltonian.parts import ExactParts, SubFlow, exact_parts
 from sympflow.systems import fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum, toda_lattice
 
 
@@ -98,7 +98,7 @@ def test_the_flow_is_the_matrix_exponential(seed):
     generator = np.block([[np.zeros((4, 4)), B], [-K, np.zeros((4, 4))]])
     centered = y - np.concatenate([part.center, np.zeros(4)])
     exact = centered @ expm(t * generator).T + np.concatenate([part.center, np.zeros(4)])
-    maps = [Map(0, np.full(part.n_classes, t))]
+    maps = [SubFlow(0, np.full(part.n_classes, t))]
     for x in (y, torch.as_tensor(y)):
         z = np.asarray(parts.from_modes(*parts.apply(maps, *parts.to_modes(x))))
         assert np.abs(z - exact).max() < 1e-11 * np.abs(exact).max()

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from sympflow import (
+    ClockedFit,
     HamiltonianSystem,
     SympFlow,
     compare,
@@ -16,6 +17,7 @@ from sympflow import (
     solve,
     systems,
     time_transformed,
+    train,
 )
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.shipped import choose
@@ -26,7 +28,6 @@ from sympflow.integrators.flows import LogSympFlow
 from sympflow.interop.scipy import as_scipy
 from sympflow.systems.celestial import kepler_ellipse
 from sympflow.testing.checks import check_integrator
-from sympflow.training.clock_fit import train_clock
 
 METHODS = ("log_leapfrog", "log_blanes_moan4", "log_kahan_li8")
 EPS = np.finfo(float).eps
@@ -251,7 +252,7 @@ def test_a_sympflow_on_the_transformed_system_runs_in_physical_time():
 
 @pytest.fixture(scope="module")
 def clocked():
-    return train_clock(systems.kepler(), 1.0)
+    return train(systems.kepler(), ClockedFit(1.0))
 
 
 def rows(n=5):
@@ -334,12 +335,12 @@ def test_clocked_flows_are_kept_in_files(clocked, tmp_path):
 def test_schemes_and_systems_without_a_clock_are_refused():
     with pytest.raises(ValueError, match=r"^`scheme` 'chin4a' is not a symmetric one without force gradients"):
         ClockedFlow(3, "chin4a")
-    with pytest.raises(ValueError, match=r"^`system` is no logarithmic Hamiltonian"):
+    with pytest.raises(ValueError, match=r"^`system` is not a logarithmic Hamiltonian"):
         ClockedFlow(2, system=systems.kepler())
     with pytest.raises(ValueError, match=r"^`terms` must be a positive integer"):
         ClockedFlow(3, terms=0)
-    with pytest.raises(ValueError, match=r"^`system` 'plain' has no domain"):
-        train_clock(HamiltonianSystem.from_sympy("p**2/2 - 1/sqrt(1 + q**2)", y0=[1, 0], name="plain"), 0.1)
+    with pytest.raises(ValueError, match=r"^`domain` is not known for the system 'plain'"):
+        train(HamiltonianSystem.from_sympy("p**2/2 - 1/sqrt(1 + q**2)", y0=[1, 0], name="plain"), ClockedFit(0.1))
 
 
 def test_a_flow_in_another_time_is_asked_for_by_name_or_by_a_tolerance_that_no_other_meets():

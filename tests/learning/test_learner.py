@@ -410,7 +410,7 @@ def test_friction_that_chance_makes_negative_is_none(damping, seed):
         trajectories(8, 15, noise=0.01, seed=seed), damping=damping, family="polynomial", time_budget=30
     )
     friction = found.system.friction
-    assert friction is None or 0 <= friction.largest < 0.01
+    assert 0 <= friction.largest < 0.01
 
 
 def test_friction_below_0_is_0_and_one_that_is_no_chance_is_told(clean):

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators import progress, stored_runs, windows
+from sympflow.integrators import grid_runs, progress, windows
 from sympflow.integrators.contract import Interrupted
 from sympflow.solver import solve
 from sympflow.storage import store as storage
+from sympflow.storage.runs import RunStore
 from sympflow.storage.store import Store, StoreError
 from sympflow.systems import henon_heiles
 
@@ -42,8 +43,8 @@ CASES = {
 
 @pytest.fixture(autouse=True)
 def short_windows(monkeypatch):
-    monkeypatch.setattr(stored_runs, "ONE", 100)
-    monkeypatch.setattr(stored_runs, "ARRAY_STEPS", 30)
+    monkeypatch.setattr(grid_runs, "ONE", 100)
+    monkeypatch.setattr(grid_runs, "ARRAY_STEPS", 30)
     monkeypatch.setattr(windows.Pace, "took", lambda self, n: None)
     monkeypatch.setattr(progress, "BETWEEN", 0.0)
 
@@ -87,9 +88,9 @@ def test_ctrl_c_between_the_steps_and_their_outputs(tmp_path, monkeypatch, case,
     system, method, options = CASES[case]
     whole = solve(system, method, (0, END), **options)
     owner, name = {
-        "append": (stored_runs.RunStore, "append"),
+        "append": (RunStore, "append"),
         "pieces": (windows.Pieces, "to"),
-    }.get(where, (stored_runs, where))
+    }.get(where, (grid_runs, where))
     done, calls = getattr(owner, name), []
 
     def struck(*given):
@@ -127,11 +128,11 @@ def test_a_run_that_goes_on_to_a_later_end_is_the_longer_run(tmp_path, case):
 
 KILLED = """
 import os, signal, sys
-from sympflow.integrators import progress, stored_runs, windows
+from sympflow.integrators import grid_runs, progress, windows
 from sympflow.solver import solve
 from sympflow.systems import henon_heiles
 
-stored_runs.ONE, progress.BETWEEN, windows.Pace.took = 100, 0.0, lambda self, n: None
+grid_runs.ONE, progress.BETWEEN, windows.Pace.took = 100, 0.0, lambda self, n: None
 
 def kill(done, total):
     if done >= 12:

@@ -113,7 +113,7 @@ sys.modules["matplotlib.figure"] = None
 try:
     report.figure()
 except ImportError as error:
-    assert 'pip install "sympflow[plot]"' in str(error)
+    assert 'pip install matplotlib, or in the clone of sympflow pip install ".[plot]"' in str(error)
 else:
     raise AssertionError
 """

@@ -31,33 +31,6 @@ QUICK = {"restarts": 4, "steps": 30, "points": 40, "reference_states": 10, "labe
 NETWORK = {"pairs": 1, "hidden": (4,), "points": 60, "validation_points": 60, "reference_states": 5, "progress": False}
 
 
-class Clock:
-    """Time that passes with every evaluation of something."""
-
-    def __init__(self, monkeypatch):
-        self.now, self.costs = 0.0, {}
-        self.patch = monkeypatch
-        monkeypatch.setattr(sessions, "time", self)
-
-    def perf_counter(self):
-        return self.now
-
-    def costs_seconds(self, owner, name, seconds):
-        """Let a method take so long."""
-        whole = getattr(owner, name)
-
-        def slow(*arguments, **options):
-            self.now += seconds
-            return whole(*arguments, **options)
-
-        self.patch.setattr(owner, name, slow)
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    return Clock(monkeypatch)
-
-
 # the deadline -------------------------------------------------------------------------------------------------
 
 

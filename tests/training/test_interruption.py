@@ -13,7 +13,6 @@ import torch
 from sympflow import SympFlow, systems, train
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training import session as sessions
 from sympflow.training import trainer, trials
 from sympflow.training.least_squares import STOPPED, Minimum
 from sympflow.training.session import Interruption
@@ -220,19 +219,8 @@ def test_trials_say_what_they_try(monkeypatch, capsys):
     assert "with a curvature term" in said
 
 
-class Clock:
-    """Time that passes only where it is told to."""
-
-    def __init__(self):
-        self.now = 0.0
-
-    def perf_counter(self):
-        return self.now
-
-
-def test_a_budget_and_the_training_time_count_the_trials(monkeypatch):
-    clock, seen = Clock(), {}
-    monkeypatch.setattr(sessions, "time", clock)
+def test_a_budget_and_the_training_time_count_the_trials(monkeypatch, clock):
+    seen = {}
 
     def chosen(system, domain, session):
         clock.now += 5.0
@@ -251,9 +239,7 @@ def test_a_budget_and_the_training_time_count_the_trials(monkeypatch):
         assert seen == {"left": whole - 5.0, "seconds": 5.0}
 
 
-def test_a_budget_that_cuts_the_last_fits_is_reported(monkeypatch):
-    clock = Clock()
-    monkeypatch.setattr(sessions, "time", clock)
+def test_a_budget_that_cuts_the_last_fits_is_reported(monkeypatch, clock):
 
     def pass_by():
         clock.now += 100.0

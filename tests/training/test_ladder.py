@@ -299,7 +299,7 @@ def test_every_flow_is_a_map_for_all_times(listed):
     system = next(s for s in SCENES if listed.is_of(s))
     flow = listed.load(system)
     if listed.shift is not None:  # in its own time it is early or late: what it is right in is the physical time
-        figures = clock_errors(flow, system, 987, 6)
+        figures = clock_errors(flow, system, system.domain, 987, 6)
         assert max(figures.values()) <= 10 * flow.figures["one_step_error_max"]
         return
     x = flow.domain_for(system).sample(6, 987)

@@ -8,7 +8,7 @@ import pytest
 import sympflow
 from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
 from sympflow.flow.primed import PrimedFlow
-from sympflow.training import energy_runs, table_fit
+from sympflow.training import lattice_fit, table_fit
 from sympflow.training.lattice_fit import TAIL, LatticePiece
 
 BOND = "r**2/2 + r**4/4"
@@ -127,7 +127,7 @@ def test_a_table_that_overflowed_is_as_bad_as_can_be(flow):
     """And is left out of the flow: a search that took too long a step goes on."""
     lattice = ring(12, domain=LatticeStates(0.2))
     mine = flow.of_any_size(lattice)
-    runs = energy_runs.EnergyRuns(mine, lattice, lattice.domain.sample(2), 0.0, 1.0)
+    runs = lattice_fit.EnergyRuns(mine, lattice, lattice.domain.sample(2), 0.0, 1.0)
     offset, design = runs.table.polynomial(np.array([flow.dt]))
     theta = runs.table.frozen_parameters(offset[0] + design[0] @ runs.table.parameters())
     before = runs.residuals(theta)
@@ -142,10 +142,10 @@ def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
     lattice = ring(domain=LatticeStates(0.2))
     with pytest.raises(ValueError, match=r"^`runs` must be a positive integer; got 0"):
         train(lattice, flow=flow, runs=0, **FIT)
-    with pytest.raises(ValueError, match=r"^`runs` are of lattices that keep their energy, and"):
+    with pytest.raises(ValueError, match=r"^`runs` need a lattice that conserves its energy, and"):
         train(ring(damping=0.1, domain=LatticeStates(0.2)), dt=0.2, runs=4, **FIT)
     pendulum = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", domain=Box([-1, -1], [1, 1]))
-    with pytest.raises(ValueError, match=r"^`runs` are of lattices that keep their energy, and"):
+    with pytest.raises(ValueError, match=r"^`runs` need a lattice that conserves its energy, and"):
         train(pendulum, dt=0.5, runs=4, **FIT)
     with pytest.raises(ValueError, match=r"^`runs` begin in states of a larger piece of the system, and `data`"):
         train(lattice, runs=4, data=([0.1], np.zeros((1, 512)), np.zeros((1, 512))))

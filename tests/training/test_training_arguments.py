@@ -118,7 +118,7 @@ def test_the_remedies_work():
 
 def test_unknown_options_are_refused_with_those_that_there_are():
     for name in ("nonsense", "stagse"):
-        with pytest.raises(TypeError, match=rf"^`{name}` is no option of train\(\): .*stages, .*learning_rate"):
+        with pytest.raises(TypeError, match=rf"^`{name}` is not an option of train\(\): .*stages, .*learning_rate"):
             train(HH, **{name: 3})
     for kind in KINDS:
         for solver in SOLVERS:
@@ -133,6 +133,8 @@ def test_unknown_options_are_refused_with_those_that_there_are():
         ({"fit": "primed"}, TypeError, "^`fit` must be a fit of sympflow.training"),
         ({"fit": PrimedFit(), "solver": Adam()}, TypeError, "^`solver` of PrimedFit is GaussNewton; .*LossFit"),
         ({"fit": PrimedFit(), "solver": "adam"}, TypeError, "^`solver` must be GaussNewton"),
+        ({"budget": 1.0, "time_budget": 1.0}, TypeError, "^`budget` and `time_budget` are the same limit"),
+        ({"budget": -1.0}, ValueError, "^`budget` must be a positive number of seconds; got -1"),
         ({"fit": LossFit()}, TypeError, "^`flow` is missing, which LossFit trains further"),
         ({"fit": NetworkFit(), "flow": SympFlow(2)}, TypeError, "^`fit` NetworkFit is not one of a given SympFlow"),
         ({"fit": SplitFit(), "flow": SympFlow(2)}, TypeError, "^`fit` SplitFit is not one of a given SympFlow"),

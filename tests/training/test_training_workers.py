@@ -20,7 +20,7 @@ from sympflow.training.split_fit import SplitRun
 from sympflow.training.starts import scaling_of
 from sympflow.training.table_fit import TableFit, TableRun
 from sympflow.training.table_step import TableStep
-from sympflow.workers import Crew
+from sympflow.workers import WorkerPool
 
 PENDULUM = systems.pendulum()
 FLOW = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=0)
@@ -53,7 +53,7 @@ def test_trials_are_the_same_whatever_the_workers(monkeypatch):
         monkeypatch.setattr(trials, name, value)
     alone = trials.chosen_trial(PENDULUM, PENDULUM.domain)
     with ThreadPoolExecutor(2) as threads:
-        found = trials.chosen_trial(PENDULUM, PENDULUM.domain, Session(crew=Crew(threads)))
+        found = trials.chosen_trial(PENDULUM, PENDULUM.domain, Session(pool=WorkerPool(threads)))
     assert (found.start, found.error) == (alone.start, alone.error)
     assert same(found.flow, alone.flow)
 
@@ -120,7 +120,7 @@ def in_main_thread(event, item):
 def test_a_time_budget_does_not_wait_for_workers_that_start():
     event = threading.Event()
     with ThreadPoolExecutor(2) as threads:
-        session = Session(time_budget=0.05, crew=Crew(threads))
+        session = Session(time_budget=0.05, pool=WorkerPool(threads))
         try:
             assert list(session.each(in_main_thread, event, range(5), session.deadline)) == [*range(5)]
         finally:

@@ -21,11 +21,12 @@ QUICK = {"STARTS": 2, "STEPS": 20, "FINAL_STEPS": 20, "POINTS": 40, "LENGTH": 50
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.02], ids=["none", "some"])
-def test_trials_that_the_time_ended_are_warned_of(monkeypatch, seconds):
+def test_trials_that_the_time_ended_are_warned_of(monkeypatch, clock, seconds):
     monkeypatch.setattr("sympflow.training.session.LEAST_PART", 3.5 * seconds)
+    clock.tick = 1e-4
 
     def trial(start, *_):
-        time.sleep(seconds)
+        clock.now += seconds
         return trials.Trial(start, 1e-8)
 
     monkeypatch.setattr(trials, "trial", trial)

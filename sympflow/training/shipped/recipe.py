@@ -20,7 +20,7 @@ from sympflow.training.clock_fit import train_clock
 from sympflow.training.fits import ClockedFit, Fit, GaussNewton, LossFit, NetworkFit, Solver
 from sympflow.training.session import Session
 from sympflow.training.trainer import fit_flow
-from sympflow.workers import Crew
+from sympflow.workers import WorkerPool
 
 
 class Judge(Protocol):
@@ -64,7 +64,7 @@ class Recipe:
         before = time.process_time()
         domain = self.domain_of(system)
         if isinstance(self.fit, ClockedFit):
-            return train_clock(system, self.fit)
+            return train_clock(system, self.fit, domain)
         start = None if isinstance(self.fit, NetworkFit) else self.fit.flow(system, domain, earlier)
         first = self.fit if start is None else self.fit.of_a_given_flow
         flow = fit_flow(system, start, first, self.solver, domain, Session(progress=progress))
@@ -102,13 +102,13 @@ def made(
     """
     flows: dict[tuple[str, str], FlowMap] = {}
     left = list(recipes)
-    with Crew(workers) as crew:
+    with WorkerPool(workers) as pool:
         while left:
             names = {(recipe.scene, recipe.name) for recipe in left}
             ready = [recipe for recipe in left if (recipe.scene, recipe.after) not in names]
             left = [recipe for recipe in left if recipe not in ready]
             items = [(recipe, _before(recipe, flows, earlier)) for recipe in ready]
-            for recipe, flow in zip(ready, crew.map(_made, progress, items), strict=True):
+            for recipe, flow in zip(ready, pool.map(_made, progress, items), strict=True):
                 flows[recipe.scene, recipe.name] = flow
                 yield recipe, flow
 

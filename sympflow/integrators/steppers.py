@@ -1,0 +1,275 @@
+"""Steppers: one run of a fixed-step method, in compiled loops or by array operations."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, library_name, stack
+from sympflow.integrators.contract import Problem
+from sympflow.integrators.grid import Grid
+from sympflow.kernels.protocol import Carry
+
+if TYPE_CHECKING:
+    from sympflow.kernels.protocol import Kernel
+
+_ADVICE = re.compile(r"(, or use|: use|\. Use) backend='array'\.$")
+
+
+class ArraySteps:
+    """The steps of one run by array operations, and the count of their evaluations; a subclass defines `step`."""
+
+    takes_carry: bool = True
+    counts: Mapping[str, int] | None = None
+    """The evaluations that were made so far, where they are counted."""
+    stages: int = 0
+    """Evaluations of the force and the Hessian in each iteration of an implicit step; 0 of an explicit one."""
+    iterations: int = 0
+    backend: str = ""
+    """The name of what runs, if it is not the library of the states."""
+
+    def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        """One step of length h, a number or one for each state, from y (..., 2d) at the time t, of either kind."""
+        raise NotImplementedError
+
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
+        """See `Stepper.rollout`."""
+        return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
+
+    def check_lengths(self, h: Any) -> None:
+        """Warn of lengths of steps, those of compiled loops too, for which the method was not made."""
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
+        """Evaluations of forces and their derivatives, as `FixedStep.evaluations`."""
+        raise NotImplementedError
+
+
+class Stepper:
+    """One run of a fixed-step integrator: all that a run changes or counts is here, its kernel and its arrays.
+
+    Attributes
+    ----------
+    kernel : Kernel or None
+        The compiled loops of the run; None where it is made of array operations.
+    arrays : ArraySteps
+        The same steps by array operations, and their evaluations.
+    saves_finite : bool
+        True if the states that `rollout` saves up to the last finite one are known to be finite.
+    remark : str
+        Why a run of a formula is not compiled, for its message.
+    why : str
+        Why functions of Python run as such, to be read after the backend.
+    """
+
+    def __init__(
+        self,
+        integrator: Any,
+        problem: Problem,
+        arrays: ArraySteps,
+        kernel: Kernel | None = None,
+        told: Sequence[str] = (),
+    ) -> None:
+        self.integrator, self.system, self.problem = integrator, problem.system, problem
+        self.arrays, self.kernel = arrays, kernel
+        self.saves_finite = kernel is not None and kernel.saves_finite
+        self.remark = self.why = ""
+        y0, untraced = problem.y0, None if kernel is not None or problem.system is None else problem.system.untraced
+        if untraced and problem.backend == "auto" and not is_tensor(y0) and y0.dtype == np.float64:
+            name = "potential" if problem.system.separable else "hamiltonian"
+            self.why = f": `{name}` could not be traced, for {untraced}"
+        if told and problem.system.symbols is not None:
+            self.remark = f" Its steps were array operations: {_ADVICE.sub('.', told[0])}"
+
+    @property
+    def compiled(self) -> bool:
+        """True if the steps run in compiled loops."""
+        return self.kernel is not None
+
+    @property
+    def backend(self) -> str:
+        """The means of the run, for `stats["backend"]`: "compiled", "numpy", "torch", or another library's name."""
+        if self.kernel is not None:
+            return self.kernel.backend
+        return self.arrays.backend or library_name(self.problem.y0)
+
+    @property
+    def takes_carry(self) -> bool:
+        """True if `rollout` takes a carry: unless the steps are those of a `rollout` that a class has of its own."""
+        return self.kernel is not None or self.arrays.takes_carry
+
+    @property
+    def counts_itself(self) -> bool:
+        """True if `evaluations` tells those that were made so far, whatever the steps."""
+        return self.arrays.counts is not None or self.arrays.stages > 0
+
+    def rollout(
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+    ) -> tuple[Array, np.ndarray]:
+        """Return the states (len(save), ..., 2d) after the steps `save` (sorted counts in 0 … n_steps) of length h.
+
+        Also the index of the last finite state of each trajectory, of shape y0.shape[:-1]. With a `carry` the run from
+        y0 goes on from there: see `kernels.protocol.Kernel.run`.
+        """
+        if self.kernel is None:
+            return self.arrays.rollout(y0, h, n_steps, save, t0, carry)
+        rows = y0 if y0.ndim == 1 else y0.reshape(-1, y0.shape[-1])
+        states, last, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
+        self.remark = self.kernel.remark
+        if y0.ndim > 1:
+            states = states.swapaxes(0, 1).reshape(len(save), *y0.shape)
+        self.arrays.iterations += iterations
+        return states, np.asarray(last).reshape(y0.shape[:-1])
+
+    def shorter(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        """Return the states a step of length h, a number or one for each state, after y (..., 2d) at the time t."""
+        if self.kernel is None:
+            return self.arrays.step(y, h, t)
+        self.arrays.check_lengths(h)
+        times = t if np.ndim(t) == 0 else np.broadcast_to(t, y.shape[:-1]).reshape(-1)
+        rows = y if y.ndim == 2 else np.ascontiguousarray(y).reshape(-1, y.shape[-1])
+        lengths = h if np.shape(h) == (len(rows),) else np.broadcast_to(h, y.shape[:-1]).reshape(-1)
+        states, iterations = self.kernel.step(lengths, rows, times)
+        self.arrays.iterations += iterations
+        return states.reshape(y.shape)
+
+    def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
+        """Evaluations of the force and its derivatives so far, if it made so many steps, saves and shorter steps."""
+        arrays = self.arrays
+        if arrays.stages:
+            return dict.fromkeys(("force_evaluations", "hessian_evaluations"), arrays.iterations * arrays.stages)
+        known = arrays.counts if self.kernel is None else self.kernel.evaluations(n_steps, n_saved, n_extra)
+        return arrays.evaluations(n_steps, n_saved, n_extra, self.backend) if known is None else dict(known)
+
+    def more_stats(self) -> dict[str, int]:
+        """Further entries of the statistics."""
+        return {"newton_iterations": self.arrays.iterations} if self.arrays.stages else {}
+
+
+def compiled_loops(
+    make: Callable[[], Any],
+    y0: Array,
+    backend: str,
+    compensated: bool = False,
+    reason: str | None = None,
+    told: list[str] | None = None,
+) -> Any:
+    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations."""
+    if backend == "array":
+        reason = "`backend` is 'array': choose 'auto'."
+    elif is_tensor(y0):
+        reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
+    elif y0.dtype != np.float64:
+        reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
+    asked = reason is None
+    if reason is None:
+        try:
+            return make()
+        except ValueError as error:
+            reason = str(error)
+    if backend == "compiled":
+        raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
+    if compensated:
+        needed = "" if reason.startswith("`compensated`") else "`compensated` sums need compiled loops. "
+        raise ValueError(needed + reason) from None
+    if told is not None and backend == "auto" and asked:
+        told.append(reason)
+    return None
+
+
+def rollout(
+    step: Callable[[int, Array], Array],
+    y: Array,
+    n_steps: int,
+    save: np.ndarray,
+    block: int = 64,
+    carry: Carry | None = None,
+) -> tuple[Array, np.ndarray]:
+    """States at the counts `save` of n_steps times `step(k, y)`, and the last finite count of each trajectory."""
+    k = 0
+    if carry is not None and carry.running is not None:
+        k, y = carry.steps, carry.running
+    tensor = is_tensor(y)
+    out: Any = [] if tensor else np.full((len(save), *y.shape), np.nan, dtype=y.dtype)
+    wanted = save.tolist()
+    position = 0
+    finite = np.where(finite_states(y, in_any_lane=True), n_steps, -1)
+    if wanted and wanted[0] == 0:
+        out.append(y) if tensor else out.__setitem__(0, y)
+        position = 1
+    with np.errstate(all="ignore"):
+        while k < n_steps and (finite == n_steps).any():
+            start, y_start = k, y
+            for k in range(start, min(start + block, n_steps)):
+                y = checked_state(step(k, y), y)
+                if position < len(wanted) and wanted[position] == k + 1:
+                    if tensor:
+                        out.append(y)
+                    else:
+                        out[position] = y
+                    position += 1
+            k += 1
+            failed = (finite == n_steps) & ~finite_states(y, in_any_lane=True)
+            if failed.any():
+                z = y_start
+                for j in range(start, k):
+                    z = step(j, z)
+                    first = failed & (finite == n_steps) & ~finite_states(z, in_any_lane=True)
+                    finite = np.where(first, j, finite)
+    if carry is not None:
+        carry.advance(n_steps, y)
+    if tensor:
+        out += [full_of_nan(y)] * (len(wanted) - len(out))
+        out = stack(out, axis=0) if out else y[None][:0]
+    return out, np.asarray(finite)
+
+
+def checked_state(y_next: Any, y: Array) -> Array:
+    """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
+    shape, tensor = getattr(y_next, "shape", None), is_tensor(y)
+    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == tensor:
+        if tensor and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
+            raise TypeError(
+                "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
+                "whose step takes arrays only says so by `arrays_only`."
+            )
+        return y_next
+    what = "" if shape is None else f" of {y_next.dtype} and shape {tuple(shape)}"
+    raise TypeError(
+        f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
+        f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
+    )
+
+
+def _gradients_are_on() -> bool:
+    import torch
+
+    return torch.is_grad_enabled()
+
+
+def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:
+    """Replace the states y, those at grid points `count`, by those a step later where the remainder h is not 0."""
+    extra = remainder.nonzero()[0]
+    if not extra.size:
+        return y
+    h = remainder[extra]
+    first, last = int(extra[0]), int(extra[-1])
+    together = last - first == len(extra) - 1  # nearly always, and a slice is copied ten times sooner
+    rows: Any = slice(first, last + 1) if together and not is_tensor(y) else extra
+    states = y[rows]
+    lengths, t = h, grid.t0 + count[extra] * grid.h
+    if y.ndim != 2:
+        lengths, t = (np.broadcast_to(x.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy() for x in (h, t))
+    if not is_tensor(y):
+        with np.errstate(all="ignore"):
+            y[rows] = checked_state(stepper.shorter(states, lengths.astype(y.dtype), t), states)
+        return y
+    import torch
+
+    h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
+    advanced = checked_state(stepper.shorter(states, h_extra, t), states)
+    return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
