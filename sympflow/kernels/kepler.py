@@ -357,8 +357,8 @@ class KeplerLoops:
         n = len(frame.order)
         if not n or n > MOST_GROUPS * LANES - 1 or (len(frame.test) and not frame.jacobi):
             raise ValueError(
-                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, and for "
-                "bodies without mass in Jacobi's coordinates: use backend='array'."
+                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, with "
+                "bodies without mass in Jacobi's coordinates only: use backend='array'."
             )
         self.frame, self.code = frame, KeplerCode(frame)
         size = AWAY * frame.size.max()
