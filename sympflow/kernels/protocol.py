@@ -96,6 +96,8 @@ class Batch(NamedTuple):
     counts : ndarray of shape (N,), or (0,) of stages that count nothing
     stop : ndarray of int64 of shape (1,)
         The run ends soon once it is not 0.
+    kept : ndarray, optional
+        Room for the states before all stages: see `sympflow.kernels.runs.run_function`.
     """
 
     y0: np.ndarray
@@ -107,6 +109,7 @@ class Batch(NamedTuple):
     running: np.ndarray
     counts: np.ndarray = NOTHING
     stop: np.ndarray = NEVER
+    kept: np.ndarray | None = None
 
     @classmethod
     def whole(cls, y0: np.ndarray, n_steps: int, save: np.ndarray, n_out: int) -> Batch:
@@ -119,7 +122,7 @@ class Batch(NamedTuple):
         stop = self.stop if stop is None else stop
         if begin == 0 and end >= len(self.y0):
             return self if stop is self.stop else self._replace(stop=stop)
-        y0, n_steps, save, out, finite, first, running, counts, _ = self
+        y0, n_steps, save, out, finite, first, running, counts, *_ = self
         i = slice(begin, end)
         return Batch(y0[i], n_steps, save, out[i], finite[i], first, running[i], counts[i], stop)
 
@@ -256,6 +259,18 @@ class Kernel:
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,), of a driven system at times t."""
+        raise NotImplementedError
+
+    def check_reverse(self) -> None:
+        """Raise a ValueError, with the reason, where runs cannot be differentiated: see `recorded`."""
+        raise ValueError("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
+
+    def recorded(self, task: Task) -> Any:
+        """`runs`, as a `Recorded` run, of which cotangents can be pulled back."""
+        raise NotImplementedError
+
+    def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of tensors, with `values` of the parameters, by tensor operations."""
         raise NotImplementedError
 
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
