@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -17,39 +18,6 @@ if TYPE_CHECKING:
 ZERO = 1e-12  # of the largest squared frequency: what is below is a free drift
 SAME = 1e-9  # relative difference below which two frequencies are one
 EQUILIBRIUM_STEPS = 100
-
-
-class Scene(Protocol):
-    """The properties of a `HamiltonianSystem` that tell its linear part."""
-
-    name: str
-    ndof: int
-    symbols: Any
-    quadratic_kinetic: bool
-    inverse_mass: np.ndarray | None
-    stiffness_matrix: np.ndarray | None
-    domain: Any
-    y0: Any
-    t_span: Any
-
-    separable: bool
-    autonomous: bool
-
-    @property
-    def local(self) -> Any: ...
-
-    @property
-    def written(self) -> Any: ...
-
-    def potential(self, q: Any, t: Any = None) -> Any: ...
-
-    def force(self, q: Any, t: Any = None) -> Any: ...
-
-    def potential_hessian(self, q: Any, t: Any = None) -> Any: ...
-
-    def kinetic_hessian(self, p: Any) -> Any: ...
-
-    def check_conservative(self, what: str, remedy: str) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -199,13 +167,13 @@ class LinearPart:
         return float(self.frequencies.max(initial=0.0) * self.interval)
 
 
-def check_parts_conservative(system: Scene) -> None:
+def check_parts_conservative(system: Any) -> None:
     """Refuse a system with friction, which the exact flows of parts of H leave out."""
     remedy = "use the splitting 'kinetic', as of 'verlet'"
     system.check_conservative("which exact flows of parts of H omit", remedy)
 
 
-def linear_part(system: Scene) -> LinearPart:
+def linear_part(system: Any) -> LinearPart:
     """The quadratic part of a system, read off its symbols or made from its `stiffness_matrix`.
 
     Of H = T(p) + V(q) or of any other H the terms ½ pᵀBp + ½ qᵀKq + linear ones are taken, where B belongs to
@@ -252,7 +220,7 @@ def linear_part(system: Scene) -> LinearPart:
     return part
 
 
-def _equilibrium(system: Scene, K: np.ndarray) -> np.ndarray:
+def _equilibrium(system: Any, K: np.ndarray) -> np.ndarray:
     """c in the range of K where ∇V vanishes along it: the rest U is then small beside ½ (q−c)ᵀK(q−c)."""
     inverse, t0 = np.linalg.pinv(K, rcond=1 / GAP**2, hermitian=True), float(system.t_span[0])
     starts = [np.zeros(system.ndof)] + ([] if system.y0 is None else [system.y0[: system.ndof]])
@@ -260,18 +228,19 @@ def _equilibrium(system: Scene, K: np.ndarray) -> np.ndarray:
         for start in starts:
             if not np.isfinite(system.force(start, t0)).all():
                 continue
-            q, last = start.copy(), np.inf
+            q, last, reach = start.copy(), np.inf, 0.0
             for _ in range(EQUILIBRIUM_STEPS):
                 change = inverse @ np.asarray(system.force(q, t0))
                 size = float(np.linalg.norm(change))
                 if not size < last:  # at the level of rounding, or nowhere near
                     break
                 q, last = q + change, size
-            return inverse @ K @ q if last <= 1e-6 * (1 + np.linalg.norm(q)) else inverse @ K @ start
+                reach = max(reach, size, float(np.linalg.norm(q)))
+            return inverse @ K @ q if last <= 1e-6 * reach else inverse @ K @ start
     return np.zeros(system.ndof)
 
 
-def _interval(system: Scene) -> float:
+def _interval(system: Any) -> float:
     return abs(system.t_span[1] - system.t_span[0])
 
 
@@ -305,9 +274,19 @@ def read_off(
     X = sp.Matrix([s - _number(c) for s, c in zip(q, center, strict=True)])
     P, Ks, Bs = sp.Matrix(p), *(sp.Matrix(d, d, [_number(v) for v in A.ravel()]) for A in (K_array, B_array))
     removed = sp.expand(quadratic - (X.T * Ks * X)[0] / 2 - (P.T * Bs * P)[0] / 2)
-    negligible = 1e-12 * (1 + np.abs(slope).max())
-    kept = [t for t in sp.Add.make_args(removed) if abs(t.as_coeff_Mul()[0]) > negligible and t.free_symbols]
+    given = sp.expand(quadratic).as_coefficients_dict()
+    kept = [
+        t
+        for t in sp.Add.make_args(removed)
+        if t.free_symbols and abs(t.as_coeff_Mul()[0]) > ZERO * _size(t.as_coeff_Mul()[1], given, K_array, center, q)
+    ]
     return LinearPart(B_array, K_array, center, rest + sp.Add(*kept), interval)
+
+
+def _size(term: sp.Expr, given: Any, K: np.ndarray, center: np.ndarray, q: Sequence[sp.Symbol]) -> float:
+    """The size of what cancels in the coefficient of a term: as it was given, and of K·center where it is linear."""
+    from_center = float(np.abs(K[q.index(term)] * center).max()) if term in q else 0.0
+    return max(abs(float(given.get(term, 0))), from_center)
 
 
 def _number(value: float) -> Any:
@@ -356,14 +335,14 @@ GAP = 10.0  # between the curvatures of a stiff direction and of the others
 TURN = 0.1  # radians by which a stiff direction may turn and still count as constant
 
 
-def inverse_mass(system: Scene) -> np.ndarray:
+def inverse_mass(system: Any) -> np.ndarray:
     """M⁻¹ (d, d)."""
     if not system.quadratic_kinetic:
         raise ValueError("`stiffness_matrix` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
     return np.asarray(system.kinetic_hessian(np.zeros(system.ndof)), dtype=float)
 
 
-def turning(system: Scene, part: LinearPart | None) -> str | None:
+def turning(system: Any, part: LinearPart | None) -> str | None:
     """Why a constant K does not follow the stiff directions of V, or None.
 
     ∇²V is taken at states of low potential, in the domain or about y0: in the valleys where orbits are. It is stiff if
@@ -421,7 +400,7 @@ def _angle(reference: np.ndarray, directions: np.ndarray) -> float:
     return float(np.arccos(np.clip(np.quantile(cosines, 0.1), 0.0, 1.0)))
 
 
-def _positions(system: Scene) -> np.ndarray | None:
+def _positions(system: Any) -> np.ndarray | None:
     if system.domain is not None:
         q = system.domain.sample(DRAWN, 0)[:, : system.ndof]
     elif system.y0 is not None:
