@@ -76,8 +76,9 @@ def check_kept(name: str, value: Any) -> None:
     """Raise a TypeError if a number that a system keeps carries derivatives, which would be dropped in silence."""
     if is_tensor(value) and differentiable(value):
         raise TypeError(
-            f"`{name}` is a tensor that torch differentiates or transforms, but it is kept as numbers: write H with "
-            "it, as HamiltonianSystem(hamiltonian=...), or pass `.detach()`."
+            f"`{name}` is a tensor that torch differentiates or transforms, but it is kept as numbers: pass "
+            "`.detach()`, and the tensor itself to each run, as in solve(..., params={name: tensor}); or write H with "
+            "it, as HamiltonianSystem(hamiltonian=...)."
         )
 
 

@@ -26,6 +26,13 @@ def is_tensor(x: object) -> bool:
     return torch is not None and isinstance(x, torch.Tensor)
 
 
+def as_tensor(x: Array) -> Array:
+    """Return a tensor of the same numbers."""
+    import torch
+
+    return torch.as_tensor(x)
+
+
 def library(x: Array) -> Any:
     """Return the module of the functions for `x`: NumPy or torch."""
     if is_tensor(x):
@@ -223,6 +230,8 @@ def _behind(x: Any) -> tuple[Any, list[int]]:
     if torch.compiler.is_dynamo_compiling():
         return None, []
     functorch, axes = torch._C._functorch, list(range(x.ndim))
+    if type(x) is torch.Tensor and not functorch.is_functorch_wrapped_tensor(x):
+        return x.detach(), axes  # nearly always
     with torch._C._DisableFuncTorch():
         while functorch.is_functorch_wrapped_tensor(x):
             if functorch.is_batchedtensor(x):
@@ -247,7 +256,10 @@ def _is_transformed(x: Any) -> bool:
     import torch
     from torch.autograd import forward_ad
 
-    if torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x) or _is_symbolic(x):
+    functorch = torch._C._functorch
+    if torch.compiler.is_compiling() or functorch.is_functorch_wrapped_tensor(x) or _is_symbolic(x):
+        return True
+    if functorch.is_legacy_batchedtensor(x):  # cotangents side by side, of torch.autograd.grad(is_grads_batched=True)
         return True
     return forward_ad.unpack_dual(x).tangent is not None
 
@@ -267,6 +279,8 @@ def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
     """
     if not is_tensor(y):
         return np.isfinite(y).all(-1)
+    if y.device.type == "cpu" and (found := values(y)) is not None and found.ndim == y.ndim:
+        return np.isfinite(found).all(-1)
     finite = values(all_finite(y))
     if finite is None:
         return np.ones(y.shape[:-1], dtype=bool)

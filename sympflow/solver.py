@@ -23,7 +23,18 @@ from sympflow.arguments import (
     check_t_span,
     warn,
 )
-from sympflow.arrays import Array, concatenate, finite_states, full_of_nan, is_tensor, lanes, last, readable, to_numpy
+from sympflow.arrays import (
+    Array,
+    as_tensor,
+    concatenate,
+    finite_states,
+    full_of_nan,
+    is_tensor,
+    lanes,
+    last,
+    readable,
+    to_numpy,
+)
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_step
@@ -201,6 +212,8 @@ def solve(
     rows = None
     if params is not None:
         rows, y_start = check_params(system, params, y_start, integrator)
+        if rows.followed:
+            y_start = as_tensor(y_start)
         if rows.uniform:
             system = rows.system_of(0)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
@@ -281,6 +294,8 @@ def _answered(integrator: Integrator, problem: Problem, action: str, rows: Param
         sol = _solved(integrator, problem, action)
         sol.rows = rows
         return sol
+    if rows.followed:
+        return _solved_followed(integrator, problem, action, rows)
     return _solved_rows(integrator, problem, action, rows)
 
 
@@ -336,6 +351,23 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
         sol.store, sol.t, sol.y = problem.store, None, None
     if stopped is not None:
         raise Interrupted(outcome, sol) from None
+    return sol
+
+
+def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
+    """The solution of trajectories to whose parameters gradients flow: one run, whatever the values."""
+    columns = {name: np.ravel(value) for name, value in rows.values.items()}
+    followed = {name: rows.followed.get(name, as_tensor(column.copy())) for name, column in columns.items()}
+    letters = np.stack([*columns.values()])
+    together = replace(problem, letters=letters, followed=followed, diagnosed=False)
+    if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
+        raise ValueError(
+            f"`params` has {', '.join(rows.followed)} that require gradients, which flow through no `events`, "
+            "impulses, or `on_domain_exit` 'stop': detach them, or leave these out."
+        )
+    integrator.check_followed(together)
+    sol = _solved(integrator, together, action, rows)
+    sol.rows = rows
     return sol
 
 

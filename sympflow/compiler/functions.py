@@ -14,7 +14,7 @@ import numpy as np
 
 from sympflow.compiler.numbers import Number
 
-__all__ = ["FUNCTIONS", "Function", "added", "apply", "dot", "fma", "times", "where"]
+__all__ = ["FUNCTIONS", "Function", "added", "apply", "dot", "fma", "is_zero", "summed", "times", "where"]
 
 
 @dataclass(frozen=True)
@@ -199,6 +199,19 @@ def dot(x: Iterable[Any], y: Iterable[Any]) -> Any:
     total: Any = 0.0
     for a, b in zip(x, y, strict=False):
         total = total + times(a, b)
+    return total
+
+
+def is_zero(x: Any) -> bool:
+    """Return True of the float 0, which need not be added or multiplied."""
+    return isinstance(x, float) and x == 0.0
+
+
+def summed(total: Any, x: Iterable[Any], y: Iterable[Any]) -> Any:
+    """Return total + Σ xᵢ yᵢ of as many as there are of both, in compiled code rounded once for each."""
+    for a, b in zip(x, y, strict=False):
+        if not is_zero(a):
+            total = a * b if is_zero(total) else fma(a, b, total)
     return total
 
 

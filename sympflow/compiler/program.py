@@ -12,7 +12,7 @@ import numpy as np
 from sympflow.compiler.functions import FUNCTIONS, apply
 from sympflow.compiler.numbers import Number
 
-__all__ = ["Program", "Traced", "derivatives", "fused", "gradient", "tangent", "traced"]
+__all__ = ["Program", "Traced", "adjoint", "derivatives", "fused", "gradient", "tangent", "traced"]
 
 
 class Traced(Number):
@@ -79,6 +79,7 @@ def _place(x: Any) -> tuple[int, float]:
     return (1, x.order) if isinstance(x, Traced) else (0, x)
 
 
+MOST_DERIVED = 5000  # operations through which derivatives of single outputs are taken
 MOST_ROOTS = 8.5  # powers that are written as powers of a root
 _COMMUTE = {"add", "mul", "times", "min", "max", "eq", "and", "or"}
 
@@ -195,8 +196,10 @@ class Program:
     def __call__(self, *values: Any) -> list[Any]:
         """Return the outputs for values of the inputs, in their order: arrays, tensors, numbers of one kind."""
         of = {x.order: value for x, value in zip(self.inputs, values, strict=True)}
+        arrays = all(isinstance(x, np.ndarray | float) for x in values)
         for x in self.operations:
-            of[x.order] = apply(x.name, *[of[a.order] if isinstance(a, Traced) else a for a in x.args])
+            args = [of[a.order] if isinstance(a, Traced) else a for a in x.args]
+            of[x.order] = FUNCTIONS[x.name].numpy(*args) if arrays else apply(x.name, *args)
         return [of[x.order] if isinstance(x, Traced) else x for x in self.outputs]
 
     def __len__(self) -> int:
@@ -316,6 +319,55 @@ def tangent(outputs: Sequence[Any], x: Sequence[Traced], v: Sequence[Any]) -> li
                     total = total + partial * dots[a.order]
             dots[number.order] = total
     return [dots.get(y.order, 0.0) if isinstance(y, Traced) else 0.0 for y in outputs]
+
+
+def adjoint(program: Program) -> Program:
+    """Return the program from the inputs, and from cotangents of the outputs behind them, to those of the inputs.
+
+    In the reverse mode, number by number, or with the derivatives of each output by the inputs and by other outputs
+    that it is made of, which do not wait for cotangents: the better one.
+    """
+    recording, n = program.inputs[0].recording, len(program.outputs)
+    cotangents = [recording.input(f"of_{i}") for i in range(n)]
+    of: dict[int, Any] = {}
+    for a, y in zip(cotangents, program.outputs, strict=True):
+        if isinstance(y, Traced):
+            of[y.order] = of.get(y.order, 0.0) + a
+    found, marks = [], [{x.order for x in program.operations}]
+    if n * len(program) <= MOST_DERIVED:
+        marks.append(set(of))
+    for within in marks:
+        slopes = dict(of)
+        for number in reversed(program.operations):
+            if number.order in within and number.order in slopes:
+                for a, partial in _slopes_of(number, within):
+                    slopes[a.order] = slopes.get(a.order, 0.0) + slopes[number.order] * partial
+        found.append(fused(Program([*program.inputs, *cotangents], [slopes.get(x.order, 0.0) for x in program.inputs])))
+    return min(found, key=lambda each: 2 * _waiting(each, cotangents) + 3 * len(each))
+
+
+def _slopes_of(y: Traced, ends: set[int]) -> Iterator[tuple[Traced, Any]]:
+    """The derivatives of a number by others it is made of, down to inputs and the numbers at which it `ends`."""
+    slopes: dict[int, Any] = {y.order: 1.0}
+    known: dict[int, Traced] = {y.order: y}
+    while known:
+        number = known.pop(max(known))
+        slope = slopes[number.order]
+        if number is not y and (number.name == "input" or number.order in ends):
+            yield number, slope
+            continue
+        for a, partial in _partials(number):
+            slopes[a.order], known[a.order] = slopes.get(a.order, 0.0) + slope * partial, a
+
+
+def _waiting(program: Program, late: Sequence[Traced]) -> int:
+    """How long the outputs wait for inputs that are known late, in cycles."""
+    known = {x.order: 0 for x in late}
+    for x in program.operations:
+        ready = [known[a.order] for a in x.args if isinstance(a, Traced) and a.order in known]
+        if ready:
+            known[x.order] = max(ready) + FUNCTIONS[x.name].cost
+    return max((known.get(y.order, 0) for y in program.outputs if isinstance(y, Traced)), default=0)
 
 
 def derivatives(outputs: Sequence[Any], x: Sequence[Traced]) -> list[list[Any]]:

@@ -267,8 +267,8 @@ class Tables:
             stages = self._stages((s.kind, _numbers(s, self._coefficients, sign)) for s in substeps)
             numbers = np.array(stages, dtype=float)  # (m, columns, K)
             numbers = np.pad(numbers, ((0, 0), (0, 0), (0, max(0, 3 - numbers.shape[2]))))
-            kicks, gradients, curvatures = (numbers[:, i] for i in range(3))
-            return StageTable(self.level, kicks, numbers[:, -1], gradients, curvatures, numbers[:, 3:-1])
+            of_kick = range(3, numbers.shape[1] - 1) if self.level == POLYNOMIAL_LEVEL else (1, 2)
+            return StageTable(self.level, numbers[:, [-1, 0, *of_kick]].swapaxes(0, 1))
 
         return self.kept(("polynomials", back), make)
 

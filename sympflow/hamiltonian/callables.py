@@ -278,7 +278,7 @@ class CallableHamiltonian(Functions):
         return [self.ndof, *self._functions]
 
     def learns(self, y: Array) -> bool:
-        if self.numba_functions is not None or self.form is not None:
+        if self.numba_functions is not None or (self.form is not None and self.library == "numpy"):
             return False
         y = unfollowed(y)
         try:
@@ -618,7 +618,7 @@ class DrivenCallables(Functions):
         return result.reshape(*t.shape, *result.shape[1:])
 
     def learns(self, y: Array) -> bool:
-        return self.form is None and self._at(0.0).learns(y)
+        return (self.form is None or self.library == "torch") and self._at(0.0).learns(y)
 
     def check(self, states: np.ndarray, like: Array, n_given: int, times: np.ndarray | None = None) -> None:
         """Test them at each of the times (n,)."""

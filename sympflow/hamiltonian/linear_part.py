@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -17,36 +17,6 @@ if TYPE_CHECKING:
 ZERO = 1e-12  # of the largest squared frequency: what is below is a free drift
 SAME = 1e-9  # relative difference below which two frequencies are one
 EQUILIBRIUM_STEPS = 100
-
-
-class Scene(Protocol):
-    """The properties of a `HamiltonianSystem` that tell its linear part."""
-
-    name: str
-    ndof: int
-    symbols: Any
-    quadratic_kinetic: bool
-    inverse_mass: np.ndarray | None
-    stiffness_matrix: np.ndarray | None
-    domain: Any
-    y0: Any
-    t_span: Any
-
-    separable: bool
-    autonomous: bool
-
-    @property
-    def local(self) -> Any: ...
-
-    def potential(self, q: Any, t: Any = None) -> Any: ...
-
-    def force(self, q: Any, t: Any = None) -> Any: ...
-
-    def potential_hessian(self, q: Any, t: Any = None) -> Any: ...
-
-    def kinetic_hessian(self, p: Any) -> Any: ...
-
-    def check_conservative(self, what: str, remedy: str) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -196,13 +166,13 @@ class LinearPart:
         return float(self.frequencies.max(initial=0.0) * self.interval)
 
 
-def check_parts_conservative(system: Scene) -> None:
+def check_parts_conservative(system: Any) -> None:
     """Refuse a system with friction, which the exact flows of parts of H leave out."""
     remedy = "use the splitting 'kinetic', as of 'verlet'"
     system.check_conservative("which exact flows of parts of H omit", remedy)
 
 
-def linear_part(system: Scene) -> LinearPart:
+def linear_part(system: Any) -> LinearPart:
     """The quadratic part of a system, read off its symbols or made from its `stiffness_matrix`.
 
     Of H = T(p) + V(q) or of any other H the terms ½ pᵀBp + ½ qᵀKq + linear ones are taken, where B belongs to
@@ -249,7 +219,7 @@ def linear_part(system: Scene) -> LinearPart:
     return part
 
 
-def _equilibrium(system: Scene, K: np.ndarray) -> np.ndarray:
+def _equilibrium(system: Any, K: np.ndarray) -> np.ndarray:
     """c in the range of K where ∇V vanishes along it: the rest U is then small beside ½ (q−c)ᵀK(q−c)."""
     inverse, t0 = np.linalg.pinv(K, rcond=1 / GAP**2, hermitian=True), float(system.t_span[0])
     starts = [np.zeros(system.ndof)] + ([] if system.y0 is None else [system.y0[: system.ndof]])
@@ -268,7 +238,7 @@ def _equilibrium(system: Scene, K: np.ndarray) -> np.ndarray:
     return np.zeros(system.ndof)
 
 
-def _interval(system: Scene) -> float:
+def _interval(system: Any) -> float:
     return abs(system.t_span[1] - system.t_span[0])
 
 
@@ -353,14 +323,14 @@ GAP = 10.0  # between the curvatures of a stiff direction and of the others
 TURN = 0.1  # radians by which a stiff direction may turn and still count as constant
 
 
-def inverse_mass(system: Scene) -> np.ndarray:
+def inverse_mass(system: Any) -> np.ndarray:
     """M⁻¹ (d, d)."""
     if not system.quadratic_kinetic:
         raise ValueError("`stiffness_matrix` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
     return np.asarray(system.kinetic_hessian(np.zeros(system.ndof)), dtype=float)
 
 
-def turning(system: Scene, part: LinearPart | None) -> str | None:
+def turning(system: Any, part: LinearPart | None) -> str | None:
     """Why a constant K does not follow the stiff directions of V, or None.
 
     ∇²V is taken at states of low potential, in the domain or about y0: in the valleys where orbits are. It is stiff if
@@ -418,7 +388,7 @@ def _angle(reference: np.ndarray, directions: np.ndarray) -> float:
     return float(np.arccos(np.clip(np.quantile(cosines, 0.1), 0.0, 1.0)))
 
 
-def _positions(system: Scene) -> np.ndarray | None:
+def _positions(system: Any) -> np.ndarray | None:
     if system.domain is not None:
         q = system.domain.sample(DRAWN, 0)[:, : system.ndof]
     elif system.y0 is not None:

@@ -6,13 +6,14 @@ import math
 import reprlib
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import sympy as sp
 
-from sympflow.arrays import is_tensor
+from sympflow.arrays import differentiable, is_tensor, transformed
 from sympflow.hamiltonian.symbolic import exact, generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -28,10 +29,16 @@ class Rows(NamedTuple):
 
 
 class ParameterRows:
-    """The parameters of each trajectory of a batch."""
+    """The parameters of each trajectory of a batch; `followed` are tensors (N,) of those whose gradients are wanted."""
 
-    def __init__(self, system: HamiltonianSystem, values: Mapping[str, np.ndarray], uniform: bool = False) -> None:
-        self.system, self.values, self.uniform = system, dict(values), uniform
+    def __init__(
+        self,
+        system: HamiltonianSystem,
+        values: Mapping[str, np.ndarray],
+        uniform: bool = False,
+        followed: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        self.system, self.values, self.uniform, self.followed = system, dict(values), uniform, followed
         self.shape = next(iter(self.values.values())).shape
 
     @cached_property
@@ -150,7 +157,8 @@ class ParameterRows:
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""
-        return {"system": self.system, "values": self.values, "shape": self.shape, "uniform": self.uniform}
+        of_run = {"uniform": self.uniform, "followed": {}}
+        return {"system": self.system, "values": self.values, "shape": self.shape, **of_run}
 
 
 _Key = tuple[tuple[str, ...], tuple[float, ...]]
@@ -200,14 +208,20 @@ def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...])
             f"`params` must have shapes that broadcast with the batch {batch} of `y0`, as numbers or arrays of one "
             f"value for each trajectory; got {shapes}."
         ) from None
-    numbers = not any(array.ndim for array in arrays.values())
-    return ParameterRows(system, {name: np.broadcast_to(array, shape) for name, array in arrays.items()}, numbers)
+    followed = {name: value for name, value in params.items() if differentiable(value)}
+    followed = {name: value.double().cpu().expand(shape).reshape(-1) for name, value in followed.items()}
+    numbers = not followed and not any(array.ndim for array in arrays.values())
+    values = {name: np.broadcast_to(array, shape) for name, array in arrays.items()}
+    return ParameterRows(system, values, numbers, followed)
 
 
 def _checked_values(name: str, given: Any) -> np.ndarray:
     if is_tensor(given):
-        if given.requires_grad:
-            raise TypeError(f"`params` has {name} that requires a gradient, which does not flow to it: detach it.")
+        if transformed(given):
+            raise TypeError(
+                f"`params` has {name} that torch.func, forward mode or torch.compile follows, which solve does not "
+                "take: use torch.autograd.grad, or detach it."
+            )
         given = given.detach().cpu().numpy()
     try:
         array = np.asarray(given)

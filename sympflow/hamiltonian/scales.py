@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -25,25 +25,10 @@ SMALLEST_SCALE = 1e-12
 """|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
 
 
-class Scene(Protocol):
-    """The properties of a `HamiltonianSystem` by which its scales are known."""
-
-    ndof: int
-    domain: Any
-    t_span: tuple[float, float]
-    energy_scale: float | None
-
-    @property
-    def dt(self) -> float: ...
-
-    @property
-    def between_impulses(self) -> Any: ...
-
-
 _KNOWN: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
 
 
-def natural_scale(scene: Scene) -> np.ndarray:
+def natural_scale(scene: Any) -> np.ndarray:
     """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω)."""
     system = scene.between_impulses
     if system not in _KNOWN:
@@ -57,13 +42,13 @@ def natural_scale(scene: Scene) -> np.ndarray:
     return _KNOWN[system].copy()
 
 
-def weights(system: Scene) -> np.ndarray:
+def weights(system: Any) -> np.ndarray:
     """[s, 1/s], (2d,): the factors that make a state [q, p] one of numbers of a size."""
     s = natural_scale(system)
     return np.concatenate([s, 1 / s])
 
 
-def distance(system: Scene, change: np.ndarray, axis: int = -1) -> np.ndarray:
+def distance(system: Any, change: np.ndarray, axis: int = -1) -> np.ndarray:
     """Return ‖y − y'‖ of differences of states along an axis, each pᵢ divided by sᵢ²: in units of q."""
     s = natural_scale(system)
     shape = [1] * change.ndim
@@ -71,7 +56,7 @@ def distance(system: Scene, change: np.ndarray, axis: int = -1) -> np.ndarray:
     return np.linalg.norm(change * np.concatenate([np.ones_like(s), s**-2]).reshape(shape), axis=axis)
 
 
-def smallest_size(scene: Scene, y0: np.ndarray) -> float:
+def smallest_size(scene: Any, y0: np.ndarray) -> float:
     """A size that neither all q nor all p of an orbit from the states y0 (..., 2d) are less than; never 0."""
     system = scene.between_impulses
     scale = weights(system)
@@ -120,7 +105,7 @@ def fastest_rate(system: Any) -> float | None:
     return max(_median_rate(system, float(t)) for t in times) or SLOW / system.dt
 
 
-def default_step(scene: Scene, y: np.ndarray | None = None) -> float:
+def default_step(scene: Any, y: np.ndarray | None = None) -> float:
     """`STEP` over the largest rate at states y (..., 2d), by default y0 or those of the domain, to two digits."""
     system = scene.between_impulses
     rate = 0.0

@@ -221,6 +221,25 @@ class SymbolicHamiltonian(Definition):
         )
         return form if kept and alike and all(map(math.isfinite, form.values)) else self
 
+    def named(self, names: Sequence[str]) -> SymbolicHamiltonian:
+        """H with these parameters as symbols, whatever their values: the form by which it is differentiated by them."""
+        key = tuple(names)
+        if key not in self._named:
+            written, values = self.written
+            letters = {name: sp.Symbol(f"parameter_{i}", real=True) for i, name in enumerate(names)}
+            H = written.xreplace({s: letters.get(s.name, value) for s, value in values.items()})
+            states = {*self.q, *self.p}
+            form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
+            known = {s.name: s for s in values}
+            form.parameters, form.meanings = tuple(letters.values()), tuple(known[name] for name in names)
+            form.values = tuple(float(values[s]) for s in form.meanings)
+            self._named[key] = form
+        return self._named[key]
+
+    @cached_property
+    def _named(self) -> dict[tuple[str, ...], SymbolicHamiltonian]:
+        return {}
+
     @property
     def written(self) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
         """H as it was written, in the numbered coordinates, and the values of its parameters."""

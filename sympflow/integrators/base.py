@@ -32,7 +32,7 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.grid_runs import GridRun
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.steppers import ArraySteps, Stepper, rollout
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, sc
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parts import ExactParts, SubFlow
     from sympflow.hamiltonian.planets import Frame
-    from sympflow.kernels.carry import Carry
-    from sympflow.kernels.protocol import Kernel
+    from sympflow.kernels.protocol import Carry, Kernel
     from sympflow.kernels.splitting_loops import SplittingLoops
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()
@@ -68,6 +67,8 @@ class Composition(ABC, ArraySteps):
     """True if the time moves with one of the parts, of a system that depends on it."""
     breakdown: ClassVar[Failure | None] = None
     """The reason for which runs end that cannot go on; None for that of all methods."""
+    doubts: ClassVar[bool] = False
+    """True if there may be a warning of a step that is long for the system."""
     takes_extended: ClassVar[bool] = False
     """True if the parts stay as they are with E, the momentum of the time, as one more momentum."""
 
@@ -118,6 +119,10 @@ class Composition(ABC, ArraySteps):
     @abstractmethod
     def kernel(self, compensated: bool) -> Kernel:
         """The compiled loops; a ValueError says why there are none."""
+
+    def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
+        """The same with the parameters of these names as numbers by which runs are differentiated."""
+        raise ValueError(f"`method` {self.method!r} has no compiled derivatives by parameters.")
 
 
 MOST_GROWTH = 1.0
@@ -249,6 +254,16 @@ class KineticPotential(Composition):
                 p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
         return np.concatenate([q, p], axis=-1), np.concatenate([U, P], axis=-2)
 
+    def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
+        system = self.system
+        if system.symbols is None:
+            raise ValueError(f"`system` {system.name!r} is no symbolic one.")
+        if system.kinetic_timed:
+            raise ValueError(f"`system` {system.name!r} has a kinetic energy that depends on t.")
+        kernel = _splitting_loops()(system, names).kernel(self.scheme, compensated)
+        kernel.check_reverse()
+        return kernel
+
     def kernel(self, compensated: bool) -> Kernel:
         loops = _splitting_loops()(self.system)
         if not self.system.friction:
@@ -260,7 +275,7 @@ class KineticPotential(Composition):
 
 
 @cache
-def _splitting_loops() -> Callable[[HamiltonianSystem], SplittingLoops]:
+def _splitting_loops() -> Callable[..., SplittingLoops]:
     """The maker of compiled loops, imported once."""
     from sympflow.kernels.splitting_loops import splitting_loops
 
@@ -586,6 +601,7 @@ class KeplerInteraction(Composition):
     heliocentric ones it holds the motion of the star too, half before a kick and half after, which is of order 2.
     """
 
+    doubts: ClassVar[bool] = True
     breakdown: ClassVar[Failure | None] = Failure.ENCOUNTER
 
     def __init__(

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import Field, dataclass, fields
+from dataclasses import Field, dataclass, field, fields
 from enum import Enum
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -136,6 +136,8 @@ class Problem:
     events: EventSearch | None = None
     letters: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
+    followed: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters whose gradients are wanted, tensors (N,), by their names: then `letters` are the values of these."""
     progress: Progress | None = None
     """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None
@@ -220,6 +222,13 @@ class Integrator:
     def takes_letters(self, problem: Problem) -> bool:
         """True if a run takes values of parameters for each trajectory, as numbers of one compiled run."""
         return False
+
+    def check_followed(self, problem: Problem) -> None:
+        """Raise a ValueError where gradients do not flow to parameters."""
+        raise ValueError(
+            f"`params` has {', '.join(problem.followed)}, to which no gradient flows through method {self.name!r}: use "
+            "a splitting method on the splitting 'kinetic', such as 'kahan_li8', or detach them."
+        )
 
     @property
     def takes_driving(self) -> bool:

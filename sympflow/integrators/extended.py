@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,41 +15,24 @@ from sympflow.integrators.contract import Interrupted, Outcome, Problem
 from sympflow.integrators.interpolants import DenseOutput
 
 if TYPE_CHECKING:
+    from sympflow.integrators.compositions import Composition
     from sympflow.storage.runs import RunStore
 
 APART = 0.1
 """Distance of two copies, over the size of the states of the run, beyond which these mean little."""
 
 
-class Extension(Protocol):
-    """A phase space that extends the one of the system, and the way back."""
-
-    method: str
-
-    def lift(self, y: Array) -> Array:
-        """The states of the extended space for states y (..., 2d)."""
-        ...
-
-    def project(self, x: Array) -> Array:
-        """The states (..., 2d) of those of the extended space."""
-        ...
-
-    def distance(self, x: Array) -> Array:
-        """Distance of states of the extended space from those that `lift` gives, and their size: (..., 2)."""
-        ...
-
-
 class Projected(DenseOutput):
     """The dense output of a run on an extended phase space."""
 
-    def __init__(self, sol: Any, extension: Extension) -> None:
+    def __init__(self, sol: Any, extension: Composition) -> None:
         self.sol, self.extension, self.t_min, self.t_max = sol, extension, sol.t_min, sol.t_max
 
     def states(self, times: np.ndarray) -> Array:
         return self.extension.project(self.sol.states(times))
 
 
-def extended_run(run: Callable[[Problem], Outcome], extension: Extension, problem: Problem) -> Outcome:
+def extended_run(run: Callable[[Problem], Outcome], extension: Composition, problem: Problem) -> Outcome:
     """The outcome of a problem that is run on an extended phase space."""
     search = problem.events
     lifted = None if search is None else EventSearch(_of_projections(search, extension), search.max_interval)
@@ -81,14 +64,14 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Extension, proble
     return outcome
 
 
-def _of_projections(search: EventSearch, extension: Extension) -> Any:
+def _of_projections(search: EventSearch, extension: Composition) -> Any:
     return tuple(
         replace(event, g=lambda t, x, g=event.g: g(t, extension.project(x)))  # type: ignore[misc]
         for event in search.events
     )
 
 
-def _noted(store: RunStore, extension: Extension, x: np.ndarray) -> np.ndarray:
+def _noted(store: RunStore, extension: Composition, x: np.ndarray) -> np.ndarray:
     """The states of those of the extended space; a store keeps how far these are from ones that stand for a state."""
     with np.errstate(all="ignore"):
         found = np.asarray(extension.distance(x)).reshape(-1, 2)
@@ -98,7 +81,7 @@ def _noted(store: RunStore, extension: Extension, x: np.ndarray) -> np.ndarray:
     return np.asarray(extension.project(x))
 
 
-def _warn_of_distance(extension: Extension, x: np.ndarray, outcome: Outcome) -> None:
+def _warn_of_distance(extension: Composition, x: np.ndarray, outcome: Outcome) -> None:
     with np.errstate(all="ignore"):
         ratio = _ratio(np.asarray(extension.distance(x)).max(0))
     outcome.stats["copy_distance"] = float(np.nanmax(ratio)) if not np.isnan(ratio).all() else float("nan")
@@ -114,7 +97,7 @@ def _ratio(found: np.ndarray) -> np.ndarray:
     return np.where(apart == 0, 0.0, apart / np.where(size == 0, 1.0, size))
 
 
-def _warn(extension: Extension, apart: float, which: str) -> None:
+def _warn(extension: Composition, apart: float, which: str) -> None:
     warn(
         f"The two copies{which} that method {extension.method!r} keeps differ by up to {apart:.3g} of the size of "
         "the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which the "

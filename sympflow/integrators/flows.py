@@ -33,7 +33,7 @@ from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
 from sympflow.integrators.grid_runs import GridRun
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 
 if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do without
     from sympflow.flow.flow_map import FlowMap

@@ -32,7 +32,7 @@ from sympflow.integrators.grid import Grid, Outputs, distinct
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper, shorter_steps
 from sympflow.integrators.windows import ARRAY_STEPS, MOST_SAVED, ONE, Pace, Pieces, Saved, first_window
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 
 if TYPE_CHECKING:
     from sympflow.storage.runs import Place, RunStore

@@ -99,7 +99,7 @@ class Gauss(FixedStep):
         return True
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        from sympflow.kernels.implicit_loops import implicit_kernel
+        from sympflow.kernels.newton import implicit_kernel
 
         told: list[str] = []
         kernel = compiled_loops(

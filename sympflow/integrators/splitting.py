@@ -320,11 +320,23 @@ class Splitting(FixedStep):
         )
         return kernel is not None and bool(kernel.loops.values)
 
+    def check_followed(self, problem: Problem) -> None:
+        if self.clock != "physical" or self.overrides("step"):
+            super().check_followed(problem)
+        try:
+            if problem.backend == "array":
+                raise ValueError("`backend` is 'array'.")
+            self.composed(problem.system).kernel_by(bool(self.compensated), tuple(problem.followed))
+        except ValueError as error:
+            names = ", ".join(problem.followed)
+            raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
+
     def longest_step(self, system: HamiltonianSystem) -> float:
         return self.composed(system).longest_step() if self.clock == "physical" else super().longest_step(system)
 
     def doubt(self, system: HamiltonianSystem) -> str:
-        return self.composed(system).doubt(self.step_length(system)) if self.clock == "physical" else ""
+        doubts = SPLITTINGS[self.splitting].doubts and self.clock == "physical"
+        return self.composed(system).doubt(self.step_length(system)) if doubts else ""
 
     def check(self, system: HamiltonianSystem) -> None:
         if self.clock != "physical":
@@ -421,8 +433,14 @@ class Splitting(FixedStep):
         composition = self.composed(problem.system)
         told: list[str] = []
         compensated = bool(self.compensated)
+        names = tuple(problem.followed)
         kernel = compiled_loops(
-            lambda: composition.kernel(compensated), problem.y0, problem.backend, compensated, told=told
+            lambda: composition.kernel_by(compensated, names) if names else composition.kernel(compensated),
+            problem.y0,
+            problem.backend,
+            compensated,
+            told=told,
+            system=problem.system,
         )
         if problem.letters is not None:
             kernel = kernel.varied(problem.letters)

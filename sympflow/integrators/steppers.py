@@ -8,10 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, finite_states, full_of_nan, is_tensor, library_name, stack
+from sympflow.arrays import (
+    Array,
+    differentiable,
+    finite_states,
+    full_of_nan,
+    is_tensor,
+    library_name,
+    stack,
+    transformed,
+)
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
@@ -100,7 +109,10 @@ class Stepper:
     @property
     def takes_carry(self) -> bool:
         """True if `rollout` takes a carry: unless the steps are those of a `rollout` that a class has of its own."""
-        return self.kernel is not None or self.arrays.takes_carry
+        if self.kernel is None:
+            return self.arrays.takes_carry
+        y0 = self.problem.y0  # where torch follows the run, it cannot from piece to piece
+        return not is_tensor(y0) or not differentiable(y0, *self.problem.followed.values())
 
     @property
     def counts_itself(self) -> bool:
@@ -117,6 +129,10 @@ class Stepper:
         """
         if self.kernel is None:
             return self.arrays.rollout(y0, h, n_steps, save, t0, carry)
+        if is_tensor(y0):
+            from sympflow.integrators.tensors import rolled_out
+
+            return rolled_out(self, y0, h, n_steps, save, t0, carry)
         rows = y0 if y0.ndim == 1 else y0.reshape(-1, y0.shape[-1])
         states, last, iterations = self.kernel.run(h, rows, n_steps, save, carry, t0)
         self.remark = self.kernel.remark
@@ -129,6 +145,10 @@ class Stepper:
         """Return the states a step of length h, a number or one for each state, after y (..., 2d) at the time t."""
         if self.kernel is None:
             return self.arrays.step(y, h, t)
+        if is_tensor(y):
+            from sympflow.integrators.tensors import stepped
+
+            return stepped(self, y, h, t)
         self.arrays.check_lengths(h)
         times = t if np.ndim(t) == 0 else np.broadcast_to(t, y.shape[:-1]).reshape(-1)
         rows = y if y.ndim == 2 else np.ascontiguousarray(y).reshape(-1, y.shape[-1])
@@ -157,18 +177,25 @@ def compiled_loops(
     compensated: bool = False,
     reason: str | None = None,
     told: list[str] | None = None,
+    system: Any = None,
 ) -> Any:
-    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations."""
+    """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
+
+    Tensors need these, but where the `system` is given: there those on the CPU are compiled.
+    """
     if backend == "array":
         reason = "`backend` is 'array': choose 'auto'."
     elif is_tensor(y0):
-        reason = "`y0` is a tensor: pass a NumPy array, or use backend='array'."
+        reason = _no_loops_for(y0, system)
     elif y0.dtype != np.float64:
         reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
     asked = reason is None
     if reason is None:
         try:
-            return make()
+            loops = make()
+            if is_tensor(y0) and differentiable(y0):
+                loops.check_reverse()
+            return loops
         except ValueError as error:
             reason = str(error)
     if backend == "compiled":
@@ -178,6 +205,19 @@ def compiled_loops(
         raise ValueError(needed + reason) from None
     if told is not None and backend == "auto" and asked:
         told.append(reason)
+    return None
+
+
+def _no_loops_for(y0: Array, system: Any) -> str | None:
+    """Why a tensor needs array operations, if it does."""
+    if system is None:
+        return "`y0` is a tensor: pass a NumPy array, or use backend='array'."
+    if y0.device.type != "cpu":
+        return f"`y0` is on {y0.device}: move it to the CPU, or use backend='array'."
+    if transformed(y0):
+        return "`y0` is followed by torch.func, forward mode or torch.compile: use backend='array'."
+    if system.learns(y0):
+        return "`system` has numbers that torch follows: use backend='array'."
     return None
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from sympflow.arrays import Array, concatenate, full_of_nan, is_tensor, readable
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.steppers import Stepper
-from sympflow.kernels.carry import Carry
+from sympflow.kernels.protocol import Carry
 
 SECONDS = 0.2
 """The time that a window is to take."""

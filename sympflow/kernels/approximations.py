@@ -117,17 +117,7 @@ def _powers(values: Sequence[Any], cosines: Sequence[Sequence[Any]], half: float
     degree = next((k for k in range(n - 1) if tails[k + 1] <= EXACT * less * largest), n)
     if degree > HIGHEST:
         return None
-    powers = [mp.mpf(0)] * (degree + 1)
-    before, current = [mp.mpf(1)], [mp.mpf(0), mp.mpf(1)]
-    for k in range(degree + 1):
-        T = before if k == 0 else current
-        for i, t in enumerate(T):
-            powers[i] += chebyshev[k] * t
-        if k >= 1:
-            following = [mp.mpf(0), *(2 * t for t in current)]
-            for i, t in enumerate(before):
-                following[i] -= t
-            before, current = current, following
+    powers = np.polynomial.chebyshev.cheb2poly(np.array(chebyshev[: degree + 1], dtype=object)).tolist()
     powers = [c if abs(c) > EXACT * less * largest / n else mp.mpf(0) for c in powers]
     if sum(map(abs, powers)) > AMPLIFIED * less * largest:
         return None

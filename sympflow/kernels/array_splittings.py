@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from sympflow.compiler.arrange import Arranged
-from sympflow.compiler.control import INT, POINTER, Value
+from sympflow.compiler.control import INT, POINTER, Rows, Value
 from sympflow.compiler.functions import added, fma
-from sympflow.compiler.program import gradient, traced
+from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.formulas import Letter
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Numbers, Room
@@ -75,22 +75,39 @@ class TermForces:
         self.data = [*V.data, *kinetic]
 
     def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        self._V.added(room, self._V.slopes, [q], out, d, letters)
+        self._add(room, self._V.slopes, [q], out, d, letters)
 
     def product(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        self._V.added(room, self._V.products, [q, v], out, d, letters)
+        self._add(room, self._V.products, [q, v], out, d, letters)
 
     def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        self._V.added(room, self._V.bends, [q, v], out, d, letters)
+        self._add(room, self._V.bends, [q, v], out, d, letters)
 
     def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        place = len(self._V.data)
         if self._T is None or isinstance(self._T, np.ndarray):
             with room.code.over(d) as i:
                 x = room.load(i, p)
-                room.store(x if self._T is None else x * room.code.load(room.data(place), i), i, out)
+                room.store(x if self._T is None else x * room.code.load(room.data(len(self._V.data)), i), i, out)
             return
-        self._T.added(room, self._T.slopes, [p], out, d, letters, place)
+        self._add(room, self._T.slopes, [p], out, d, letters, self._T)
+
+    def _add(
+        self,
+        room: Room,
+        derivatives: Sequence[Program],
+        given: Sequence[Value],
+        out: Value,
+        d: Value,
+        letters: Sequence[Any],
+        T: Terms | None = None,
+    ) -> None:
+        """Write derivatives of V, or of T, at places in memory into another one."""
+        with room.code.over(d) as i:
+            room.store(0.0, i, out)
+        terms, first = (self._V, 0) if T is None else (T, len(self._V.data))
+        data = [room.data(first + k) for k in range(len(terms.data))]
+        rows, total = [Rows(x, room.type) for x in given], Rows(out, room.type)
+        terms.add(data, derivatives, rows, letters, lambda places: [(total, place) for place in places])
 
 
 class Functions:
@@ -161,10 +178,10 @@ def term_code(splitting: Splitting) -> ArrayCode:
     M = symbols.inverse_mass
     T: Terms | np.ndarray | None = None
     if M is None or not M.is_diagonal() or M.free_symbols:
-        T = Terms(symbols.T, symbols.p, symbols.parameters)
+        T = Terms(symbols.T, symbols.p, symbols.parameters).check()
     elif any(x != 1 for x in M.diagonal()):
         T = np.array([float(x) for x in M.diagonal()])
-    return ArrayCode(splitting, TermForces(Terms(symbols.V, symbols.q, symbols.parameters), T))
+    return ArrayCode(splitting, TermForces(Terms(symbols.V, symbols.q, symbols.parameters).check(), T))
 
 
 def function_code(

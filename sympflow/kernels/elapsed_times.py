@@ -19,7 +19,7 @@ import numpy as np
 from sympflow.compiler.control import DOUBLE, INT, POINTER, Code, Module, Type, Value, Variable
 from sympflow.compiler.machine import host
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.runs import ColumnStage, Lanes, finished, groups, there
+from sympflow.kernels.runs import ColumnStage, Lanes, assign, finished, groups, there
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import SplittingCode
 from sympflow.kernels.stages import run_table, step_table
@@ -170,7 +170,7 @@ class _Reach:
                 code.store(x.value, start, i * width)
             first = j.value
             with code.over(block * self.link):
-                _set(state, column(j.value, [x.value for x in state], self.zero))
+                assign(state, column(j.value, [x.value for x in state], self.zero))
                 j.value = self._following(j.value)
             end = column(self.link + 1, [x.value for x in state], self.zero)
             code.store(self._elapsed(end, n.value + block, of_clock), then)
@@ -247,7 +247,7 @@ class _Reach:
         column = ColumnStage(code, self.table, self.kinds, self.made.size, 1, 1, self.made.stage)
         state, before = [code.variable(x) for x in start], [code.variable(x) for x in start]
         with code.given(self.zero < n):
-            _set(before, column(self.link + 1, start, self.zero))
+            assign(before, column(self.link + 1, start, self.zero))
         j, k, s = code.variable(first), code.variable(self.zero), code.variable(code.load(saved, lane, INT))
         found, row = code.variable(code.constant(1, Type("i1"))), begin + lane
 
@@ -256,7 +256,7 @@ class _Reach:
 
         with code.during(lambda: found.value & due() & (k.value < block)):
             with code.over(self.link):
-                _set(state, column(j.value, [x.value for x in state], self.zero))
+                assign(state, column(j.value, [x.value for x in state], self.zero))
                 j.value = self._following(j.value)
             after = column(self.link + 1, [x.value for x in state], self.zero)
             t = (
@@ -273,7 +273,7 @@ class _Reach:
                     code.store(x.value, place, i)
                 code.store(n + k.value + 1, self.counts, row * 2)
                 s.value = s.value + 1
-            _set(before, after)
+            assign(before, after)
             k.value = k.value + 1
         code.store(s.value, saved, lane)
         return found.value
@@ -291,7 +291,7 @@ class _Reach:
         low, high, last_sigma, last_t = (code.variable(x) for x in (none, longest, none, before))
         guess = code.select(before < after, longest * (target - before) / (after - before), none)
         sigma = code.variable(code.apply("min", (code.apply("max", (guess, none)), longest)))
-        _set(best, start)
+        assign(best, start)
         residual_of_best = code.variable(code.apply("abs", (before - target,)))
         trials = code.variable(self.zero)
         open_ = code.variable(code.constant(1, Type("i1")))
@@ -304,7 +304,7 @@ class _Reach:
             residual = now - target
             size = code.apply("abs", (residual,))
             with code.given(size < residual_of_best.value):
-                _set(best, x)
+                assign(best, x)
                 residual_of_best.value = size
             short = residual < 0.0  # NaN counts as too far
             low.value = code.select(short, s, low.value)
@@ -326,10 +326,5 @@ class _Reach:
         with code.over(self.n_columns) as c:
             numbers: list[Any] = [code.load(self.step, c * given + i) for i in range(given)]
             numbers[:2] = [sigma * number for number in numbers[:2]]
-            _set(x, made.executed(numbers, [value.value for value in x]))
+            assign(x, made.executed(numbers, [value.value for value in x]))
         return [value.value for value in x]
-
-
-def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:
-    for variable, value in zip(variables, values, strict=True):
-        variable.value = value

@@ -10,12 +10,12 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.compiler.control import DOUBLE, POINTER, Module, Value
+from sympflow.compiler.control import DOUBLE, POINTER, Module, Rows, Value
 from sympflow.compiler.machine import compiled, host
 from sympflow.compiler.program import Program, gradient
 from sympflow.hamiltonian.formulas import Letter, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import OneStep, OneStepKernel, add_terms, is_large, lettered
+from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
 from sympflow.kernels.runs import Numbers, Room
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
@@ -87,8 +87,8 @@ class Field:
         self.ndof = system.ndof
         self._damping = system.friction.matrix(self.ndof) if system.friction else None
         self.rates = [] if self._damping is None else self._damping[self._damped].tolist()
-        self._families = _families(self.lettered) if self.large else []
-        self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]
+        self._terms = terms_of(self.lettered) if self.large else None
+        self.data = [] if self._terms is None else [*self._terms.data]
         if self._damping is not None:
             self.data.append(np.ascontiguousarray(self._damping))
 
@@ -146,10 +146,9 @@ class Field:
         given = [code.load(letters, k) for k in range(len(self.lettered.given))]
         with code.over(n) as m:
             code.store(code.constant(0.0), g, m)
-        for i, family in enumerate(self._families):
-            found = recorded([family.f], (*family.x, *family.c, *self.lettered.given))
-            slopes = Program(found.inputs, gradient(found.outputs[0], found.inputs[: len(family.x)]))
-            add_terms(family, data[2 * i : 2 * i + 2], slopes, y, given, lambda places: [(g, m) for m in places])
+        slope = Rows(g, DOUBLE)
+        assert self._terms is not None
+        self._terms.add(data, self._terms.slopes, [Rows(y, DOUBLE)], given, lambda places: [(slope, m) for m in places])
         with code.over(d) as m:
             code.store(code.load(g, m + d), out, m)
             force = -code.load(g, m)
@@ -161,13 +160,6 @@ class Field:
 
                 (force,) = code.loop(d, [force], damped)
             code.store(force, out, m + d)
-
-
-def _families(lettered: Any) -> list[Any]:
-    """The kinds of terms of H."""
-    from sympflow.kernels.terms import families
-
-    return families(lettered.expressions[0], (*lettered.symbols.q, *lettered.symbols.p))
 
 
 class _Explicit(OneStep):

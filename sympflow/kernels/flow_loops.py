@@ -347,7 +347,7 @@ class CollocatedFlowKernel(Kernel):
     saves_finite = False
 
     def __init__(self, system: HamiltonianSystem, tableau: Tableau, steps: int) -> None:
-        from sympflow.kernels.implicit_loops import implicit_kernel
+        from sympflow.kernels.newton import implicit_kernel
 
         self._kernel, self._steps = implicit_kernel(system, tableau), steps
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from sympflow.compiler.arrange import ALWAYS, Arrangement
 from sympflow.compiler.control import INT, Code, Sweep, Type, Value
-from sympflow.compiler.functions import FUNCTIONS, added, times
+from sympflow.compiler.functions import FUNCTIONS, added, is_zero, times
 from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
@@ -728,7 +728,7 @@ class _Place:
                 for key, x in law(partial(self._of_bond, axis, k)):
                     if key[0] == "kept":
                         self.keep((key, axis), x)
-                    elif not (isinstance(x, float) and x == 0):
+                    elif not is_zero(x):
                         ahead = self._acting(axis, k, self.code.operand(x, self.scene.type))
                         change = self.behind(axis, k, key[1], ahead) - ahead
                         total[key[1]] = total[key[1]] + change if key[1] in total else change

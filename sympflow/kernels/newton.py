@@ -12,19 +12,22 @@ from collections.abc import Sequence
 from functools import cached_property, reduce
 from itertools import pairwise
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Type, Value
-from sympflow.compiler.functions import added, fma, where
+from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value
+from sympflow.compiler.functions import added, fma, is_zero, where
 from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
 from sympflow.hamiltonian.formulas import recorded
-from sympflow.kernels.one_steps import Lettered, OneStep, add_terms, is_large
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, terms_of
+from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
 
-__all__ = ["newton_code"]
+__all__ = ["implicit_kernel", "newton_code"]
 
 TOLERANCE = 1e-11  # of a relative increment: convergence is quadratic, so what is left is below rounding
 ROUNDING = 1e-9  # increments below this that no longer shrink are rounding
@@ -32,6 +35,51 @@ SMALLEST = 1e-150  # of a size whose reciprocal is multiplied by other numbers
 MOST_IN_REGISTERS = 4  # unknowns
 ABREAST = 4  # numbers of a row of a matrix that are changed together
 LONG = 4e6  # operations between two looks for a stop
+
+
+def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
+    """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
+
+    Raises
+    ------
+    ValueError
+        If the system cannot be compiled, with the reason.
+    """
+    kernels = _KERNELS.setdefault(system, {})
+    if (tableau, compensated) not in kernels:
+        kernels[tableau, compensated] = _kernel(system, tableau, compensated)
+    return kernels[tableau, compensated]
+
+
+_KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneStepKernel]] = WeakKeyDictionary()
+
+
+def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
+    written = system.written or system.form
+    if written is None:
+        raise ValueError(
+            "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
+            "or use backend='array'."
+        )
+    friction = system.friction
+    if friction and compensated:
+        raise ValueError("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
+    if friction.kind == 2:
+        raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
+    symbols = written if is_large(written) else written.parametric
+    of_time = with_letters(symbols, [symbols.H])
+    code = newton_code(of_time, tableau, compensated, bool(friction))
+    single = newton_code(of_time, tableau, False, False) if compensated else code
+    if not friction:
+        return OneStepKernel(code, single)
+    rates = np.broadcast_to(friction.rates, system.ndof)
+    exponents = np.outer([*stage_nodes(tableau), 1.0], rates).ravel()
+
+    def growths(h: np.ndarray) -> np.ndarray:
+        """e^{γτ} at the stages and the end of steps, and their reciprocals."""
+        return np.exp(np.concatenate([h[:, None] * exponents, -h[:, None] * exponents], axis=1))
+
+    return OneStepKernel(code, single, growths)
 
 
 def newton_code(lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> NewtonCode:
@@ -217,13 +265,8 @@ class _InMemory(NewtonCode):
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
         super().__init__(lettered, tableau, compensated, damped)
         symbols = lettered.symbols
-        self._large = is_large(symbols)
-        self._families = []
-        if self._large:
-            from sympflow.kernels.terms import families
-
-            self._families = families(lettered.expressions[0], (*symbols.q, *symbols.p))
-        self.data = [x for each in self._families for x in (each.coordinates.astype(np.int64), each.constants)]
+        self._terms = terms_of(lettered) if is_large(symbols) else None
+        self.data = [] if self._terms is None else self._terms.data
         n, N = self.n_out, self.unknowns
         self._numbers = self.size + self.stages * len(self.lettered.letters)
         self._sizes = [N, self._numbers, N * self._wide, n, n, n * n, N]
@@ -338,34 +381,23 @@ class _InMemory(NewtonCode):
         n, letters = self.n_out, len(self.lettered.letters)
         given = [code.load(numbers, 1 + k) for k in range(self.parameters)]
         given += [code.load(numbers, i * letters + (self.size + k)) for k in range(letters)]
-        if self._large:
-            self._add_terms(code, given, Y, g, S, data)
+        if self._terms is not None:  # a loop over the terms of each kind
+            _fill(code, g, n)
+            _fill(code, S, n * n)
+            slope, rows = Rows(g, DOUBLE), Rows(S, DOUBLE)
+
+            def targets(places: list[Value]) -> list[tuple[Rows, Value]]:
+                return [(slope, m) for m in places] + [(rows, i * n + j) for i in places for j in places]
+
+            self._terms.add(data, self._terms.hessians, [Rows(Y, DOUBLE)], given, targets)
             return
-        slope, hessian = self._square(self.slopes(*(code.load(Y, m) for m in range(n)), *given))
-        for m, x in enumerate(slope):
+        slopes, hessian = self._square(self.slopes(*(code.load(Y, m) for m in range(n)), *given))
+        for m, x in enumerate(slopes):
             code.store(code.operand(x, DOUBLE), g, m)
         for j, row in enumerate(hessian):
             for k, x in enumerate(row):
-                if not _is_zero(x):
+                if not is_zero(x):
                     code.store(code.operand(x, DOUBLE), S, j * n + k)
-
-    def _add_terms(
-        self, code: Code, given: Sequence[Value], Y: Value, g: Value, S: Value, data: Sequence[Value]
-    ) -> None:
-        """The same by a loop over the terms of each kind."""
-        n = self.n_out
-        _fill(code, g, n)
-        _fill(code, S, n * n)
-
-        def targets(places: list[Value]) -> list[tuple[Value, Value]]:
-            return [(g, m) for m in places] + [(S, row * n + column) for row in places for column in places]
-
-        for i, family in enumerate(self._families):
-            program = recorded([family.f], (*family.x, *family.c, *self.lettered.given))
-            x = program.inputs[: len(family.x)]
-            slope = gradient(program.outputs[0], x)
-            both = Program(program.inputs, [*slope, *(entry for s in slope for entry in gradient(s, x))])
-            add_terms(family, data[2 * i : 2 * i + 2], both, Y, given, targets)
 
     def _fill_sizes(self, code: Code, state: Value, K: Value, M: Value, sizes: Value) -> None:
         """The reciprocal size of each unknown: of its variable, or of the largest of its kind where that is 0."""
@@ -471,7 +503,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
     rows = [[*row, value, weight] for row, value, weight in zip(M, x, weights, strict=True)]
     for k in range(n):
         for i in range(k + 1, n):
-            if _is_zero(rows[i][k]):
+            if is_zero(rows[i][k]):
                 continue
             better = abs(rows[i][k]) * rows[i][-1] > abs(rows[k][k]) * rows[k][-1]
             for j in range(k, n + 2):
@@ -479,7 +511,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
                 rows[k][j], rows[i][j] = where(better, b, a), where(better, a, b)
         inverse = 1.0 / rows[k][k]
         for row in rows[k + 1 :]:
-            if _is_zero(row[k]):
+            if is_zero(row[k]):
                 continue
             factor = -(row[k] * inverse)
             for j in range(k + 1, n + 1):
@@ -497,7 +529,7 @@ def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) ->
 def _total(terms: Sequence[Any]) -> Any:
     total: Any = 0.0
     for x in terms:
-        total = x if _is_zero(total) else total + x
+        total = x if is_zero(total) else total + x
     return total
 
 
@@ -507,12 +539,8 @@ def _larger(a: Any, b: Any) -> Any:
 
 def _largest(values: Sequence[Any]) -> Any:
     """The largest absolute value."""
-    moving = [abs(x) for x in values if not _is_zero(x)]
+    moving = [abs(x) for x in values if not is_zero(x)]
     return reduce(_larger, moving) if moving else 0.0
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, float) and x == 0.0
 
 
 def _fill(code: Code, place: Value, count: int) -> None:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler.control import INT, Code, Value
-from sympflow.compiler.program import Program
+from sympflow.compiler.control import Code, Value
 from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
@@ -18,9 +17,9 @@ from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.threads import given
 
 if TYPE_CHECKING:
-    from sympflow.kernels.terms import Family
+    from sympflow.kernels.terms import Terms
 
-__all__ = ["Lettered", "OneStep", "OneStepKernel", "add_terms", "check_size", "is_large", "lettered"]
+__all__ = ["Lettered", "OneStep", "OneStepKernel", "check_size", "is_large", "lettered", "terms_of"]
 
 MOST_COMPILED = 5000  # operations of a gradient
 
@@ -54,6 +53,14 @@ def is_large(form: Any) -> bool:
     return is_large(form)
 
 
+def terms_of(lettered: Lettered) -> Terms:
+    """The terms of the first expression, of a large system."""
+    from sympflow.kernels.terms import Terms
+
+    symbols = lettered.symbols
+    return Terms(lettered.expressions[0], (*symbols.q, *symbols.p), lettered.given)
+
+
 def check_size(form: TracedHamiltonian) -> None:
     """Refuse a traced function that would take long to compile.
 
@@ -66,35 +73,6 @@ def check_size(form: TracedHamiltonian) -> None:
             f"`system` has {form.size:,} operations in its gradient, more than {MOST_COMPILED:,}, which are not "
             "compiled: write it with HamiltonianSystem.from_sympy, lattice or pairs, or use backend='array'."
         )
-
-
-def add_terms(
-    family: Family,
-    data: Sequence[Value],
-    values: Program,
-    y: Value,
-    given: Sequence[Value],
-    targets: Callable[[list[Value]], list[tuple[Value, Value]]],
-) -> None:
-    """Add the values of each term of a kind, of its coordinates, constants and the given numbers, in a loop.
-
-    Parameters
-    ----------
-    data : two addresses
-        Of the family's coordinates and constants.
-    y : Value
-        The address of the state.
-    targets : callable
-        From the places of a term's coordinates to those of its values: addresses and indices.
-    """
-    (coordinates, constants), code, k, n = data, y.code, len(family.x), len(family.c)
-    with code.over(len(family.coordinates)) as term:
-        places = [code.load(coordinates, term * k + j, INT) for j in range(k)]
-        numbers = [code.load(y, place) for place in places]
-        numbers += [code.load(constants, term * n + j) for j in range(n)]
-        for (target, place), x in zip(targets(places), values(*numbers, *given), strict=True):
-            if not (isinstance(x, float) and x == 0):
-                code.store(code.load(target, place) + x, target, place)
 
 
 class OneStep(Rollouts):

@@ -26,7 +26,7 @@ from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.runs import Memory, Numbers, Room, finished
-from sympflow.kernels.splittings import Shape, Splitting, WithinRange
+from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
 from sympflow.kernels.teams import Member, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
@@ -224,11 +224,11 @@ class FewSplitting(Splitting):
         pair = local.V, local.first, local.c, local.cutoff is None, local.box is None
         return *pair, local.n_bodies, local.dim, self.level, self.compensated, self.friction
 
-    def kinds(self) -> Sequence[Arranged | WithinRange]:
+    def kinds(self) -> Sequence[Stage | WithinRange]:
         _check_level(self.level)
         return super().kinds()
 
-    def _arranged(self, terms: int) -> Arranged:
+    def _arranged(self, terms: int) -> Stage:
         return FewShape(self, terms, True).arranged()[1]
 
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
-from sympflow.compiler.functions import fma, times
+from sympflow.compiler.functions import fma, is_zero, times
 from sympflow.compiler.program import Program, gradient
 from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlow, shears
@@ -248,7 +248,7 @@ def _combined(weights: Sequence[Any], values: Sequence[Any]) -> Any:
     """Σ weights_i values_i, without those that are 0."""
     total: Any = 0.0
     for w, x in zip(weights, values, strict=True):
-        if isinstance(w, float) and w == 0:
+        if is_zero(w):
             continue
         term = x if isinstance(w, float) and w == 1 else times(w, x)
         total = term if isinstance(total, float) else total + term

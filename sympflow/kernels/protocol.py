@@ -3,17 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.kernels.carry import Carry
 from sympflow.kernels.threads import NEVER, given, run_rows
 
 __all__ = ["Batch", "Carry", "Kernel", "Run", "Steps", "Task", "run_states"]
 
 NOTHING: Any = np.empty(0)
+
+
+@dataclass
+class Carry:
+    """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
+
+    The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
+    state is another one, and compensated sums have errors. A run that is given a carry goes on from it, and leaves in
+    it where it ends; one that is interrupted leaves it as it was.
+
+    Attributes
+    ----------
+    steps : int
+        The steps made so far; 0 before a run.
+    running : ndarray of shape (K,), or (N, K) of a batch; or None
+        The kernel's own; None before a run. NaN where a trajectory has ended. Of array operations the states (..., K),
+        an array or a tensor.
+    spare : ndarray, optional
+        An array that the next running state of a batch may be written into, where it fits: that before the last one.
+    """
+
+    steps: int = 0
+    running: Any = None
+    spare: Any = None
+
+    def advance(self, steps: int, running: Any) -> None:
+        """Take the place after so many steps."""
+        self.steps, self.running = steps, running
 
 
 class Task(NamedTuple):
@@ -68,6 +96,8 @@ class Batch(NamedTuple):
     counts : ndarray of shape (N,), or (0,) of stages that count nothing
     stop : ndarray of int64 of shape (1,)
         The run ends soon once it is not 0.
+    kept : ndarray, optional
+        Room for the states before all stages: see `sympflow.kernels.runs.run_function`.
     """
 
     y0: np.ndarray
@@ -79,6 +109,7 @@ class Batch(NamedTuple):
     running: np.ndarray
     counts: np.ndarray = NOTHING
     stop: np.ndarray = NEVER
+    kept: np.ndarray | None = None
 
     @classmethod
     def whole(cls, y0: np.ndarray, n_steps: int, save: np.ndarray, n_out: int) -> Batch:
@@ -91,7 +122,7 @@ class Batch(NamedTuple):
         stop = self.stop if stop is None else stop
         if begin == 0 and end >= len(self.y0):
             return self if stop is self.stop else self._replace(stop=stop)
-        y0, n_steps, save, out, finite, first, running, counts, _ = self
+        y0, n_steps, save, out, finite, first, running, counts, *_ = self
         i = slice(begin, end)
         return Batch(y0[i], n_steps, save, out[i], finite[i], first, running[i], counts[i], stop)
 
@@ -230,25 +261,22 @@ class Kernel:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,), of a driven system at times t."""
         raise NotImplementedError
 
+    def check_reverse(self) -> None:
+        """Raise a ValueError, with the reason, where runs cannot be differentiated: see `recorded`."""
+        raise ValueError("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
+
+    def recorded(self, task: Task) -> Any:
+        """`runs`, as a `Recorded` run, of which cotangents can be pulled back."""
+        raise NotImplementedError
+
+    def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of tensors, with `values` of the parameters, by tensor operations."""
+        raise NotImplementedError
+
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The `step` from each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d); None where they are not compiled."""
         return None
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int] | None:
         """Count the evaluations of the system's functions in a run; None where the method itself counts them."""
-        return None
-
-    def reach_times(
-        self,
-        h: float,
-        y0: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        numbers: tuple[float, ...] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The states of rows of `y0` (N, 2d) at elapsed times, of steps that are equal in another time.
-
-        See `elapsed_times.reach_times`. None where there is no such pass.
-        """
         return None

@@ -12,7 +12,7 @@ import numpy as np
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.protocol import Batch
-from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "aligned", "filled", "zeros"]
@@ -104,6 +104,27 @@ class Rollouts:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
         raise NotImplementedError
 
+    def adjoint(
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+    ) -> tuple[list[Value], list[Value]]:
+        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
+        raise NotImplementedError
+
+    def check_reverse(self) -> None:
+        """Raise a ValueError, with the reason, where there is none."""
+        raise ValueError("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
+
+    def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of length h at t from tensors (..., 2d), by tensor operations.
+
+        `numbers` (n, m) are those of the columns of a step of length 1, `values` those of the parameters.
+        """
+        raise NotImplementedError
+
+    def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+        """From cotangents (m, size, …) of the numbers of columns to those of the numbers of a table (n, m, …)."""
+        raise NotImplementedError
+
     def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
         """One column of many states: see `sympflow.kernels.runs.Over`."""
         each(lambda values: self.stage(values, numbers, kind, step))
@@ -152,14 +173,18 @@ class Rollouts:
         return found
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "run", "run own" or "map"."""
-        memory = self.place
+        """Compile the function of a name: "run", "kept", "reverse", "slopes", each " own" too, or "map"."""
+        memory, (what, _, own_tables) = self.place, name.partition(" ")
+        if what in ("reverse", "slopes"):
+            sizes = self.n_values, self.n_out, self.size
+            return reverse_function(*sizes, self.adjoint, width, bool(own_tables), what == "slopes")
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
-        own, over = name == "run own", self.over if self.chunked else None
+        own, kept = bool(own_tables), what == "kept"
+        over = self.over if self.chunked and not kept else None
         return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over
+            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over, kept
         )
 
     @cached_property
@@ -189,12 +214,12 @@ class Rollouts:
                 self._run(table, part.rows(i, i + 1), closed, 1)
 
     def _run(self, table: Any, batch: Batch, closed: bool, width: int) -> None:
-        y0, n_steps, save, out, n_finite, first, running, counts, stop = batch
-        states = y0[:, : self.n_out]
+        y0, n_steps, save, out, n_finite, first, running, counts, stop, kept = batch
+        run, states, more = "run" if kept is None else "kept", y0[:, : self.n_out], () if kept is None else (kept,)
         if y0.shape[1] > self.n_out:
-            name, (entries, kinds) = "run own", self.own_columns(table, y0[:, self.n_out :], width)
+            name, (entries, kinds) = f"{run} own", self.own_columns(table, y0[:, self.n_out :], width)
         else:
-            name, (entries, kinds) = "run", self.prepared(table)
+            name, (entries, kinds) = run, self.prepared(table)
         begun = int(save.searchsorted(0, "right")) if len(save) and save[0] <= 0 else 0
         if begun:
             out[:, :begun] = states[:, None]
@@ -209,7 +234,7 @@ class Rollouts:
         left = np.empty((len(y0), self.n_values)) if keeps or self.counted else NEVER
         given = entries, kinds, len(kinds) - 2, int(closed), start, len(y0), first, n_steps
         outlets = later if len(later) else NEVER, len(later), outputs  # an empty array has no address
-        self.call(name, width, *given, *outlets, n_finite, left, int(keeps or self.counted), stop)
+        self.call(name, width, *given, *outlets, n_finite, left, int(keeps or self.counted), stop, *more)
         if apart:
             out[:, begun:] = outputs
         if self.counted:

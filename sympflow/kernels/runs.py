@@ -23,9 +23,11 @@ __all__ = [
     "Memory",
     "Numbers",
     "Room",
+    "assign",
     "finished",
     "groups",
     "map_function",
+    "reverse_function",
     "run_function",
     "step_function",
     "there",
@@ -40,6 +42,9 @@ Numbers = Callable[..., Any]
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 """``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
 `step` tells after how many whole steps the stage is executed."""
+Adjoint = Callable[[list[Value], list[Value], Numbers, Value, Value], tuple[list[Value], list[Value]]]
+"""``adjoint(values, cotangents, numbers, kind, step)``: the cotangents of the values before a stage, and of its
+numbers, for those of the values after it."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
 Over = Callable[[Callable[..., None], Numbers, Value, Value], None]
@@ -59,6 +64,7 @@ def run_function(
     every: int = BLOCK,
     closing: bool = True,
     over: Over | None = None,
+    kept: bool = False,
 ) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side, and of these as many as the fast memory holds.
 
@@ -83,6 +89,9 @@ def run_function(
         False if `closes` is always 0.
     over : callable, optional
         The stage of many states, where these are to be in memory: as pays where a stage is long.
+    kept : bool
+        True to keep the state before each stage, and the last one, for `reverse_function`: a further argument is the
+        address of ((n_steps − first)·link + 1) states of all trajectories side by side, group by group.
 
     Returns
     -------
@@ -99,13 +108,13 @@ def run_function(
     """
     module = Module(host().fused)
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
-    types += MEMORY if memory else []
+    types += MEMORY if memory else [POINTER] if kept else []
     code = module.function("run", types)
     table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite, running, keeps, stop = (
         code.arguments[:15]
     )
     one, zero = code.constant(1, INT), code.constant(0, INT)
-    state: _Registers | Memory
+    state: Any
     if width > 1 and memory is None and over is not None:
         state = _Chunks(code, n_values, n_out, width, own, over)
     else:
@@ -121,6 +130,7 @@ def run_function(
         j, step = code.variable(code.select(zero < first, link, zero)), code.variable(first)
         alive = code.variable(code.constant(1, Type("i1", 1 if isinstance(state, _Chunks) else width)))
         going = code.variable(first < n_steps)
+        history = _History(code, code.arguments[15], group, (n_steps - first) * link, n_values, width) if kept else None
         with code.during(lambda: going.value):
             k = code.apply("min", (longest.value, n_steps - n.value))
             if look is not None:
@@ -130,12 +140,17 @@ def run_function(
             k = code.select(left, code.apply("min", (k, following)), k)
             j_before, step_before = j.value, step.value
             state.remember()
-            with code.over(k * link):
+            made = (n.value - first) * link
+            with code.over(k * link) as i:
                 at = j.value
+                if history is not None:
+                    history.keep(state.values(), made + i)
                 state.change(column, at, step.value)
                 j.value = code.select(code.apply("eq", (at, link)), one, at + 1)
                 step.value = code.select(code.apply("eq", (j.value, link)), step.value + 1, step.value)
             state.end()
+            if history is not None:
+                history.keep(state.values(), made + k * link)
             if closing:
                 with code.over(closes):
                     state.change(column, link + 1, step.value, end=True)
@@ -165,6 +180,75 @@ def run_function(
             _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
             state.keep(running, begin, n_rows)
+    return finished(code, types)
+
+
+def reverse_function(
+    n_values: int, n_out: int, size: int, adjoint: Adjoint, width: int = 1, own: bool = False, slopes: bool = False
+) -> Callable[..., None]:
+    """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
+
+    Parameters
+    ----------
+    n_values, n_out, size, width, own
+        As for `run_function`.
+    adjoint : callable
+    slopes : bool
+        True to find the derivatives by the numbers of the columns too.
+
+    Returns
+    -------
+    callable
+        Of addresses and integers (table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, slopes):
+        `rows` (n_rows, n_values) are the cotangents of the running states after `n_steps` steps, and become those after
+        `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than `first`. What a table of its own for
+        every `width` trajectories would hold is added to `slopes`, in the same order.
+    """
+    types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER]
+    code = Module(host().fused).function("reverse", types)
+    table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, derivatives = code.arguments
+    one, zero = code.constant(1, INT), code.constant(0, INT)
+    lanes, outputs = Lanes(code, n_values, width), Lanes(code, n_out, width)
+    with code.over(groups(code, n_rows, width)) as group:
+        begin, length = group * width, (link + 2) * (size * width)
+        place = code.at(table, group * length) if own else table
+        column = ColumnStage(code, place, kinds, size, width if own else 1, width, _no_stage)
+        found = code.at(derivatives, group * length)
+        history = _History(code, kept, group, (n_steps - first) * link, n_values, width)
+        cotangents = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
+        n, saved = code.variable(n_steps), code.variable(n_saved)
+
+        def pulled(j: Value, step: Value, state: list[Value], given: list[Value]) -> list[Value]:
+            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step)
+            for i, x in enumerate(of_numbers if slopes else ()):
+                at = j * (size * width) + i * width
+                code.store(code.load(found, at, x.type) + x, found, at)
+            return of_state
+
+        def last() -> Value:
+            some = zero < saved.value
+            return code.select(some, code.load(save, code.select(some, saved.value - 1, zero), INT), first)
+
+        with code.during(lambda: first < n.value):
+            s = code.variable((n.value - first) * link)
+            with code.during(lambda: (zero < saved.value) & code.apply("eq", (last(), n.value))):
+                saved.value = saved.value - 1
+                given = outputs.loaded(out, begin, n_rows, n_saved * n_out, saved.value * n_out)
+                given += [code.constant(0.0, given[0].type)] * (n_values - n_out)
+                for x, more in zip(cotangents, pulled(link + 1, n.value, history.state(s.value), given), strict=True):
+                    x.value = x.value + more
+            to = code.apply("max", (last(), first))
+            r, step = code.variable(link), code.variable(n.value)
+            with code.over((n.value - to) * link):
+                s.value, r.value = s.value - 1, r.value - 1
+                opens = code.apply("eq", (r.value, 0))
+                step.value = code.select(code.apply("eq", (r.value + 1, link)), step.value - 1, step.value)
+                begins = code.apply("eq", (s.value + first, 0))
+                j = code.select(opens, code.select(begins, zero, link), r.value)
+                assign(cotangents, pulled(j, step.value, history.state(s.value), [x.value for x in cotangents]))
+                r.value = code.select(opens, link, r.value)
+            n.value = to
+        lanes.store([x.value for x in cotangents], rows, begin, n_rows, one, zero)
     return finished(code, types)
 
 
@@ -335,16 +419,19 @@ class _Registers:
 
     def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
         state = self._end if end else self._state
-        _set(state, column(j, [x.value for x in state], step))
+        assign(state, column(j, [x.value for x in state], step))
+
+    def values(self) -> list[Value]:
+        return [x.value for x in self._state]
 
     def look(self, look: Callable[[Any], Any]) -> None:
-        _set(self._state, look([x.value for x in self._state]))
+        assign(self._state, look(self.values()))
 
     def remember(self) -> None:
         self._before = [x.value for x in self._state]
 
     def restore(self) -> None:
-        _set(self._state, self._before)
+        assign(self._state, self._before)
 
     def end(self) -> None:
         self._end = [self.code.variable(x.value) for x in self._state]
@@ -364,6 +451,23 @@ class _Registers:
     def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
         one, zero = self.code.constant(1, INT), self.code.constant(0, INT)
         self._lanes.store([x.value for x in self._state], running, begin, n_rows, one, zero)
+
+
+class _History:
+    """The states before the stages of a run, of a group of trajectories."""
+
+    def __init__(self, code: Code, place: Value, group: Value, stages: Value, n_values: int, width: int) -> None:
+        self.code, self._n, self._width, self._size = code, n_values, width, n_values * width
+        self._place = code.at(place, group * ((stages + 1) * self._size))
+
+    def keep(self, values: Sequence[Value], s: Value) -> None:
+        start = self.code.at(self._place, s * self._size)
+        for i, x in enumerate(values):
+            self.code.store(x, start, i * self._width)
+
+    def state(self, s: Value) -> list[Value]:
+        start, type = self.code.at(self._place, s * self._size), Type("double", self._width)
+        return [self.code.load(start, i * self._width, type) for i in range(self._n)]
 
 
 class Memory:
@@ -545,6 +649,10 @@ def _state(
     return memory(code, width, arguments, before)
 
 
+def _no_stage(*_: Any) -> Any:
+    """The stage of a column of which the numbers alone are asked for."""
+
+
 def groups(code: Code, n_rows: Value, width: int) -> Value:
     """How often `width` rows are begun side by side."""
     if width == 1:
@@ -643,7 +751,7 @@ class ColumnStage:
         return self._stage(values, self.numbers(j, chunk), self.kind(j), step)
 
 
-def _set(variables: Sequence[Variable], values: Sequence[Value]) -> None:
+def assign(variables: Sequence[Variable], values: Sequence[Value]) -> None:
     for variable, value in zip(variables, values, strict=True):
         variable.value = value
 

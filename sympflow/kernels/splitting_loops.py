@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
@@ -23,26 +23,31 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.kernels.approximations import Ranges
+    from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.rollouts import Rollouts
     from sympflow.kernels.splittings import Splitting
     from sympflow.kernels.stage_times import Driving
 
 
-def splitting_loops(system: HamiltonianSystem) -> SplittingLoops:
+def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> SplittingLoops:
     """The compiled loops of splitting schemes on a separable system, made once per system.
+
+    With `names` the values of `SplittingLoops` are those of these parameters.
 
     Raises
     ------
     ValueError
         If the system cannot be compiled, with the reason.
     """
-    loops = _LOOPS.get(system)
-    if loops is None:
-        loops = _LOOPS[system] = SplittingLoops(system)
-    return loops
+    known = _LOOPS.get(system)
+    if known is None:
+        known = _LOOPS[system] = {}
+    if names not in known:
+        known[names] = SplittingLoops(system, names)
+    return known[names]
 
 
-_LOOPS: WeakKeyDictionary[HamiltonianSystem, SplittingLoops] = WeakKeyDictionary()
+_LOOPS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[str, ...], SplittingLoops]] = WeakKeyDictionary()
 
 LANES_OF_SUMS, LANES = 16.0, 2.0
 """By how much less a kick takes in a batch than `SplittingLoops.work`: of sums and products alone, and of functions."""
@@ -72,31 +77,32 @@ class SplittingLoops:
         True if H depends on t.
     """
 
-    def __init__(self, system: HamiltonianSystem) -> None:
+    def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
+        symbols = system.symbols.named(names) if names and system.symbols is not None else system.symbols
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work
         self._has_ranges = self.traced = self._large = False
-        self._form: Any = system.form
+        self._form: Any = system.form if symbols is system.symbols else symbols
         self._driving: Driving | TracedDriving | None = None
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., Rollouts]
         self._longs: dict[int, bool] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
-        if not system.separable:
+        if not (system.separable if symbols is None else symbols.separable):
             raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
-        if system.symbols is not None:
+        if symbols is not None:
             from sympflow.hamiltonian.recorded import check_recorded  # SymPy, which Numba functions do without
             from sympflow.kernels.terms import is_large
 
             self._has_force_gradient = system.quadratic_kinetic
-            self._large = is_large(system.symbols)
+            self._large = is_large(symbols)
             check_damping(system, self._large)
             if self.driven:
                 from sympflow.kernels.stage_times import driven_form
 
-                self._driving = driven_form(system.symbols if self._large else system.symbols.parametric)
+                self._driving = driven_form(symbols if self._large else symbols.parametric)
                 if self._large and self._driving.means:
                     raise ValueError(
                         "`system` has many terms and a kinetic energy that depends on t: use backend='array'."
@@ -106,12 +112,12 @@ class SplittingLoops:
                 self.values, self.traced = self._form.values, True
                 self.abreast = LANES
             else:
-                V = system.symbols.V
+                V = symbols.V
                 check_recorded(V)
-                check_recorded(system.symbols.T)
-                self.values = system.symbols.parametric.values
+                check_recorded(symbols.T)
+                self.values = symbols.parametric.values
                 self._has_ranges, self.traced = not self._large, True
-                sums = V is not None and not self._large and V.is_polynomial(*system.symbols.q)
+                sums = V is not None and not self._large and V.is_polynomial(*symbols.q)
                 self.abreast = LANES_OF_SUMS if sums else LANES
         elif isinstance(system.form, TracedHamiltonian):
             check_size(system.form)
@@ -368,6 +374,20 @@ class SplittingKernel(Kernel):
         h = np.asarray(h, dtype=np.float64)
         h = h.repeat(len(y)) if h.ndim == 0 else h
         return Steps(self.loops.step_rows(step_table(self.scheme), h, h, y, self.scheme.monomials, t))
+
+    def check_reverse(self) -> None:
+        self._functions().check_reverse()
+
+    def recorded(self, task: Task) -> Recorded:
+        from sympflow.kernels.reverse import Recorded
+
+        table, rows = self.table(task.h, task.t0), self._rows(task)
+        work = table.shape[1] * self.loops.work / self.loops.abreast
+        return Recorded(self._functions(), table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
+
+    def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        rows = self.loops.rows(replace(step_table(self.scheme), more=None))[..., 0]
+        return self._functions().stepped(rows, y, h, t, values)
 
     def varied(self, values: np.ndarray) -> VariedKernel:
         """The loops of batches whose trajectories have these values (k, N) of `SplittingLoops.values`."""

@@ -8,16 +8,17 @@ of many in lanes, maps, single steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import Type, Value
+from sympflow.compiler.arrange import Arrangement
+from sympflow.compiler.control import Type, Value, Variable
 from sympflow.compiler.functions import FUNCTIONS, added, dot, times
-from sympflow.compiler.program import Program, Traced, derivatives, gradient, traced
+from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, Rollouts
@@ -111,7 +112,7 @@ class Splitting:
 
         return traced(changes, *names)
 
-    def kinds(self) -> Sequence[Arranged | WithinRange]:
+    def kinds(self) -> Sequence[Stage | WithinRange]:
         """The stages, those with the fewest terms first."""
         return [self._within_range(terms) if self.ranges else self._arranged(terms) for terms in self.terms]
 
@@ -126,7 +127,7 @@ class Splitting:
             known[x.order] = ready + FUNCTIONS[x.name].cost
         return max(known.values(), default=0) + len(body) / 2
 
-    def _within_range(self, terms: int) -> Arranged | WithinRange:
+    def _within_range(self, terms: int) -> Stage | WithinRange:
         """The stage as a polynomial in its range, if there is one."""
         from sympflow.kernels.approximations import on_interval
 
@@ -136,13 +137,24 @@ class Splitting:
         arranged = NearShape(self, terms, near).arranged()[1]
         return WithinRange(arranged, self._arranged(terms), near.low, near.high)
 
-    def _arranged(self, terms: int) -> Arranged:
+    def _arranged(self, terms: int) -> Stage:
         """The stage as a program: products of sums multiplied out, or where that makes it long, the better shape."""
         cost, shape = Shape(self, terms, True).arranged()
         if terms > 1 and len(shape.body) > LONG:
             other_cost, other = Shape(self, terms, False).arranged()
             return shape if cost <= other_cost else other
         return shape
+
+
+class Stage(NamedTuple):
+    """A kick and a drift as programs: see `Arranged`.
+
+    In `plain`, which is the same up to rounding, results may be made of one another: it is the one to differentiate.
+    """
+
+    table: Program
+    body: Program
+    plain: Program
 
 
 class Shape:
@@ -158,8 +170,9 @@ class Shape:
         self.q, self.p, self.more = made.states[: self.d], made.states[self.d : 2 * self.d], made.states[2 * self.d :]
         self.number = dict(zip(splitting.numbers, made.constants, strict=True))
         self.values = [self.number[s.name] for s in symbols.parameters]
+        self.plain: list[Any] = []
 
-    def arranged(self) -> tuple[int, Arranged]:
+    def arranged(self) -> tuple[int, Stage]:
         """The cost of the stage, and its programs."""
         made, d = self.made, self.d
         errors: list[Any] = []
@@ -172,8 +185,9 @@ class Shape:
         else:
             positions, momenta = self._drifted(self._kicked())
         outputs = [*positions, *momenta, *errors]
-        arranged = made.finish(outputs)
-        return 2 * max(made.depth(x) for x in outputs) + 3 * len(arranged.body), arranged
+        table, body = made.finish(outputs)
+        plain = Program(body.inputs, [*self.plain, *momenta, *errors]) if self.plain else body
+        return 2 * max(made.depth(x) for x in outputs) + 3 * len(body), Stage(table, body, plain)
 
     def _kicked(self) -> list[Any]:
         """The momenta after a kick, numbers of the body."""
@@ -217,11 +231,13 @@ class Shape:
             moves = self._velocity(momenta, self.number["a"])
             return [made.written(q + x) for q, x in zip(self.q, moves, strict=True)], momenta
         positions = [made.node(q) for q in self.q]
+        self.plain = [*positions]
         for i in range(d):
             for j in range(d):
                 if M[i, j] != 0:
                     factor = made.written(made.number(times(self.number["a"], self._of_parameters(M[i, j]))))
                     positions[i] = made.moved(positions[i], factor, momenta[j])
+                    self.plain[i] = made.operation("fma", factor, momenta[j], self.plain[i])
         return positions, momenta
 
     def _damped(self, name: str, momenta: Sequence[Any]) -> list[Any]:
@@ -269,12 +285,12 @@ class WithinRange:
 
     Attributes
     ----------
-    near : Arranged
+    near : Stage
     table : callable
         From the constants of a run to the numbers that both read.
     """
 
-    def __init__(self, near: Arranged, exact: Arranged, low: float, high: float) -> None:
+    def __init__(self, near: Stage, exact: Stage, low: float, high: float) -> None:
         self.near, self._exact, self._low, self._high = near, exact, low, high
         self.table = _Both(near.table, exact.table)
 
@@ -380,7 +396,7 @@ class SplittingCode(Rollouts):
         return SplittingCode, (self._splitting,)
 
     @cached_property
-    def _kinds(self) -> Sequence[Arranged | WithinRange]:
+    def _kinds(self) -> Sequence[Any]:
         return self._splitting.kinds()
 
     @cached_property
@@ -420,9 +436,11 @@ class SplittingCode(Rollouts):
         if not self.timed:
             return [numbers(i) for i in range(len(table.outputs))]
         code, given = step.code, [numbers(i, lone=True) for i in range(self.size)]
+        return [code.operand(x, type) for x in table(*self._lettered(self._time(given, step), given))]
+
+    def _time(self, given: Sequence[Value], step: Value) -> Value:
         before, first, length = given[self._clock]
-        time = first + (code.convert("sitofp", step, "double") * length + before)
-        return [code.operand(x, type) for x in table(*self._lettered(time, given))]
+        return first + (step.code.convert("sitofp", step, "double") * length + before)
 
     @cached_property
     def _clock(self) -> slice:
@@ -430,12 +448,93 @@ class SplittingCode(Rollouts):
         end = self.size - self._own
         return slice(end - CLOCK, end)
 
-    def _lettered(self, time: Value, given: Sequence[Value]) -> list[Any]:
+    def _lettered(self, time: Any, given: Sequence[Any]) -> list[Any]:
         """The numbers of a column of a driven system, of those that are given, with its letters at a time."""
         driving, clock = self._splitting.driving, self._clock
         assert driving is not None
         fixed = given[clock.stop :]
         return [*given[: clock.start], *fixed, *driving.values_at(time, given[0], fixed)]
+
+    # the reverse --------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _plain(self) -> list[Stage]:
+        """The stages of each kind, to be differentiated."""
+        kinds = [kind for kind in self._kinds if isinstance(kind, Stage)]
+        if len(kinds) < len(self._kinds):
+            raise NotImplementedError("its kicks are no plain programs.")
+        return kinds
+
+    @cached_property
+    def _adjoints(self) -> list[Program]:
+        """Of the stage of each kind: the state, the numbers of a column, the time if it counts, and the cotangents."""
+        if not self.timed:
+            return [adjoint(kind.plain) for kind in self._plain]
+        names = [f"x_{i}" for i in range(self.n_values)], [f"number_{i}" for i in range(self.size)]
+
+        def stage(body: Any, numbers: Sequence[Any]) -> list[Any]:
+            state, given, time = numbers[: self.n_values], numbers[self.n_values : -1], numbers[-1]
+            return body.plain(*state, *body.table(*self._lettered(time, given)))
+
+        return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._plain]
+
+    def check_reverse(self) -> None:
+        try:
+            self._adjoints  # noqa: B018
+        except (NotImplementedError, AttributeError, TypeError) as error:
+            raise ValueError(f"`system` has stages without a compiled reverse: {error}") from error
+
+    def adjoint(
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+    ) -> tuple[list[Value], list[Value]]:
+        code, type = step.code, values[0].type
+        zero = code.constant(0.0, type)
+        found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
+        for k, program in enumerate(self._adjoints):
+            n = len(program.inputs) - 2 * self.n_values - self.timed
+            column = [numbers(i, lone=True) for i in range(n)]
+            if self.timed:
+                column.append(self._time(column, step))
+            with code.given(code.apply("eq", (kind, k))) if len(self._adjoints) > 1 else nullcontext():
+                results = [code.operand(x, type) for x in program(*values, *column, *cotangents)]
+                for result, x in zip(found, results, strict=False):
+                    result.value = x
+        return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
+
+    def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+        if self.timed:
+            return slopes.swapaxes(0, 1)
+        found = np.zeros((len(table), *np.delete(slopes.shape, 1)))
+        kinds = self._kinds_of(table if table.ndim == 2 else table[..., 0])
+        for k, program in enumerate(self._of_tables):
+            columns = kinds == k
+            n = len(program.inputs) - len(table)
+            with np.errstate(all="ignore"):
+                rows = program(*(row[columns] for row in table), *(slopes[columns, i] for i in range(n)))
+            for i, row in enumerate(rows):
+                found[i, columns] = row
+        return found
+
+    @cached_property
+    def _of_tables(self) -> list[Program]:
+        return [adjoint(kind.table) for kind in self._plain]
+
+    def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        import torch
+
+        state = [*y.unbind(-1), *[torch.zeros_like(y[..., 0])] * (self.n_values - self.n_out)]
+        kick, kinds = kicks_of(self._splitting.level, len(self._splitting.monomials))[0], self._kinds_of(numbers)
+        powers = [1, *kick.powers]
+        for k, column in zip(kinds, numbers.T.tolist(), strict=True):
+            given = [c * h**power for c, power in zip(column, powers, strict=False)]
+            if self.timed:
+                given = self._lettered(
+                    torch.as_tensor(t, dtype=y.dtype) + column[len(powers)] * h, [*given, 0.0, 0.0, 0.0, *values]
+                )
+            else:
+                given += values
+            state = self._plain[k].plain(*state, *self._plain[k].table(*given))
+        return torch.stack([x.expand(y.shape[:-1]) for x in state[: self.n_out]], dim=-1)
 
     @property
     def given_numbers(self) -> int:

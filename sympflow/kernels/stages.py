@@ -34,10 +34,8 @@ class StageTable:
     ----------
     level : int
         The terms of kicks: see `sympflow.schemes.Scheme.level`.
-    kicks, drifts, gradients, curvatures : ndarray of shape (m,) or (m, K)
-        b, a, g and c.
-    polynomials : ndarray of shape (m, M) or (m, M, K)
-        e of the M monomials, none for other kicks.
+    numbers : ndarray of shape (n, m) or (n, m, K)
+        a of the drifts, then of the kicks b and e of each monomial, or b, g and c.
     times : ndarray of shape (m,) or (m, K), optional
         When each kick is, counted from the beginning of the step; the default is the sum of the drifts before it.
     direction : float
@@ -47,22 +45,25 @@ class StageTable:
     """
 
     level: int
-    kicks: np.ndarray
-    drifts: np.ndarray
-    gradients: np.ndarray
-    curvatures: np.ndarray
-    polynomials: np.ndarray
+    numbers: np.ndarray
     times: np.ndarray | None = None
     direction: float = 1.0
     more: np.ndarray | None = None
 
+    @property
+    def drifts(self) -> np.ndarray:
+        return np.asarray(self.numbers[0])
+
+    @cached_property
+    def kick_times(self) -> np.ndarray:
+        """`times`, or their default."""
+        return np.cumsum(self.drifts, axis=0) - self.drifts if self.times is None else self.times
+
     @cached_property
     def packed(self) -> np.ndarray:
-        """The numbers that loops read, as rows of one array (1 + n, m) or (1 + n, m, K): a, then those of the kicks."""
-        of_kicks = [self.kicks, *self.polynomials.swapaxes(0, 1)]
-        if self.level != POLYNOMIAL:
-            of_kicks = [self.kicks, self.gradients, self.curvatures][: 1 + self.level]
-        return np.ascontiguousarray(np.stack([self.drifts, *of_kicks, *(() if self.more is None else self.more)]))
+        """The numbers that loops read: of a kick as many as its level has; those of friction behind them."""
+        n = len(self.numbers) if self.level == POLYNOMIAL else 2 + self.level
+        return np.ascontiguousarray(np.concatenate([self.numbers[:n], *(() if self.more is None else [self.more])]))
 
     def rows(self, values: tuple[float, ...]) -> np.ndarray:
         """`packed`, and for each of the values of a system's parameters a row, the same for all stages."""
@@ -70,101 +71,61 @@ class StageTable:
             return self.packed
         rows = self._with_values.get(values)
         if rows is None:
-            more = np.zeros((len(values), *self.packed.shape[1:]))
-            (more if more.ndim == 2 else more[..., 0])[:] = np.array(values)[:, None]
-            rows = np.concatenate([self.packed, more])
+            rows = np.concatenate([self.packed, self._constant(values)])
             self._with_values.clear()  # systems with other values come one after the other
             self._with_values[values] = rows
         return rows
 
     def timed_rows(self, values: tuple[float, ...], h: float, t0: float) -> np.ndarray:
         """`rows`, before the values the times of the kicks, that of step 0 and the step of the time."""
-        of_kicks = np.cumsum(self.drifts, axis=0) - self.drifts if self.times is None else self.times
-        clock = np.zeros((2, *of_kicks.shape))
-        (clock if clock.ndim == 2 else clock[..., 0])[:] = np.array([t0, self.direction * h])[:, None]
-        rows, n = self.rows(values), len(self.packed)
-        return np.concatenate([rows[:n], of_kicks[None], clock, rows[n:]])
+        clock = self._constant((t0, self.direction * h))
+        return np.concatenate([self.packed, self.kick_times[None], clock, self._constant(values)])
+
+    def _constant(self, values: tuple[float, ...]) -> np.ndarray:
+        """Rows of numbers that are the same for all stages."""
+        rows = np.zeros((len(values), *self.packed.shape[1:]))
+        (rows if rows.ndim == 2 else rows[..., 0])[:] = np.reshape(values, (-1, 1))
+        return rows
 
     @cached_property
     def _with_values(self) -> dict[tuple[float, ...], np.ndarray]:
         return {}
 
     def scaled(self, h: float) -> StageTable:
-        """The numbers of steps h, of those for h = 1."""
-        return StageTable(
-            self.level,
-            h * self.kicks,
-            h * self.drifts,
-            _times_power(self.gradients, h, 3),
-            _times_power(self.curvatures, h, 5),
-            _times_power(self.polynomials, h, 3),
-            None if self.times is None else h * self.times,
-            self.direction,
-        )
-
-
-def _times_power(numbers: np.ndarray, h: float, n: int) -> np.ndarray:
-    """hⁿ times numbers, of which those that are 0 stay 0 even where hⁿ is beyond what a float can hold."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.where(numbers == 0, 0.0, np.float64(h) ** n * numbers)
+        """The numbers of steps h, of those for h = 1; those that are 0 stay 0 even where hⁿ is not finite."""
+        powers = (1, 1, *([3] * len(self.numbers) if self.level == POLYNOMIAL else (3, 5)))[: len(self.numbers)]
+        with np.errstate(over="ignore", invalid="ignore"):
+            factors = np.array([np.float64(h) ** n for n in powers])[:, None]
+            numbers = np.where(self.numbers == 0, 0.0, factors * self.numbers)
+        return replace(self, numbers=numbers, times=None if self.times is None else h * self.times)
 
 
 # the numbers of a scheme ------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Stage:
-    kick: float = 0.0
-    gradient: float = 0.0
-    curvature: float = 0.0
-    polynomial: tuple[float, ...] = ()
-    drift: float = 0.0
-
-    @property
-    def kicks(self) -> bool:
-        return bool(self.kick or self.gradient or self.curvature or any(self.polynomial))
-
-    def kicked_by(self, other: _Stage) -> _Stage:
-        """This stage, whose kick is followed by that of the other one."""
-        return replace(
-            self,
-            kick=self.kick + other.kick,
-            gradient=self.gradient + other.gradient,
-            curvature=self.curvature + other.curvature,
-            polynomial=tuple(a + b for a, b in zip(self.polynomial, other.polynomial, strict=True)),
-        )
-
-
-def _stages(scheme: Scheme) -> list[_Stage]:
+def _stages(scheme: Scheme) -> list[np.ndarray]:
     """The scheme as kick-drift pairs without idle maps, except a zero kick in front or a zero drift at the end."""
-    none = _Stage(polynomial=(0.0,) * len(scheme.monomials) if scheme.polynomials else ())
-    stages: list[_Stage] = []
+    stages: list[np.ndarray] = []
+    nothing = np.zeros(2 + (len(scheme.monomials) if scheme.polynomials else 2))
     for kind, one, three, five, e in scheme.substeps:
         if kind == "kick":
-            stages.append(_Stage(one, three, five, e))
-        elif stages and stages[-1].drift == 0.0:
-            stages[-1] = replace(stages[-1], drift=one)
-        else:
-            stages.append(replace(none, drift=one))
-    return stages or [none]
+            stages.append(np.array([0.0, one, *(e if scheme.polynomials else (three, five))]))
+            continue
+        if not stages or stages[-1][0] != 0.0:
+            stages.append(nothing.copy())
+        stages[-1][0] = one
+    return stages or [nothing]
 
 
-def _table(
-    scheme: Scheme, stages: Sequence[_Stage], times: Sequence[float] | None = None, direction: float = 1.0
-) -> StageTable:
-    columns = zip(*((s.kick, s.drift, s.gradient, s.curvature) for s in stages), strict=True)
-    kicks, drifts, gradients, curvatures = (np.array(column, dtype=float) for column in columns)
-    polynomials = np.array([s.polynomial for s in stages], dtype=float)
-    known = None if times is None else np.array(times)
-    return StageTable(scheme.level, kicks, drifts, gradients, curvatures, polynomials, known, direction)
+def _table(scheme: Scheme, stages: Sequence[np.ndarray], *times: Any) -> StageTable:
+    return StageTable(scheme.level, np.stack(stages, axis=1), *times)
 
 
 @lru_cache(maxsize=256)
 def step_table(scheme: Scheme) -> StageTable:
     """The stages of one step by itself, for h = 1, as constant polynomials (m, 1)."""
     table = _table(scheme, _stages(scheme))
-    kicks, drifts, gradients = (column[..., None] for column in (table.kicks, table.drifts, table.gradients))
-    return StageTable(table.level, kicks, drifts, gradients, table.curvatures[..., None], table.polynomials[..., None])
+    return replace(table, numbers=table.numbers[..., None])
 
 
 def single_table(scheme: Scheme, h: float) -> StageTable:
@@ -177,34 +138,24 @@ def run_table(scheme: Scheme, h: float) -> StageTable:
     """The table [opening, inner …, link, closing] of a run whose steps are h: see `runs.run_function`."""
     stages = _stages(scheme)
     first, last = stages[0], stages[-1]
-    opening = replace(
-        first, kick=0.0, gradient=0.0, curvature=0.0, drift=0.0, polynomial=(0.0,) * len(first.polynomial)
-    )
-    inner, link = stages[:-1], last
-    if len(stages) > 1 and last.drift == 0.0:  # kick … kick: the last kick and the next first stage are one
-        opening, inner, link = first, stages[1:-1], replace(last.kicked_by(first), drift=first.drift)
-    elif len(stages) > 1 and not first.kicks:  # drift … drift
-        opening, inner, link = first, stages[1:-1], replace(last, drift=last.drift + first.drift)
-    before_inner = opening.drift + np.cumsum([0.0, *(s.drift for s in inner)])
+    opening, inner, link = 0 * first, stages[:-1], last
+    if len(stages) > 1 and (last[0] == 0.0 or not first[1:].any()):  # kick … kick, or drift … drift: two are one
+        opening, inner, link = first, stages[1:-1], last + first
+    before_inner = opening[0] + np.cumsum([0.0, *(s[0] for s in inner)])
     # The link begins with the last kick of the step before; an output is closed after so many whole steps.
-    times = [0.0, *before_inner[: len(inner)].tolist(), -last.drift, -last.drift]
-    direction = float(round(sum(s.drift for s in stages)))
+    times = np.array([0.0, *before_inner[: len(inner)], -last[0], -last[0]])
+    direction = float(round(sum(s[0] for s in stages)))
     return _table(scheme, [opening, *inner, link, last], times, direction).scaled(h)
 
 
 def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
     """The stages of a map of the ends of a run, whose last stage is before them; two drifts in a row are one."""
     assert run.times is not None
-    of_kicks = np.cumsum(after.drifts) - after.drifts if after.times is None else after.times
-    names = ("kicks", "drifts", "gradients", "curvatures", "polynomials")
-    last = {name: np.array(getattr(run, name)[-1]) for name in names}
-    merged = int(not any(getattr(after, name)[0].any() for name in names if name != "drifts"))
+    last, merged = run.numbers[:, -1:].copy(), int(not after.numbers[1:, 0].any())
     if merged:
-        last["drifts"] = last["drifts"] + after.drifts[0]
-    columns: dict[str, Any] = {
-        name: np.concatenate([last[name][None], getattr(after, name)[merged:]]) for name in names
-    }
-    return replace(after, **columns, times=np.concatenate([run.times[-1:], of_kicks[merged:]]))
+        last[0] += after.drifts[0]
+    numbers = np.concatenate([last, after.numbers[:, merged:]], axis=1)
+    return replace(after, numbers=numbers, times=np.concatenate([run.times[-1:], after.kick_times[merged:]]))
 
 
 # kinds of kick --------------------------------------------------------------------------------------------

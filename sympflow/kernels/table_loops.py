@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
-from sympflow.compiler.functions import dot, fma
+from sympflow.compiler.functions import dot, fma, summed
 from sympflow.compiler.machine import address, host
 from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
@@ -470,26 +470,26 @@ class _Errors:
         w, terms = self.maps.width, self.maps.terms
         b = [self.A[w + i] for i in range(w)]
         for k in range(terms):
-            self.B[number + k] = _fused(b, [tape[k * w + i] for i in range(w)])
+            self.B[number + k] = summed(0.0, b, [tape[k * w + i] for i in range(w)])
         slope = {ij: tape[terms * w + n] for n, ij in enumerate(self.maps.pairs)}
         for i in range(w):
-            self.A[i] = _fused(b, [slope[min(i, j), max(i, j)] for j in range(w)], self.A[i])
+            self.A[i] = summed(self.A[i], b, [slope[min(i, j), max(i, j)] for j in range(w)])
 
     def drift_back(self, number: Value, drift: Value, tape: Rows) -> None:
         d, w = self.maps.d, self.maps.width
         a = [self.A[i] for i in range(w)]
-        by_time = _fused(a, [tape[i] for i in range(w)])
+        by_time = summed(0.0, a, [tape[i] for i in range(w)])
         if self.maps.friction is None:
             time = self.number(number)
             for j, x in enumerate(_product([list(column) for column in zip(*self.mass, strict=True)], a)):
                 self.A[w + j] = fma(time, x, self.A[w + j])
         else:
             b = [self.A[w + i] for i in range(d)]
-            by_time = _fused(b, [tape[w + i] for i in range(d)], by_time)
+            by_time = summed(by_time, b, [tape[w + i] for i in range(d)])
             mean, end = self.motion(drift)
             for j in range(d):
-                change = _fused([row[j] for row in mean], a)
-                self.A[w + j] = _fused([row[j] for row in end], b, change)
+                change = summed(0.0, [row[j] for row in mean], a)
+                self.A[w + j] = summed(change, [row[j] for row in end], b)
         self.B[number] = by_time
 
     def derivatives(self, place: Value, stride: Value) -> None:
@@ -504,11 +504,3 @@ class _Errors:
 
             (total,) = code.loop(end - begin, [self.zero], more)
             code.store(total, self.J, f * stride + place)
-
-
-def _fused(x: Sequence[Value], y: Sequence[Value], total: Value | None = None) -> Value:
-    """total + Σ xᵢ yᵢ."""
-    for a, b in zip(x, y, strict=False):
-        total = a * b if total is None else fma(a, b, total)
-    assert total is not None
-    return total

@@ -16,7 +16,7 @@ import numpy as np
 
 from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, Value
-from sympflow.compiler.functions import dot, fma
+from sympflow.compiler.functions import dot, is_zero, summed
 from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
@@ -115,7 +115,7 @@ class Linearised(Shape):
         made, d, positions = self.made, self.d, [self.made.node(x) for x in q]
         for i in range(d):
             for j in range(d):
-                if not _is_zero(slants[d * i + j]):
+                if not is_zero(slants[d * i + j]):
                     positions[i] = made.moved(positions[i], slants[d * i + j], made.written(p[j]))
         return positions
 
@@ -142,26 +142,14 @@ def _vector_moved(
     """A vector (q, p) after a stage, of the derivatives that its program gives after the state."""
     n = d * (d + 1) // 2
     bend, slant, end = derivatives[:n], derivatives[n : n + d * d], derivatives[n + d * d :]
-    p = [_summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
-    q = [_summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
-    return q, [_summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
+    p = [summed(p[i], [bend[_place(i, j)] for j in range(d)], q) for i in range(d)]
+    q = [summed(q[i], slant[d * i : d * (i + 1)], p) for i in range(d)]
+    return q, [summed(0.0, end[d * i : d * (i + 1)], p) for i in range(d)] if end else p
 
 
 def _place(i: int, j: int) -> int:
     """The place of an entry of a symmetric matrix, of which the rows are known to the diagonal."""
     return max(i, j) * (max(i, j) + 1) // 2 + min(i, j)
-
-
-def _is_zero(x: Any) -> bool:
-    return isinstance(x, float) and x == 0.0
-
-
-def _summed(total: Any, factors: Sequence[Any], x: Sequence[Value]) -> Any:
-    """total + Σ factor·x."""
-    for factor, value in zip(factors, x, strict=True):
-        if not _is_zero(factor):
-            total = fma(factor, value, total)
-    return total
 
 
 class TangentCode(SplittingCode):
@@ -307,62 +295,46 @@ class TangentKernel:
             np.ones(N, dtype=bool),
         )
         table = self._loops.rows(run_table(self._scheme, h), h)
+        width = self._width
+
+        def follow(looks: np.ndarray, rows: np.ndarray, carry: Carry) -> np.ndarray:
+            """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
+            work = table.shape[1] * self._code.n_out / 2
+            task = Task(0.0, start[rows], int(looks[-1]), looks, carry, threads=threads)
+            run = run_states(partial(self._code.run, table), task, self._code.n_values, work)
+            w = run.states[..., width:-k].reshape(*run.states.shape[:2], k, width)
+            w = w if scale is None else w * scale
+            with np.errstate(all="ignore"):
+                growth = LOG_2 * run.states[..., -k:] + 0.5 * np.log(np.einsum("nmki,nmki->nmk", w, w))
+                W = w.swapaxes(-1, -2).reshape(-1, width, k)
+                spreads = np.full(w.shape[:2], np.nan) if spread is None else spread(W).reshape(w.shape[:2])
+            known = looks <= run.n_finite[:, None]
+            below = known & (spreads < limit)
+            last = np.where(below.any(1), below.argmax(1), len(looks) - 1)
+            known &= np.arange(len(looks)) <= last[:, None]
+            first, end = np.searchsorted(save, [looks[0], looks[-1] + 1])
+            where, each = np.searchsorted(looks, save[first:end]), np.arange(len(rows))
+            if len(where):
+                columns = np.arange(first, end)
+                found.growth[rows[:, None], :, columns] = np.where(known[:, where, None], growth[:, where], np.nan)
+                found.spread[rows[:, None], columns] = np.where(known[:, where], spreads[:, where], np.nan)
+            failed = ~below.any(1) & (run.n_finite < looks[-1])
+            found.growth[rows, :, -1] = np.where(failed[:, None], np.nan, growth[each, last])
+            found.spread[rows, -1] = np.where(failed, np.nan, spreads[each, last])
+            found.n_steps[rows] = np.where(failed, run.n_finite, looks[last])
+            found.whole[rows] = ~failed
+            return failed | below.any(1)
+
         size = max(64, AT_ONCE // (n * some))
         for first in range(0, N, size):
             rows, carry = np.arange(first, min(first + size, N)), Carry()
             for i in range(0, len(looks), some):
-                piece = looks[i : i + some]
-                ended = self._followed(
-                    table, start[rows], piece, save, found, rows, carry, spread, limit, scale, threads
-                )
+                ended = follow(looks[i : i + some], rows, carry)
                 if ended.any():
                     rows, carry.running, carry.spare = rows[~ended], carry.running[~ended], None
                 if not len(rows):
                     break
         return found
-
-    def _followed(
-        self,
-        table: np.ndarray,
-        start: np.ndarray,
-        looks: np.ndarray,
-        save: np.ndarray,
-        found: TangentRun,
-        rows: np.ndarray,
-        carry: Carry,
-        spread: Callable[[np.ndarray], np.ndarray] | None,
-        limit: float,
-        scale: np.ndarray | None,
-        threads: int | None,
-    ) -> np.ndarray:
-        """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
-        code, k = self._code, self.vectors
-
-        work = table.shape[1] * code.n_out / 2
-        task = Task(0.0, start, int(looks[-1]), looks, carry, threads=threads)
-        run = run_states(partial(code.run, table), task, code.n_values, work)
-        w = run.states[..., self._width : -k].reshape(*run.states.shape[:2], k, self._width)
-        w = w if scale is None else w * scale
-        with np.errstate(all="ignore"):
-            growth = LOG_2 * run.states[..., -k:] + 0.5 * np.log(np.einsum("nmki,nmki->nmk", w, w))
-            W = w.swapaxes(-1, -2).reshape(-1, self._width, k)
-            spreads = np.full(w.shape[:2], np.nan) if spread is None else spread(W).reshape(w.shape[:2])
-        known = looks <= run.n_finite[:, None]
-        below = known & (spreads < limit)
-        last = np.where(below.any(1), below.argmax(1), len(looks) - 1)
-        known &= np.arange(len(looks)) <= last[:, None]
-        first, end = np.searchsorted(save, [looks[0], looks[-1] + 1])
-        where, each = np.searchsorted(looks, save[first:end]), np.arange(len(rows))
-        if len(where):
-            columns = np.arange(first, end)
-            found.growth[rows[:, None], :, columns] = np.where(known[:, where, None], growth[:, where], np.nan)
-            found.spread[rows[:, None], columns] = np.where(known[:, where], spreads[:, where], np.nan)
-        failed = ~below.any(1) & (run.n_finite < looks[-1])
-        found.growth[rows, :, -1] = np.where(failed[:, None], np.nan, growth[each, last])
-        found.spread[rows, -1] = np.where(failed, np.nan, spreads[each, last])
-        found.n_steps[rows] = np.where(failed, run.n_finite, looks[last])
-        found.whole[rows] = ~failed
-        return failed | below.any(1)
 
 
 def _looks(save: np.ndarray, n_steps: int, limit: float) -> np.ndarray:

@@ -7,7 +7,7 @@ however many there are.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,11 +15,11 @@ import numpy as np
 import sympy as sp
 
 from sympflow.compiler.arrange import Arrangement
-from sympflow.compiler.control import INT, Value
+from sympflow.compiler.control import INT, Rows, Value
+from sympflow.compiler.functions import is_zero
 from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.runs import Room
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["Family", "Terms", "families", "is_large", "is_long", "written_out"]
@@ -190,16 +190,20 @@ class Terms:
     ----------
     data : list of ndarray
         How many terms each kind has, then the coordinates and the constants of each kind.
-
-    Raises
-    ------
-    ValueError
-        If the formulas of all kinds have too many operations.
     """
 
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
         self._given = f, tuple(variables), tuple(letters)
         self._families, self._letters = families(f, variables), tuple(letters)
+        self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
+        for family in self._families:
+            self.data += [family.coordinates.astype(np.int64), family.constants]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Terms, self._given
+
+    def check(self) -> Terms:
+        """The terms, refused where the formulas of all kinds have too many operations."""
         n = sum(4 * sp.count_ops(family.f) for family in self._families)
         if n > MOST_COMPILED:
             raise ValueError(
@@ -207,12 +211,7 @@ class Terms:
                 "it by Numba functions that loop over its terms: HamiltonianSystem(V, ndof=…, gradient=…, "
                 "hessian_vector=…), or use backend='array'."
             )
-        self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
-        for family in self._families:
-            self.data += [family.coordinates.astype(np.int64), family.constants]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return Terms, self._given
+        return self
 
     @cached_property
     def slopes(self) -> list[Program]:
@@ -229,8 +228,8 @@ class Terms:
         """½ ∇³f(v, v)."""
         return [self._derived(family, 2) for family in self._families]
 
-    def _derived(self, family: Family, times: int) -> Program:
-        """∇f, that often differentiated along v, and divided by the factorial."""
+    def _derived(self, family: Family, times: int, bends: bool = False) -> Program:
+        """∇f, that often differentiated along v, and divided by the factorial; with its own derivatives."""
         n, along = len(family.x), [f"v_{j}" for j in range(len(family.x) if times else 0)]
         given = (*family.x, *family.c, *self._letters)
 
@@ -239,7 +238,7 @@ class Terms:
             slope = gradient(evaluator(dict(zip(given, (*x, *rest), strict=True)))(family.f), x)
             for k in range(times):
                 slope = [y / (k + 1) for y in tangent(slope, x, v)]
-            return slope
+            return [*slope, *(entry for s in slope for entry in gradient(s, x))] if bends else slope
 
         names = [s.name for s in given]
         names[n:n] = along
@@ -247,28 +246,37 @@ class Terms:
         found = traced(slopes, *names)(*made.states)
         return made.finish([made.written(made.number(y)) for y in found]).body
 
-    def added(
+    @cached_property
+    def hessians(self) -> list[Program]:
+        """∇f, and ∇²f row by row."""
+        return [self._derived(family, 0, True) for family in self._families]
+
+    def add(
         self,
-        room: Room,
+        data: Sequence[Value],
         derivatives: Sequence[Program],
-        given: Sequence[Value],
-        out: Value,
-        d: Value,
+        given: Sequence[Rows],
         letters: Sequence[Any],
-        first: int = 0,
+        targets: Callable[[list[Value]], list[tuple[Rows, Value]]],
     ) -> None:
-        """Write derivatives at places in memory into another one; the `first` of the data of the code is its own."""
-        code = room.code
-        with code.over(d) as i:
-            room.store(0.0, i, out)
-        counts = room.data(first)
+        """Add derivatives of the terms of each kind to numbers in memory.
+
+        Parameters
+        ----------
+        data : sequence of Value
+            Addresses of the arrays in `data`.
+        given : sequence of Rows
+            What the coordinates of a term are numbers of.
+        targets : callable
+            From the places of a term's coordinates to where its derivatives go.
+        """
+        code, type = given[0].code, given[0].type
         for k, (family, program) in enumerate(zip(self._families, derivatives, strict=True)):
-            coordinates, constants = room.data(first + 1 + 2 * k), room.data(first + 2 + 2 * k)
-            n, m = len(family.x), len(family.c)
-            with code.over(code.load(counts, k, INT)) as term:
+            (coordinates, constants), n, m = data[1 + 2 * k :][:2], len(family.x), len(family.c)
+            with code.over(code.load(data[0], k, INT)) as term:
                 places = [code.load(coordinates, term * n + j, INT) for j in range(n)]
-                values = [room.load(place, x) for x in given for place in places]
-                values += [code.splat(code.load(constants, term * m + j), room.width) for j in range(m)]
-                for place, y in zip(places, program(*values, *letters), strict=True):
-                    if not (isinstance(y, float) and y == 0):
-                        room.add(y, place, out)
+                values = [x[place] for x in given for place in places]
+                values += [code.splat(code.load(constants, term * m + j), type.width) for j in range(m)]
+                for (rows, place), y in zip(targets(places), program(*values, *letters), strict=True):
+                    if not is_zero(y):
+                        rows[place] = rows[place] + y

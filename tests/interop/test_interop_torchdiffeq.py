@@ -304,7 +304,7 @@ class TestAdjoint:
 
             y0 = torch.tensor(HH.y0, requires_grad=True)
             with torch.autograd.graph.saved_tensors_hooks(Kept, lambda kept: kept.x):
-                odeint_end = run(HH, y0, times(0.0, 0.05 * n), method="verlet", options={"dt": 0.05})[-1]
+                odeint_end = run(HH, y0, times(0.0, 0.05 * n), method="strang_parts", options={"dt": 0.05})[-1]
                 odeint_end.sum().backward()
             return most
 
@@ -421,7 +421,7 @@ class TestCallbacks:
         y = odeint(system, y0, times(0.0, 0.1, 0.2, 0.3), method="verlet", options={"dt": 0.1})
         torch.testing.assert_close(torch.stack(seen), y[:-1], rtol=0, atol=0)
         plain = odeint(PENDULUM, y0, times(0.0, 0.1, 0.2, 0.3), method="verlet", options={"dt": 0.1})
-        torch.testing.assert_close(y, plain, rtol=0, atol=0)
+        torch.testing.assert_close(y, plain, rtol=0, atol=1e-15)  # which is compiled
 
     def test_those_of_adaptive_steps_are_not_supported(self):
         system = systems.pendulum()

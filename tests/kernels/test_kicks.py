@@ -28,8 +28,8 @@ EPS = np.finfo(float).eps
 
 def kicked(system, level, numbers, y, ranges=None):
     """The states y (N, 2d) after one kick, each row by itself and all in lanes."""
-    column = [np.array([[x, 0.0, 0.0]]) for x in (*numbers, *[0.0] * (3 - len(numbers)))]
-    table = StageTable(level, column[0], np.zeros((1, 3)), column[1], column[2], np.empty((1, 0, 3)))
+    column = [0.0, *numbers, *[0.0] * (3 - len(numbers))]
+    table = StageTable(level, np.array([[[x, 0.0, 0.0]] for x in column]))
     loops = splitting_loops(system)
 
     def step(rows):

@@ -1,0 +1,127 @@
+"""Tensors in compiled loops: the numbers of a NumPy call, and gradients by the compiled reverse of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sympflow.arrays import differentiable, to_numpy, transformed
+from sympflow.kernels.protocol import Carry, Task
+
+__all__ = ["rolled_out", "stepped"]
+
+
+def rolled_out(
+    stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: Carry | None
+) -> tuple[Tensor, np.ndarray]:
+    """`Stepper.rollout` of a tensor on the CPU: float32 is computed in double, and rounded at the outputs."""
+    if y0.dtype != torch.float64:
+        states, finite = rolled_out(stepper, y0.double(), h, n_steps, save, t0, carry)
+        return states.to(y0.dtype), finite
+    followed = stepper.problem.followed.values()
+    if not differentiable(y0, *followed):
+        found, finite = stepper.rollout(to_numpy(y0), h, n_steps, save, t0, carry)
+        return torch.from_numpy(found), finite
+    run = _Rolled(stepper, h, n_steps, save, t0)
+    return _Run.apply(run, y0, *followed), run.finite
+
+
+def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
+    """`Stepper.shorter` of tensors, differentiable by their lengths too."""
+    if y.dtype != torch.float64:
+        h = h.double() if isinstance(h, Tensor) else h
+        return stepped(stepper, y.double(), h, t).to(y.dtype)
+    h = torch.as_tensor(h, dtype=y.dtype).expand(y.shape[:-1])
+    return _Step.apply(stepper, t, y, h, *stepper.problem.followed.values())
+
+
+class _Rolled:
+    """A run of a stepper from y0: its numbers, its reverse, and the same by tensor operations."""
+
+    def __init__(self, stepper: Any, h: float, n_steps: int, save: np.ndarray, t0: float) -> None:
+        self.stepper, self.h, self.n_steps, self.save, self.t0 = stepper, h, n_steps, save, t0
+        self.finite = np.empty(0)
+
+    def run(self, y0: Tensor) -> Tensor:
+        rows = to_numpy(y0).reshape(-1, y0.shape[-1])
+        self.recorded = self.stepper.kernel.recorded(Task(self.h, rows, self.n_steps, self.save, None, self.t0))
+        self.finite = self.recorded.n_finite.reshape(y0.shape[:-1])
+        return torch.from_numpy(self.recorded.states.swapaxes(0, 1).reshape(len(self.save), *y0.shape))
+
+    def pulled(self, cotangents: Tensor, k: int) -> list[Tensor]:
+        """The cotangents of y0 and of k numbers of each trajectory."""
+        shape = cotangents.shape[1:]
+        given = to_numpy(cotangents).reshape(len(self.save), -1, shape[-1]).swapaxes(0, 1)
+        of_states, of_table = self.recorded.pulled(given, k > 0)
+        numbers = of_table[len(of_table) - k :].sum(1) if k else []
+        return [torch.from_numpy(x) for x in (of_states.reshape(shape), *numbers)]
+
+    def by_arrays(self, y0: Tensor, *followed: Tensor) -> Tensor:
+        y, states, wanted = y0, [], self.save.tolist()
+        for k in range(self.n_steps + 1):
+            states += [y] * wanted.count(k)
+            if k < self.n_steps:
+                y = _by_arrays(self.stepper, y, self.h, self.t0 + k * self.h, *followed)
+        return torch.stack(states)
+
+
+class _Run(torch.autograd.Function):
+    """The states of a run; second derivatives by tensor operations."""
+
+    @staticmethod
+    def forward(ctx: Any, run: _Rolled, y0: Tensor, *followed: Tensor) -> Tensor:
+        ctx.run = run
+        ctx.save_for_backward(y0, *followed)
+        return run.run(y0)
+
+    @staticmethod
+    def backward(ctx: Any, cotangents: Tensor) -> tuple[Any, ...]:
+        inputs, wanted = ctx.saved_tensors, ctx.needs_input_grad[1:]
+        if torch.is_grad_enabled() or transformed(cotangents):
+            return None, *_pulled(ctx.run.by_arrays, inputs, wanted, cotangents)
+        return None, *ctx.run.pulled(cotangents, len(inputs) - 1 if any(wanted[1:]) else 0)
+
+
+class _Step(torch.autograd.Function):
+    """The states after single steps, each of its own length; derivatives by tensor operations."""
+
+    @staticmethod
+    def forward(ctx: Any, stepper: Any, t: Any, y: Tensor, h: Tensor, *followed: Tensor) -> Tensor:
+        ctx.step = lambda y, h, *numbers: _by_arrays(stepper, y, h, t, *numbers)
+        ctx.save_for_backward(y, h, *followed)
+        return torch.from_numpy(stepper.shorter(to_numpy(y), to_numpy(h), t))
+
+    @staticmethod
+    def backward(ctx: Any, cotangents: Tensor) -> tuple[Any, ...]:
+        return None, None, *_pulled(ctx.step, ctx.saved_tensors, ctx.needs_input_grad[2:], cotangents)
+
+
+def _by_arrays(stepper: Any, y: Tensor, h: Any, t: Any, *followed: Tensor) -> Tensor:
+    """A step by tensor operations, of which torch follows the parameters too."""
+    if not followed:
+        return stepper.arrays.step(y, h, t)
+    if stepper.system.friction:
+        raise ValueError(
+            "`params` with gradients of a system with friction have no second derivatives, and none at times between "
+            "two steps: choose times on the grid, or detach them."
+        )
+    batch = stepper.problem.y0.shape[:-1]
+    return stepper.kernel.stepped(y, h, t, [x.reshape(batch) for x in followed])
+
+
+def _pulled(
+    function: Callable[..., Tensor], inputs: Sequence[Tensor], wanted: Sequence[bool], cotangents: Tensor
+) -> list[Tensor | None]:
+    """The cotangents of those inputs that are wanted, with a graph of their own where one is asked for."""
+    again = torch.is_grad_enabled()
+    with torch.enable_grad():
+        if not again:
+            inputs = [x.detach().requires_grad_(asked) for x, asked in zip(inputs, wanted, strict=True)]
+        y = function(*inputs)
+        some = [x for x, asked in zip(inputs, wanted, strict=True) if asked]
+        found = iter(torch.autograd.grad(y, some, cotangents, create_graph=again, allow_unused=True))
+    return [next(found) if asked else None for asked in wanted]

@@ -1,0 +1,179 @@
+"""Gradients of runs: states are kept, all of them or those at the starts of segments, and stages reversed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+
+from sympflow.kernels.protocol import Batch
+from sympflow.kernels.rollouts import Rollouts, aligned, zeros
+from sympflow.kernels.threads import BLOCK, NEVER, given, run_rows
+
+__all__ = ["Recorded"]
+
+MOST_KEPT = 2**23  # numbers of the states that are kept from a run, 64 MB
+SEGMENT = 2**18  # numbers of the states of a segment, which is run again: 2 MB
+ROWS = 256  # that run together, whatever the threads
+
+
+class Recorded:
+    """A run of rows whose cotangents can be pulled back.
+
+    Parameters
+    ----------
+    code : Rollouts
+        With a reverse of its stages.
+    table
+        Its rows are numbers.
+    y0 : ndarray of shape (N, 2d), or (N, 2d + n)
+        With own values of each row.
+    n_steps : int
+    save : ndarray of int64, sorted, in 0 … n_steps
+    work : float
+        About how many nanoseconds a step of a row takes.
+
+    Attributes
+    ----------
+    states : ndarray of shape (N, len(save), 2d)
+    n_finite : ndarray of int64 of shape (N,)
+        The last step of each row that ends in a finite state.
+    """
+
+    def __init__(
+        self, code: Rollouts, table: np.ndarray, y0: np.ndarray, n_steps: int, save: np.ndarray, work: float
+    ) -> None:
+        self._code, self._table, self._y0, self._work = code, table, given(y0), work
+        self._n_steps, self._save, self._link = n_steps, given(save, np.int64), table.shape[1] - 2
+        self._own = y0.shape[1] > code.n_out
+        self.states = np.empty((len(y0), len(save), code.n_out))
+        self.n_finite = np.full(len(y0), n_steps)
+        size = self._link * code.n_values
+        self._whole = n_steps * size * len(y0) <= MOST_KEPT
+        steps = n_steps if self._whole else max(1, SEGMENT // size // min(ROWS, len(y0)), int(n_steps**0.5) // ROWS)
+        self._ends = [*range(0, n_steps, max(steps, 1)), n_steps]
+        self._histories: dict[int, list[np.ndarray]] = {}
+        self._each(self._run)
+
+    def _each(self, call: Callable[[slice, np.ndarray], None]) -> None:
+        """Call a function of slices of rows, which are the same whatever the threads."""
+        n = len(self._y0)
+
+        def pieces(i: slice, stop: np.ndarray) -> None:
+            for k in range(i.start // BLOCK, -(-i.stop // BLOCK)):
+                call(slice(k * ROWS, min((k + 1) * ROWS, n)), stop)
+
+        run_rows(pieces, -(-n // ROWS) * BLOCK, self._n_steps * self._work * min(n, ROWS) / BLOCK, None)
+
+    def _width(self, n_rows: int) -> int:
+        return self._code.lanes if n_rows >= self._code.fewest else 1
+
+    def _room(self, n_rows: int, n_steps: int) -> np.ndarray:
+        """Memory for the states before all stages."""
+        width = self._width(n_rows)
+        return aligned(-(-n_rows // width) * width * (n_steps * self._link + 1) * self._code.n_values)
+
+    def _saved(self, first: int, to: int) -> slice:
+        """The outputs of the steps from `first` to `to`, with the first state those of all."""
+        low, high = self._save.searchsorted((first, to), "right").tolist()
+        return slice(low if first else 0, high)
+
+    def _run(self, i: slice, stop: np.ndarray) -> None:
+        """Run some rows, segment by segment: each begins with what the one before leaves."""
+        code, n = self._code, i.stop - i.start
+        history = self._histories[i.start] = []
+        running = np.empty((n, 0 if self._whole else code.n_values))
+        alive, found = np.ones(n, dtype=bool), np.empty(n, dtype=np.int64)
+        for first, to in pairwise(self._ends):
+            history.append(self._room(n, to) if self._whole else running.copy())
+            chosen, kept = self._saved(first, to), history[-1] if self._whole else None
+            batch = Batch(self._y0[i], to, self._save[chosen], self.states[i, chosen], found, first, running)
+            code.run(self._table, batch._replace(stop=stop, kept=kept))
+            self.n_finite[i] = np.where(alive, found, self.n_finite[i])
+            alive &= found >= to
+        if self._n_steps == 0:
+            self.states[i] = self._y0[i, None, : code.n_out]
+
+    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The cotangents of the states and, of use with `slopes` only, of the numbers of the table.
+
+        Parameters
+        ----------
+        cotangents : ndarray of shape (N, len(save), 2d)
+
+        Returns
+        -------
+        of_states : ndarray of shape (N, 2d)
+        of_table : ndarray of shape (n, m), with tables of their own (n, m, N)
+        """
+        code, table = self._code, self._table
+        of_states = np.zeros((len(self._y0), code.n_values))
+        good = self.n_finite >= self._n_steps
+        found = np.zeros((table.shape[1], code.size, len(good) if slopes else 0))
+
+        def piece(i: slice, stop: np.ndarray) -> None:
+            of_states[i], lanes = self._pulled(i, cotangents[i], slopes, stop)
+            found[..., i] = lanes
+
+        if self._n_steps and good.any():
+            self._each(piece)
+        of_states = of_states[:, : code.n_out]
+        if n := int(self._save.searchsorted(0, "right")):
+            of_states += cotangents[:, :n].sum(1)
+        of_table = np.zeros((len(table), table.shape[1], *[len(good)] * self._own))
+        if slopes:
+            found[..., ~good] = 0.0
+            of_table += code.pulled(self._full_table(), found if self._own else found.sum(-1))
+        for k in () if good.all() else np.flatnonzero(~good).tolist():  # up to the last output that is finite
+            m = int(self._save.searchsorted(self.n_finite[k], "right"))
+            end = int(self._save[m - 1]) if m else 0
+            alone = Recorded(code, table, self._y0[k : k + 1], end, self._save[:m], self._work)
+            of_states[k : k + 1], more = alone.pulled(cotangents[k : k + 1, :m], slopes)
+            if self._own:
+                of_table[..., k] += more[..., 0]
+            else:
+                of_table += more
+        return of_states, of_table
+
+    def _full_table(self) -> np.ndarray:
+        """The table, with the own values of all rows (n, m, N)."""
+        if not self._own:
+            return self._table
+        values = self._y0[:, self._code.n_out :].T
+        table = np.repeat(self._table[..., None], len(self._y0), axis=2)
+        table[len(table) - len(values) :] = values[:, None]
+        return table
+
+    def _pulled(self, i: slice, given: np.ndarray, slopes: bool, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pull cotangents of the outputs of some rows back to their first states, and those of columns (m, size, n)."""
+        code, table, n = self._code, self._table, i.stop - i.start
+        width, y0 = self._width(n), self._y0[i]
+        own = " own" if self._own else ""
+        values = y0[:, code.n_out :]
+        entries, kinds = code.own_columns(table, values, width) if own else code.prepared(table)
+        groups = -(-n // width)
+        found = zeros(groups * len(kinds) * code.size * width if slopes else 1)
+        rows = np.zeros((n, code.n_values))
+        name = ("slopes" if slopes else "reverse") + own
+        for (first, to), before in reversed([*zip(pairwise(self._ends), self._histories[i.start], strict=True)]):
+            kept = before
+            if not self._whole:
+                kept = self._room(n, to - first)
+                nothing = np.empty((n, 0, code.n_out)), np.empty(n, dtype=np.int64)
+                batch = Batch(y0, to, self._save[:0], *nothing, first, before, stop=stop, kept=kept)
+                code.run(table, batch, False)
+            chosen = slice(*self._save.searchsorted((first, to), "right").tolist())
+            later, outputs, count = (
+                self._save[chosen],
+                np.ascontiguousarray(given[:, chosen]),
+                chosen.stop - chosen.start,
+            )
+            if not count:
+                later = outputs = NEVER
+            arguments = entries, kinds, len(kinds) - 2, kept, rows, n, first, to, later, count, outputs, found
+            code.call(name, width, *arguments)
+        if not slopes:
+            return rows, np.zeros(0)
+        lanes = found.reshape(groups, len(kinds), code.size, width)
+        return rows, lanes.transpose(1, 2, 0, 3).reshape(len(kinds), code.size, groups * width)[..., :n]

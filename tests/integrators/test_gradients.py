@@ -1,0 +1,161 @@
+"""Tensors run compiled, with the numbers of NumPy calls and the derivatives of the map that ran."""
+
+import numpy as np
+import pytest
+import torch
+
+from sympflow import HamiltonianSystem, solve
+from sympflow.kernels import reverse
+
+CUBIC = HamiltonianSystem.from_sympy(
+    "(p1**2/m + p2**2)/2 + k*(q1**2 + q2**2)/2 + g*(q1**2*q2 - q2**3/3)", params={"k": 1.0, "g": 0.9, "m": 1.2}
+)
+DRIVEN = HamiltonianSystem.from_sympy(
+    "p**2/2 - w*cos(q) + a*q*cos(b*t)", params={"w": 1.0, "a": 0.3, "b": 0.7}, time="t"
+)
+DAMPED = HamiltonianSystem.from_sympy("p**2/2 - w*cos(q)", params={"w": 1.0}, damping=0.2)
+RELATIVISTIC = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4/4")
+KEPLER = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2 + 0.3)")
+SYSTEMS = [
+    (CUBIC, "verlet"),
+    (CUBIC, "srkn11b"),
+    (CUBIC, "chin4c"),
+    (DRIVEN, "kahan_li8"),
+    (DAMPED, "verlet"),
+    (RELATIVISTIC, "blanes_moan4"),
+    (KEPLER, "leapfrog"),
+]
+RUNS = [
+    {"t_span": (0, 2), "dt": 0.1, "t_eval": [2.0]},
+    {"t_span": (0, 2), "dt": 0.1},
+    {"t_span": (0, 2), "dt": 0.07, "t_eval": [0.0, 0.1, 0.21, 1.9]},
+    {"t_span": (2, 0), "dt": 0.1, "save_every": 3},
+]
+
+
+def start(system, batch):
+    return np.random.default_rng(0).uniform(0.1, 0.3, (*batch, 2 * system.ndof))
+
+
+def weighted(sol):
+    return (torch.as_tensor(sol.y) * torch.as_tensor(np.random.default_rng(1).normal(size=sol.y.shape))).sum()
+
+
+@pytest.mark.parametrize(("system", "method"), SYSTEMS)
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("batch", [(), (2, 9)])
+def test_values_are_those_of_arrays_and_gradients_those_of_backpropagation(system, method, run, batch):
+    y0, found = start(system, batch), {}
+    plain = solve(system, method, y0=y0, **run)
+    for backend in ("compiled", "array"):
+        y = torch.tensor(y0, requires_grad=True)
+        sol = solve(system, method, y0=y, backend=backend, **run)
+        found[backend] = torch.autograd.grad(weighted(sol), y)[0]
+        if backend == "compiled":
+            np.testing.assert_array_equal(sol.y.detach().numpy(), plain.y)
+            assert sol.stats["backend"] == "compiled"
+    scale = found["array"].abs().max()
+    torch.testing.assert_close(found["compiled"] / scale, found["array"] / scale, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("system", "method", "params", "run"),
+    [
+        (CUBIC, "verlet", {"k": 1.0, "g": 0.0}, RUNS[0]),
+        (CUBIC, "chin4c", {"k": np.array([1.0, 0.9, 0.0]), "m": 1.3}, RUNS[2]),
+        (DRIVEN, "srkn11b", {"w": 1.1, "a": 0.3, "b": 0.7}, RUNS[2]),
+        (DAMPED, "verlet", {"w": np.array([1.0, 1.2])}, RUNS[1]),
+    ],
+)
+def test_gradients_by_parameters(system, method, params, run):
+    """The derivative of the same run by finite differences, whose error is that of rounding and h²."""
+    y0, h = start(system, ()), 1e-6
+
+    def value(**changed):
+        return float(weighted(solve(system, method, y0=y0, params={**params, **changed}, **run)))
+
+    tensors = {name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in params.items()}
+    sol = solve(system, method, y0=y0, params=tensors, **run)
+    np.testing.assert_allclose(
+        sol.y.detach().numpy(), solve(system, method, y0=y0, params=params, **run).y, rtol=0, atol=1e-14
+    )
+    for name, gradient in zip(params, torch.autograd.grad(weighted(sol), list(tensors.values())), strict=True):
+        difference = (value(**{name: params[name] + h}) - value(**{name: params[name] - h})) / (2 * h)
+        np.testing.assert_allclose(float(gradient.sum()), difference, rtol=1e-6, atol=1e-7)
+
+
+def test_first_and_second_derivatives():
+    y0 = torch.tensor(start(CUBIC, (2,)), requires_grad=True)
+    k = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+
+    def states(y, k):
+        return solve(CUBIC, "srkn6b", (0, 0.6), y, dt=0.1, t_eval=[0.33, 0.6], params={"k": k}).y
+
+    assert torch.autograd.gradcheck(states, (y0, k))
+    assert torch.autograd.gradgradcheck(states, (y0, k))
+
+
+@pytest.mark.parametrize("rows", [1, 300])
+def test_segments_give_the_same_bits(rows, monkeypatch):
+    y0, found = start(CUBIC, (rows,)), []
+    for most in (reverse.MOST_KEPT, 0):
+        monkeypatch.setattr(reverse, "MOST_KEPT", most)
+        monkeypatch.setattr(reverse, "SEGMENT", 20 * min(rows, reverse.ROWS))
+        y = torch.tensor(y0, requires_grad=True)
+        sol = solve(CUBIC, "verlet", (0, 3), y, dt=0.1, save_every=7)
+        found.append((sol.y.detach().numpy(), torch.autograd.grad(weighted(sol), y)[0].numpy()))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
+
+
+def test_a_chaotic_run():
+    """Finite differences of the compiled run itself: arrays have other states there."""
+    y0 = np.array([0.0, 0.1, 0.47, 0.1])
+    system = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + (q1**2 + q2**2)/2 + q1**2*q2 - q2**3/3")
+    run = {"t_span": (0, 100), "dt": 0.05, "t_eval": [100.0]}
+    y = torch.tensor(y0, requires_grad=True)
+    (gradient,) = torch.autograd.grad(weighted(solve(system, "verlet", y0=y, **run)), y)
+    columns, h = [], 1e-7
+    for e in np.eye(4):
+        columns.append([float(weighted(solve(system, "verlet", y0=y0 + s * h * e, **run))) for s in (1, -1)])
+    difference = (np.array(columns)[:, 0] - np.array(columns)[:, 1]) / (2 * h)
+    np.testing.assert_allclose(gradient.numpy(), difference, rtol=1e-4, atol=1e-4 * np.abs(difference).max())
+
+
+def test_rows_that_become_infinite_leave_the_others_alone():
+    y0 = np.array([[0.1, 0.0, 0.2, 0.1], [0.0, 30.0, 0.0, 30.0], [0.0, 0.1, 0.3, 0.0]])
+    y = torch.tensor(y0, requires_grad=True)
+    sol = solve(CUBIC, "verlet", (0, 2), y, dt=0.1, diagnose=False)
+    assert list(sol.status) == [0, -1, 0]
+    (gradient,) = torch.autograd.grad(sol.y[[0, 2], :, -1].sum() + sol.y[1, :, 1].sum(), y)
+    for row, last in ((0, -1), (1, 1), (2, -1)):
+        alone = torch.tensor(y0[row], requires_grad=True)
+        t_eval = sol.t[: 2 if last == 1 else None]
+        part = solve(CUBIC, "verlet", (0, 2), alone, dt=0.1, t_eval=t_eval, diagnose=False)
+        expected = torch.autograd.grad(part.y[:, last].sum(), alone)[0]
+        torch.testing.assert_close(gradient[row], expected, rtol=1e-12, atol=0)
+
+
+def test_float32_is_computed_in_double_and_rounded_at_the_outputs():
+    y0 = torch.tensor(start(CUBIC, ()), dtype=torch.float32, requires_grad=True)
+    sol = solve(CUBIC, "verlet", (0, 2), y0, dt=0.1)
+    double = solve(CUBIC, "verlet", (0, 2), y0.detach().double(), dt=0.1)
+    assert sol.y.dtype == torch.float32
+    torch.testing.assert_close(sol.y.detach(), double.y.float(), rtol=0, atol=0)
+    assert torch.autograd.grad(weighted(sol), y0)[0].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("method", "more", "remedy"),
+    [
+        ("gauss_legendre4", {}, "use a splitting method"),
+        ("dop853", {}, "use a splitting method"),
+        ("verlet", {"backend": "array"}, "Detach them"),
+        ("verlet", {"events": lambda t, y: y[0]}, "leave these out"),
+        ("verlet", {"on_domain_exit": "stop"}, "leave these out"),
+    ],
+)
+def test_parameters_to_which_no_gradient_flows(method, more, remedy):
+    k = torch.tensor(1.0, requires_grad=True)
+    with pytest.raises(ValueError, match=rf"^`params` has k.*{remedy}"):
+        solve(CUBIC, method, (0, 1), start(CUBIC, ()), params={"k": k}, **more)
