@@ -10,7 +10,6 @@ import numpy as np
 from sympflow.arrays import Array
 
 if TYPE_CHECKING:
-    from sympflow.hamiltonian.formulas import TracedHamiltonian
     from sympflow.hamiltonian.poles import Poles
 
 
@@ -77,7 +76,7 @@ class Definition:
     leaps: bool = False
     impulses: tuple[Any, ...] = ()
     poles: Poles | None = None
-    form: TracedHamiltonian | None = None
+    form: Any = None
     untraced: str = ""
     given_functions: bool = False
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
