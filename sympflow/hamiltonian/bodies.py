@@ -55,9 +55,7 @@ class PairsHamiltonian(LocalHamiltonian):
     ) -> None:
         self.dim = _checked_dim(dim)
         self.masses = _checked_column("masses", masses)
-        if not (self.masses > 0).all():
-            i = int(np.argmin(self.masses))
-            raise ValueError(f"`masses` must be positive; that of body {i} is {self.masses[i]:g}: change it.")
+        self._check_masses()
         self.n_bodies = len(self.masses)
         if self.n_bodies < 2:
             raise ValueError("`masses` must be those of two bodies or more, an array (n,).")
@@ -72,8 +70,18 @@ class PairsHamiltonian(LocalHamiltonian):
             )
         self.params = _checked_params(params)
         self._read(potential, {"m": self.masses, **self._checked_bodies(bodies)})
-        mass = np.repeat(1 / self.masses, self.dim)
+        mass = np.repeat(1 / self.inertia, self.dim)
         self.inverse_mass = None if (mass == 1).all() else mass
+
+    def _check_masses(self) -> None:
+        if not (self.masses > 0).all():
+            i = int(np.argmin(self.masses))
+            raise ValueError(f"`masses` must be positive; that of body {i} is {self.masses[i]:g}: change it.")
+
+    @property
+    def inertia(self) -> np.ndarray:
+        """The momentum of each body over its velocity."""
+        return self.masses
 
     def _checked_bodies(self, bodies: Any) -> dict[str, np.ndarray]:
         if not isinstance(bodies, Mapping | None):
@@ -294,7 +302,7 @@ class PairsHamiltonian(LocalHamiltonian):
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
         """By an energy that is off by more than T + |V| of the start, and a T of more than twice that."""
         pairs = self.n_bodies * (self.n_bodies - 1) // 2
-        T0, T = ((self._of_bodies(y[:, self.ndof :]) ** 2).sum(-1) @ (0.5 / self.masses) for y in (starts, ends))
+        T0, T = ((self._of_bodies(y[:, self.ndof :]) ** 2).sum(-1) @ (0.5 / self.inertia) for y in (starts, ends))
         found = T > 2 * T0
         if not conserves or not found.any() or (pairs > CHEAP_PAIRS and n_steps < MANY_STEPS):
             return np.zeros(len(ends), dtype=bool)
@@ -303,7 +311,7 @@ class PairsHamiltonian(LocalHamiltonian):
             return found & (np.abs(T + V - T0 - V0) > T0 + np.abs(V0))
 
     def leap(self, y: np.ndarray, start: np.ndarray) -> str:
-        before, after = ((self._of_bodies(x[self.ndof :]) ** 2).sum(-1) / self.masses for x in (start, y))
+        before, after = ((self._of_bodies(x[self.ndof :]) ** 2).sum(-1) / self.inertia for x in (start, y))
         i, j = sorted(np.argsort(after - before)[-2:].tolist())
         return (
             f"the bodies {i} and {j} have gained most: they met between two steps, which saw nothing of it. Take "

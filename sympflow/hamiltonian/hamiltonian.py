@@ -474,7 +474,8 @@ class Hamiltonian:
     def kinetic(self, p: Array, t: Any = None) -> Array:
         """T(p): (..., d) to (...). Like its derivatives it needs no t if T does not depend on it."""
         if self._separable().quadratic_kinetic:
-            return (p * self.velocity(p)).sum(-1) / 2
+            felt = None if self.local is None else self.local.felt
+            return ((p if felt is None else p * like(felt, p)) * self.velocity(p)).sum(-1) / 2
         return self._definition.kinetic(p, *self._kinetic_time(t, p))
 
     def velocity(self, p: Array, t: Any = None) -> Array:

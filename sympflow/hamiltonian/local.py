@@ -55,6 +55,8 @@ class LocalHamiltonian(Definition, ABC):
     shape: tuple[int, ...] = ()
     ends: tuple[str, ...] = ()
     noun: str = "system"
+    felt: np.ndarray | None = None
+    """1 of the momenta that count in H, 0 of those of bodies without mass (d,); None where all do."""
     frame: Any = None
     """The coordinates of planets about a star, of a system that knows its star: see `sympflow.hamiltonian.planets`."""
     written: SymbolicHamiltonian | None = None

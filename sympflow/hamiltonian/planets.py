@@ -90,7 +90,7 @@ class Frame:
     ) -> None:
         self.local, self.G, self.coordinates, self.encounter = local, G, coordinates, encounter
         masses = self.masses = local.masses
-        self.inertia = np.where(masses > 0, masses, 1.0)
+        self.inertia = local.inertia
         q, v = self.states(np.asarray(y0, dtype=float))
         x, u = q[1:] - q[0], v[1:] - v[0]
         self.elements = elements_of(x, u, G * (masses[0] + masses[1:]))
@@ -123,10 +123,10 @@ class Frame:
         """The share of each planet in the mass of all up to it."""
         return (self.masses[self.order] / self.sums[1:]).tolist()
 
-    def hill_radii(self, i: Any, j: Any) -> np.ndarray:
-        """The mutual Hill radius of bodies."""
+    def hill_radii(self, i: Any, j: Any, share: float = 1.0) -> np.ndarray:
+        """The mutual Hill radius of bodies; with a share of 0 that of i and bodies without mass."""
         mean = (self.size[i - 1] + self.size[j - 1]) / 2
-        return mean * np.cbrt((self.masses[i] + self.masses[j]) / (3 * self.masses[0]))
+        return mean * np.cbrt((self.masses[i] + share * self.masses[j]) / (3 * self.masses[0]))
 
     def states(self, y: Array) -> tuple[Array, Array]:
         """Positions and velocities (..., n, 3)."""
@@ -336,6 +336,63 @@ class PlanetsHamiltonian(PairsHamiltonian):
         super().__init__("-G*m1*m2/r", masses, 3, None, None, None, {"G": G}, None)
         self.start, self.coordinates, self.encounter = y0, coordinates, encounter
 
+    def _check_masses(self) -> None:
+        """Do nothing: bodies may have no mass."""
+
+    @property
+    def inertia(self) -> np.ndarray:
+        return np.where(self.masses > 0, self.masses, 1.0)
+
+    @cached_property
+    def felt(self) -> np.ndarray | None:  # type: ignore[override]
+        return None if (self.masses > 0).all() else np.repeat(np.where(self.masses > 0, 1.0, 0.0), 3)
+
+    @property
+    def is_few(self) -> bool:
+        return self.felt is None and super().is_few
+
+    @cached_property
+    def _heavy(self) -> tuple[np.ndarray, PairsHamiltonian]:
+        """The bodies that have a mass, and their part of H."""
+        heavy = np.flatnonzero(self.masses > 0)
+        return heavy, PairsHamiltonian("-G*m1*m2/r", self.masses[heavy], 3, None, None, None, self.params, None)
+
+    def _of_heavy(self, q: Array) -> Array:
+        x = q.reshape(*q.shape[:-1], self.n_bodies, 3)[..., self._heavy[0], :]
+        return x.reshape(*x.shape[:-2], 3 * len(self._heavy[0]))
+
+    def potential(self, q: Array) -> Array:
+        return super().potential(q) if self.felt is None else self._heavy[1].potential(self._of_heavy(q))
+
+    def potential_gradient(self, q: Array) -> Array:
+        if self.felt is None:
+            return super().potential_gradient(q)
+        return self._with_light(self._heavy[1].potential_gradient(self._of_heavy(q)), q)
+
+    def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
+        if self.felt is None:
+            return super().hessian_vector(q, v, *t)
+        return self._with_light(self._heavy[1].hessian_vector(self._of_heavy(q), self._of_heavy(v)), q, v)
+
+    def _with_light(self, heavy: Array, q: Array, v: Array | None = None) -> Array:
+        """Slopes of the bodies with mass, and per unit mass of all others; along v their derivatives."""
+        order, light = self._heavy[0], np.flatnonzero(self.masses == 0)
+        x = q.reshape(*q.shape[:-1], self.n_bodies, 3)
+        u = None if v is None else v.reshape(*v.shape[:-1], self.n_bodies, 3)
+        total: Any = 0 * (x if u is None else x + u)[..., light, :]
+        for j in order.tolist():
+            d = x[..., light, :] - x[..., j : j + 1, :]
+            square = (d * d).sum(-1)[..., None]
+            w = self.params["G"] * float(self.masses[j]) / (square * square**0.5)
+            if u is None:
+                total = total + w * d
+            else:
+                e = u[..., light, :] - u[..., j : j + 1, :]
+                total = total + w * (e - 3 * (d * e).sum(-1)[..., None] / square * d)
+        known = heavy.reshape(*heavy.shape[:-1], len(order), 3)
+        whole = _joined(known + 0 * total[..., :1, :], total)[..., np.argsort(np.concatenate([order, light])), :]
+        return whole.reshape(*whole.shape[:-2], self.ndof)
+
     @cached_property
     def frame(self) -> Frame:
         return Frame(self, self.params["G"], self.start, self.coordinates, self.encounter)
@@ -353,7 +410,8 @@ class PlanetsHamiltonian(PairsHamiltonian):
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         other = super().with_params(values)
-        vars(other).pop("frame", None)
+        for name in ("frame", "_heavy"):
+            vars(other).pop(name, None)
         return other
 
 

@@ -410,7 +410,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
         Parameters
         ----------
         masses : array_like of shape (n,)
-            The star's first, which is the heaviest.
+            The star's first, which is the heaviest. Bodies of mass 0 feel the others and are not felt; their momenta
+            are per unit mass, and no part of H.
         elements : mapping of str to array_like of shape (n − 1,), or array_like of shape (n − 1, 6)
             Heliocentric orbital elements of the planets: "a", "e", "inc", "node" (ascending), "peri" (the argument of
              the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Of hyperbolas

@@ -33,7 +33,7 @@ from sympflow.kernels.runs import Numbers, Room
 
 __all__ = ["KeplerKernel", "Substeps"]
 
-LANES = 8
+LANES, LANES_SHIFT = 8, 3
 AXES = 3
 NUMBERS = 2 * AXES * LANES  # of a group of planets
 MOST_GROUPS = 4  # whose pairs are written out
@@ -56,13 +56,21 @@ class KeplerCode(Rollouts):
     lanes, fewest = 1, 1
 
     def __init__(self, frame: Frame) -> None:
-        self.groups = -(-len(frame.order) // LANES)
-        super().__init__(NUMBERS * self.groups, NUMBERS * self.groups)
+        self.light = places_of_light(frame)
+        self.groups = -(-(len(frame.order) + bool(self.light)) // LANES)  # with one lane behind all planets
+        whole = NUMBERS * (self.groups + len(self.light))
+        super().__init__(whole, whole)
+        self.planets = len(frame.order)
         self.jacobi, self.watches = frame.jacobi, frame.encounter is not None
-        self.room, self.size = 0, 2
+        planets = LANES * self.groups
+        self.room, self.size = 3 * AXES * planets, 2
         table, limits = constants(frame, self.groups)
-        self.report = zeros(AXES * LANES * self.groups)
-        self.data = (table, limits, self.report)
+        self.report = zeros(AXES * (planets + LANES) + 1)
+        inside = np.array([frame.inside[group[0]] for group in self.light])
+        of_light = np.stack([frame.G * frame.sums[inside], 1 / frame.sums[inside], inside]) if len(inside) else zeros(1)
+        near = np.zeros(planets)
+        near[: len(frame.order)] = ((frame.encounter or 0.0) * frame.hill_radii(frame.order, frame.order, 0.0)) ** 2
+        self.data = (table, limits, self.report, np.ascontiguousarray(of_light), near)
 
     def prepared(self, table: Columns) -> Columns:
         return table
@@ -88,7 +96,7 @@ class KeplerCode(Rollouts):
             x = self._jumped(x, v, c, 0.5 * kick)
         roots = [sqrt(dot(each, each)) for each in x]
         inverses = [1.0 / r for r in roots]
-        v = self._kicked(room, x, v, c, kick, inverses)
+        v, kick = self._kicked(room, x, v, c, kick, inverses)
         if not self.jacobi:
             x = self._jumped(x, v, c, 0.5 * kick)
             roots = [sqrt(dot(each, each)) for each in x]
@@ -97,10 +105,58 @@ class KeplerCode(Rollouts):
             new = drifted(x[g], v[g], c[g]["mu"], drift, roots[g], inverses[g])
             for i, value in enumerate([*new[0], *new[1]]):
                 code.store(value, room.state, NUMBERS * g + LANES * i)
+        if len(self.light):
+            with code.over(len(self.light)) as turn:
+                self._light(room, turn, kick, drift, c[0]["star"])
+
+    def _light(self, room: Room, g: Value, kick: Value, drift: Value, star: Value) -> None:
+        """The same of a group of bodies without mass, of which all have the same planets inside of their orbits."""
+        code, type, light = room.code, Type("double", LANES), len(self.light)
+        place = code.at(room.state, (g + self.groups) * NUMBERS)
+        x, v = ([code.load(place, LANES * (k + i), type) for i in range(AXES)] for k in (0, AXES))
+        mu, over, inside = (code.splat(code.load(room.data(3), g + light * i), LANES) for i in range(3))
+        inside = code.convert("fptosi", code.lane(inside, 0), "i64")
+        planets = LANES * self.groups
+
+        def vector(which: int, j: Any) -> Vectors:
+            start = AXES * planets * which
+            return [code.splat(code.load(room.work, j + (start + planets * i)), LANES) for i in range(AXES)]
+
+        h = [y + p for y, p in zip(x, vector(1, inside), strict=True)]
+        square, own = dot(h, h), dot(x, x)
+        pull, r = star / (square * sqrt(square)), sqrt(own)
+        inverse = 1.0 / r
+        a = [over * p - pull * y for p, y in zip(vector(2, inside), h, strict=True)]
+
+        def added(j: Value, total: list[Value]) -> list[Value]:
+            d = [p - y for p, y in zip(vector(0, j), h, strict=True)]
+            distance = dot(d, d)
+            w = code.splat(code.load(room.data(0), self._of_mass(j)), LANES) / (distance * sqrt(distance))
+            limit = code.splat(code.load(room.data(4), j), LANES)
+            return [
+                code.apply("min", (total[0], distance - limit)),
+                *(p + w * q for p, q in zip(total[1:], d, strict=True)),
+            ]
+
+        start = code.splat(code.constant(float("inf")), LANES)
+        near, *a = code.loop(self.planets, [start, *a], added)
+        if self.watches:
+            kick = kick + self._met(room, code.any(near < 0.0), [h], kick, g)
+        own = mu * inverse * inverse * inverse
+        v = [q + kick * (p + own * y) for q, p, y in zip(v, a, x, strict=True)]
+        new = drifted(x, v, mu, drift, r, inverse)
+        for i, value in enumerate([*new[0], *new[1]]):
+            code.store(value, place, LANES * i)
+
+    def _of_mass(self, j: Value) -> Value:
+        """Where G m of planet j stands in the table."""
+        group = j >> LANES_SHIFT
+        return j + group * (LANES * (len(ROWS) - 1))
 
     def _kicked(
         self, room: Room, x: list[Vectors], v: list[Vectors], c: list[dict[str, Value]], t: Value, inverses: Vectors
-    ) -> list[Vectors]:
+    ) -> tuple[list[Vectors], Value]:
+        """The velocities after a kick, and its length, which is NaN where planets met."""
         code, groups, zero = room.code, range(self.groups), room.code.constant(0.0, x[0][0].type)
         h = self._heliocentric(x, c) if self.jacobi else x
         a = [[zero] * AXES for _ in groups]
@@ -128,7 +184,7 @@ class KeplerCode(Rollouts):
             t = t + self._met(room, code.any(close), h, t)
         new = []
         if not self.jacobi:
-            return [[p + t * q for p, q in zip(v[g], a[g], strict=True)] for g in groups]
+            return [[p + t * q for p, q in zip(v[g], a[g], strict=True)] for g in groups], t
         behind = [zero] * AXES
         for g in reversed(groups):
             star, own = (c[g][name] for name in ("star", "mu"))
@@ -143,7 +199,14 @@ class KeplerCode(Rollouts):
             )
             change = [c[g]["ratio"] * p + c[g]["over"] * q + own * y for p, q, y in zip(a[g], outer, x[g], strict=True)]
             new.append([p + t * q for p, q in zip(v[g], change, strict=True)])
-        return new[::-1]
+            if len(self.light):
+                before = [y - z for y, z in zip(h[g], x[g], strict=True)]
+                all_behind = [p + q for p, q in zip(weighted, outer, strict=True)]
+                for which, vector in enumerate((h[g], before, all_behind)):
+                    for i, value in enumerate(vector):
+                        start = LANES * (self.groups * (AXES * which + i) + g)
+                        code.store(value, room.work, start)
+        return new[::-1], t
 
     def _heliocentric(self, x: list[Vectors], c: list[dict[str, Value]]) -> list[Vectors]:
         """Places as seen from the star, of those from the centre of all inside."""
@@ -166,12 +229,19 @@ class KeplerCode(Rollouts):
             jump.append(t * sum(parts[1:], parts[0]))
         return [[y + j for y, j in zip(group, jump, strict=True)] for group in x]
 
-    def _met(self, room: Room, met: Value, h: list[Vectors], like: Value) -> Value:
+    def _met(self, room: Room, met: Value, h: list[Vectors], like: Value, light: Value | None = None) -> Value:
         """NaN where two planets met, whose places are then written down; else 0."""
         code = room.code
 
         def told() -> Vectors:
-            for i, value in enumerate([y for group in h for y in group]):
+            group = code.constant(-1.0) if light is None else code.convert("sitofp", light, "double")
+            code.store(group, room.data(2), len(self.report) - 1)
+            places = [y for group in h for y in group]
+            if light is not None:
+                turns = [(g, i) for g in range(self.groups) for i in range(AXES)]
+                planets = [code.load(room.work, LANES * (self.groups * i + g), like.type) for g, i in turns]
+                places = [*planets, *places]
+            for i, value in enumerate(places):
                 code.store(value, room.data(2), LANES * i)
             return [code.constant(float("nan"), like.type)]
 
@@ -244,6 +314,13 @@ def code_of(values: Sequence[Value]) -> Code:
     return values[0].code
 
 
+def places_of_light(frame: Frame) -> list[np.ndarray]:
+    """The bodies without mass in groups of eight, or fewer, with the same planets inside of their orbits."""
+    order = np.argsort(frame.inside, kind="stable")
+    classes = np.split(order, np.flatnonzero(np.diff(frame.inside[order])) + 1) if len(order) else []
+    return [members[k : k + LANES] for members in classes for k in range(0, len(members), LANES)]
+
+
 def constants(frame: Frame, groups: int) -> tuple[np.ndarray, np.ndarray]:
     """The `ROWS` of each group, and the squares of distances at which lanes meet, for each two groups and turn."""
     n, masses, G = len(frame.order), frame.masses, frame.G
@@ -277,24 +354,35 @@ class KeplerLoops:
     """The states of a frame as the registers of its code, and back."""
 
     def __init__(self, frame: Frame) -> None:
-        if len(frame.test) or not len(frame.order) or len(frame.order) > MOST_GROUPS * LANES:
+        n = len(frame.order)
+        if not n or n > MOST_GROUPS * LANES - 1 or (len(frame.test) and not frame.jacobi):
             raise ValueError(
-                f"`system` has {len(frame.order)} planets with a mass, and compiled code is for at most "
-                f"{MOST_GROUPS * LANES}: use backend='array'."
+                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, with "
+                "bodies without mass in Jacobi's coordinates only: use backend='array'."
             )
         self.frame, self.code = frame, KeplerCode(frame)
-        n, size = len(frame.order), AWAY * frame.size.max()
+        size = AWAY * frame.size.max()
         spare = LANES * self.code.groups - n
         self._spare = np.zeros((spare, 2 * AXES))
         self._spare[:, 0] = size * (1 + np.arange(spare))
         self._spare[:, AXES + 1] = np.sqrt(frame.G * frame.sums[-1] / self._spare[:, 0])
+
+        lanes = np.arange(LANES)
+        light = [n + group[np.minimum(lanes, len(group) - 1)] for group in self.code.light]
+        self._given = np.concatenate(
+            [np.arange(n), np.arange(n + len(frame.test), n + len(frame.test) + spare), *light]
+        )
+        self._found = np.zeros(n + len(frame.test), dtype=int)
+        self._found[:n] = np.arange(n)
+        for g, group in enumerate(self.code.light):
+            self._found[n + group] = LANES * (self.code.groups + g) + lanes[: len(group)]
 
     def rows(self, y: np.ndarray) -> np.ndarray:
         """The running states (N, n_values) of states (N, 2d)."""
         x, v, *_ = self.frame.into(y)
         planets = np.concatenate([x, v], axis=-1)
         planets = np.concatenate([planets, np.broadcast_to(self._spare, (len(y), *self._spare.shape))], axis=1)
-        groups = planets.reshape(len(y), self.code.groups, LANES, 2 * AXES).swapaxes(-1, -2)
+        groups = planets[:, self._given].reshape(len(y), -1, LANES, 2 * AXES).swapaxes(-1, -2)
         return np.ascontiguousarray(groups).reshape(len(y), -1)
 
     def states(self, rows: np.ndarray, y0: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -306,8 +394,9 @@ class KeplerLoops:
     def moved(self, rows: np.ndarray, y0: np.ndarray, times: np.ndarray) -> np.ndarray:
         """The states of running ones (..., n_values), after times since those y0 (..., 2d)."""
         *_, Q, U = self.frame.into(y0)
-        planets = rows.reshape(*rows.shape[:-1], self.code.groups, 2 * AXES, LANES).swapaxes(-1, -2)
-        planets = planets.reshape(*rows.shape[:-1], self.code.groups * LANES, 2 * AXES)[..., : len(self.frame.order), :]
+        groups = len(self._given) // LANES
+        planets = rows.reshape(*rows.shape[:-1], groups, 2 * AXES, LANES).swapaxes(-1, -2)
+        planets = planets.reshape(*rows.shape[:-1], groups * LANES, 2 * AXES)[..., self._found, :]
         centre = Q + times[..., None] * U
         return self.frame.out(planets[..., :AXES], planets[..., AXES:], centre, U + 0 * centre)
 
@@ -349,16 +438,25 @@ class KeplerKernel(Kernel):
         return Run(loops.states(rows, task.y0, task.save * task.h), n_finite)
 
     def _pair(self) -> str:
-        """A clause on the planets that met."""
-        frame, x = self.loops.frame, self.loops.code.report.reshape(-1, AXES, LANES).swapaxes(1, 2).reshape(-1, AXES)
-        i, j = np.triu_indices(len(frame.order), 1)
-        distance = np.linalg.norm(x[i] - x[j], axis=-1)
-        if frame.encounter is None or not len(i) or not (distance**2 < frame.limits).any():
+        """A sentence on the bodies that met."""
+        frame, code = self.loops.frame, self.loops.code
+        if frame.encounter is None or not code.report.any():
             return ""
-        k = int(np.argmin(distance / np.sqrt(frame.limits)))
-        one, other = sorted((int(frame.order[i[k]]), int(frame.order[j[k]])))
-        radii = frame.encounter * distance[k] / np.sqrt(frame.limits[k])
-        return f" Bodies {one} and {other} were {distance[k]:.4g} apart, {radii:.3g} Hill radii."
+        *places, group = code.report
+        x = np.reshape(places, (-1, AXES, LANES)).swapaxes(1, 2).reshape(-1, AXES)
+        one, other = frame.pairs
+        start, end = np.triu_indices(code.planets, 1)
+        share = 1.0
+        if group >= 0:  # a planet and one of a group of bodies without mass
+            members = code.light[int(group)]
+            start, end = (z.ravel() for z in np.indices((code.planets, len(members))))
+            one, other, share = frame.order[start], frame.test[members[end]], 0.0
+            end = end + LANES * code.groups
+        distance = np.linalg.norm(x[start] - x[end], axis=-1)
+        radii = distance / frame.hill_radii(one, one if share == 0 else other, share)
+        k = int(np.argmin(radii))
+        first, second = sorted((int(one[k]), int(other[k])))
+        return f" Bodies {first} and {second} were {distance[k]:.4g} apart, {radii[k]:.3g} Hill radii."
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])

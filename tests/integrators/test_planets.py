@@ -200,7 +200,7 @@ def test_studies_and_ensembles(tmp_path):
 BAD = [
     ({"masses": [1e-3, 1.0]}, "`masses` must begin with the star"),
     ({"masses": [1.0]}, "`masses` must be those of a star and one planet"),
-    ({"masses": [1.0, -1e-3, 1e-3, 0.1]}, "`masses` must be positive"),
+    ({"masses": [1.0, -1e-3, 1e-3, 0.1]}, "`masses` must be positive, or 0"),
     ({"elements": None}, "`elements` or `y0`"),
     ({"y0": np.zeros(24)}, "`elements` or `y0`"),
     ({"elements": None, "y0": np.zeros(7)}, "`y0` must be a finite state"),
@@ -338,3 +338,46 @@ def test_a_moon_is_no_planet():
     with pytest.raises(ValueError, match="bodies 1 and 3 are bound to each other: take the splitting 'kinetic'"):
         solve(system, "wisdom_holman", (0, 100.0))
     assert solve(system, t_span=(0, 100.0)).integrator.name == "srkn11b"
+
+
+# bodies without mass ------------------------------------------------------------------------------------------------
+
+LIGHT = {
+    "a": [5.2, 9.55, 3.0, 2.5, 15.0, 7.0, 3.3],
+    "e": [0.05, 0.06, 0.05, 0.1, 0.2, 0.01, 0.0],
+    "inc": [0.02, 0.04, 0.01, 0.1, 0.0, 0.3, 0.0],
+    "M": [0.3, 2.0, 4.0, 1.0, 2.0, 5.0, 6.0],
+}
+
+
+@pytest.mark.parametrize("method", ["wisdom_holman", "kepler_aba864", "srkn11b", "gauss_legendre6"])
+def test_bodies_without_mass_move_as_those_of_hardly_any(method):
+    given = {"elements": LIGHT, "G": GAUSS, "encounter": None}
+    none, least = (HamiltonianSystem.planets([1.0, 1e-3, 3e-4, *[m] * 5], **given) for m in (0.0, 1e-15))
+    sols = [solve(s, method, (0, 8000.0), dt=40.0) for s in (none, least)]
+    assert np.abs(sols[0].y[:24] - sols[1].y[:24]).max() < 1e-10
+    p, v = sols[0].y[33:], sols[1].y[33:] / 1e-15
+    assert np.abs(p - v).max() < 1e-12
+    assert np.abs(sols[0].energy_error()).max() < 1e-6
+
+
+@pytest.mark.parametrize("planets", [2, 8])
+def test_bodies_without_mass_are_compiled(planets):
+    rng = np.random.default_rng(0)
+    a = np.concatenate([2.0 * 1.5 ** np.arange(planets), rng.uniform(1.0, 40.0, 30)])
+    orbits = {"a": a, "e": 0.02, "inc": rng.uniform(0, 0.1, len(a)), "M": rng.uniform(0, 6, len(a))}
+    system = HamiltonianSystem.planets([1.0, *[1e-5] * planets, *[0.0] * 30], elements=orbits, encounter=None)
+    runs = [solve(system, "wisdom_holman", (0, 12.0), dt=0.3, backend=b).y for b in ("compiled", "array")]
+    assert np.abs(runs[0] - runs[1]).max() < 1e-11
+    few = {name: x if name == "e" else x[:planets] for name, x in orbits.items()}
+    alone = HamiltonianSystem.planets([1.0, *[1e-5] * planets], elements=few, encounter=None)
+    d = 3 * (1 + planets)
+    assert np.abs(solve(alone, "wisdom_holman", (0, 12.0), dt=0.3).y[:d] - runs[0][:d]).max() < 1e-11
+
+
+def test_a_body_without_mass_that_meets_a_planet():
+    orbits = {"a": [1.0, 1.9, 1.06], "M": [0.0, 2.0, 1.0]}
+    system = HamiltonianSystem.planets([1.0, 1e-4, 1e-4, 0.0], elements=orbits)
+    sol = solve(system, "wisdom_holman", (0, 2000.0), dt=0.2)
+    assert sol.status == -1
+    assert "Bodies 1 and 3 were" in sol.message
