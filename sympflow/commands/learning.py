@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def learn(
     ctx: typer.Context,
-    data: Annotated[Path, typer.Argument(help="A CSV, Parquet, NetCDF or zarr file: t, q1 …, p1 …, and the orbit.")],
+    data: Annotated[Path, typer.Argument(help="A CSV, Parquet, npz, NetCDF or zarr file: t, q1 …, p1 …, the orbit.")],
     ndof: Annotated[int | None, typer.Option(help="Degrees of freedom, where columns bear other names.")] = None,
     dt: Annotated[float | None, typer.Option(help="Δt of the flow. Default: what suits its frequencies.")] = None,
     noise: Annotated[float | None, typer.Option(help="Standard deviation of the data. Default: estimated.")] = None,
@@ -37,6 +37,10 @@ def learn(
     order: Annotated[
         str, typer.Option(help="Of columns without the names q1 …: halves, q1 q2 p1 p2, or pairs, q1 p1 q2 p2.")
     ] = "halves",
+    observed: Annotated[
+        str,
+        typer.Option(help="qp, states; qv, positions and velocities, of a mass that is not known; q, positions alone."),
+    ] = "qp",
     loss: Annotated[str, typer.Option(help="squares, or huber for data with outliers.")] = "squares",
     unit: Annotated[
         list[str] | None, typer.Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
@@ -59,6 +63,8 @@ def learn(
 
       sympflow learn spring.parquet --damping --time-budget 60
 
+      sympflow learn camera.csv --observed q --ndof 2
+
       sympflow learn orbits.csv --mass 1,2.5 --known own.toml --family polynomial
     """
     with reporting(ctx):
@@ -68,7 +74,7 @@ def learn(
         ready_file(to)
         if plot is not None:
             ready_file(plot, "--plot")
-        runs = Trajectories.read(data, ndof, units=_units(unit), order=order, period=period)
+        runs = Trajectories.read(data, ndof, units=_units(unit), order=order, period=period, observed=observed)
         out.print(f"{len(runs.runs)} trajectories, {runs.n_points} points, {runs.ndof} degree(s) of freedom")
         flow = learn_flow(
             runs,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -227,14 +228,15 @@ def _equilibrium(system: Any, K: np.ndarray) -> np.ndarray:
         for start in starts:
             if not np.isfinite(system.force(start, t0)).all():
                 continue
-            q, last = start.copy(), np.inf
+            q, last, reach = start.copy(), np.inf, 0.0
             for _ in range(EQUILIBRIUM_STEPS):
                 change = inverse @ np.asarray(system.force(q, t0))
                 size = float(np.linalg.norm(change))
                 if not size < last:  # at the level of rounding, or nowhere near
                     break
                 q, last = q + change, size
-            return inverse @ K @ q if last <= 1e-6 * (1 + np.linalg.norm(q)) else inverse @ K @ start
+                reach = max(reach, size, float(np.linalg.norm(q)))
+            return inverse @ K @ q if last <= 1e-6 * reach else inverse @ K @ start
     return np.zeros(system.ndof)
 
 
@@ -272,9 +274,19 @@ def read_off(
     X = sp.Matrix([s - _number(c) for s, c in zip(q, center, strict=True)])
     P, Ks, Bs = sp.Matrix(p), *(sp.Matrix(d, d, [_number(v) for v in A.ravel()]) for A in (K_array, B_array))
     removed = sp.expand(quadratic - (X.T * Ks * X)[0] / 2 - (P.T * Bs * P)[0] / 2)
-    negligible = 1e-12 * (1 + np.abs(slope).max())
-    kept = [t for t in sp.Add.make_args(removed) if abs(t.as_coeff_Mul()[0]) > negligible and t.free_symbols]
+    given = sp.expand(quadratic).as_coefficients_dict()
+    kept = [
+        t
+        for t in sp.Add.make_args(removed)
+        if t.free_symbols and abs(t.as_coeff_Mul()[0]) > ZERO * _size(t.as_coeff_Mul()[1], given, K_array, center, q)
+    ]
     return LinearPart(B_array, K_array, center, rest + sp.Add(*kept), interval)
+
+
+def _size(term: sp.Expr, given: Any, K: np.ndarray, center: np.ndarray, q: Sequence[sp.Symbol]) -> float:
+    """The size of what cancels in the coefficient of a term: as it was given, and of K·center where it is linear."""
+    from_center = float(np.abs(K[q.index(term)] * center).max()) if term in q else 0.0
+    return max(abs(float(given.get(term, 0))), from_center)
 
 
 def _number(value: float) -> Any:

@@ -14,6 +14,8 @@ from sympflow.learning.trajectories import Trajectories
 
 BETTER = 0.5
 """Share of the misfit that another reading of the data must leave at most, to be worth a word."""
+MUCH_BETTER = 0.1
+"""The same of a vector field that is not Hamiltonian: a sum that has more terms leaves less by itself."""
 ALIKE = 1.2
 """Factor by which a reading may leave more than the best, and is named if it stands before it."""
 TURNED = (
@@ -98,7 +100,7 @@ def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str, d
         for i in range(2 * d):
             c = np.linalg.lstsq(columns, v[:, i], rcond=None)[0]
             squares += float((((v[:, i] - columns @ c) / scales[i]) ** 2).sum())
-        if squares < BETTER * min(left, widest):
+        if squares < MUCH_BETTER * min(left, widest):
             return (
                 "A vector field of cubic polynomials that is not Hamiltonian fits much better: the data are no motion "
                 "of a Hamiltonian in these coordinates, or these are not canonical."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.inertia import Inertia
 from sympflow.learning.maps import NetworkFlow
-from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Part, Polynomial, Waves
+from sympflow.learning.models import Distances, FixedKinetic, Formula, Kinetic, Model, Network, Part, Polynomial, Waves
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
 HARMONICS = (1, 2, 3, 4, 6, 8)
@@ -24,7 +24,7 @@ WHOLE_WIDTHS = (12, 24, 40)
 FLOW_SIZES = ((2, 6, False), (2, 6, True), (3, 10, True), (5, 12, True))
 """Pairs of layers, of half of them where it is palindromic, neurons of each, and True for palindromic SympFlows."""
 POWERS = ((-1,), (-2, -1, 0, 1, 2))
-"""Powers of the distances of pairs, 0 for the logarithm."""
+"""Powers of distances, 0 for the logarithm."""
 CHANGING = 0.5
 """Variance of the total momentum along a trajectory, over the sum of those of its parts, where it is not constant."""
 MOST_TERMS = 400
@@ -173,6 +173,22 @@ def _magnetic(said: Said) -> Iterator[Candidate]:
         )
 
 
+def _central(said: Said) -> Iterator[Candidate]:
+    d, size = said.ndof, 2 * float(np.mean(said.scales[: said.ndof]))
+    if said.angles or d not in (2, 3):
+        return
+    bodies = np.arange(d)[None]
+    for powers in POWERS:
+        yield Candidate(
+            f"{T}, V of the distance from the origin, {_of_powers(powers)}",
+            said.separated(Distances.between(bodies, powers, size, central=True)),
+        )
+
+
+def _of_powers(powers: Sequence[int]) -> str:
+    return "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
+
+
 def _pairs(said: Said) -> Iterator[Candidate]:
     d = said.ndof
     size = 2 * float(np.mean(said.scales[:d]))
@@ -183,11 +199,13 @@ def _pairs(said: Said) -> Iterator[Candidate]:
             "one body after another": np.arange(d).reshape(-1, dim),
             "one axis after another": np.arange(d).reshape(dim, -1).T,
         }
-        for powers in POWERS:
-            said_powers = "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
-            for order, bodies in ((order, bodies) for order, bodies in orders.items() if said.at_rest(bodies)):
-                name = f"{T}, V of the distances of {len(bodies)} bodies in {dim} dimensions, {order}, {said_powers}"
-                yield Candidate(name, said.separated(Pairs(bodies, powers, size, shared=False)))
+        for central, powers in product((False, True), POWERS):
+            for order, bodies in orders.items():
+                if not central and not said.at_rest(bodies):
+                    continue
+                name = f"{T}, V of the distances of {len(bodies)} bodies in {dim} dimensions"
+                name += f"{' and from the origin' * central}, {order}, {_of_powers(powers)}"
+                yield Candidate(name, said.separated(Distances.between(bodies, powers, size, central)))
 
 
 def _networks(said: Said) -> Iterator[Candidate]:
@@ -250,6 +268,7 @@ class Family:
 
 
 FAMILIES = {
+    "central": Family(True, _central),
     "pairs": Family(True, _pairs),
     "waves": Family(True, _waves),
     "polynomial": Family(True, _polynomials),
@@ -261,11 +280,11 @@ FAMILIES = {
     "whole-network": Family(False, _whole_networks, linear=False, observed="qp"),
     "sympflow": Family(False, _flows, linear=False, observed="qp"),
 }
-"""In the order in which they are tried: potentials of the distances of bodies; Fourier series, where a `period` is
-given; polynomials; networks of one layer. The first four have H = ½ pᵀM⁻¹p + V(q); "inertia" has a mass matrix that
-depends on q, as of pendulums that hang on each other; "magnetic", for velocities, a uniform magnetic field, in Landau's
-gauge; the next three are functions H(q, p). "sympflow" is last: flow maps with neural potentials, which are fitted to
-the data themselves, and no H is learned."""
+"""In the order in which they are tried: potentials of the distance from the origin, and of distances of bodies; Fourier
+series, where a `period` is given; polynomials; networks of one layer. The first five have H = ½ pᵀM⁻¹p + V(q);
+"inertia" has a mass matrix that depends on q, as of pendulums that hang on each other; "magnetic", for velocities, a
+uniform magnetic field, in Landau's gauge; the next three are functions H(q, p). "sympflow" is last: flow maps with
+neural potentials, which are fitted to the data themselves, and no H is learned."""
 
 
 def families(said: Said, name: str | None) -> list[str]:
@@ -287,9 +306,9 @@ def families(said: Said, name: str | None) -> list[str]:
     if name is not None and not (FAMILIES[name].tells(said) and any(True for _ in FAMILIES[name].models(said))):
         raise ValueError(
             f"`family` {name!r} does not apply: series need the `period` of an angle, pairs the coordinates of two "
-            "bodies or more in two or three dimensions, functions H(q, p) and flows momenta, a magnetic field "
-            "velocities in two dimensions or more, flows nothing that is known of H, and other families not too many "
-            "degrees of freedom."
+            "bodies or more in two or three dimensions, central fields those of one, functions H(q, p) and flows "
+            "momenta, a magnetic field velocities in two dimensions or more, flows nothing that is known of H, and "
+            "other families not too many degrees of freedom."
         )
     if name is not None:
         return [name]

@@ -169,7 +169,7 @@ def fitted(
             theta, moved = lagrangian_start(model, data, theta)
         if model.stepper is None:
             steps = 1 if model.linear else MATCHED_STEPS
-            theta = matched(model, theta, moved.pieces(MATCHED_POINTS), 1 / moved.scales, steps)
+            theta = matched(model, theta, moved.pieces(MATCHED_POINTS), 1 / moved.scales, steps, setting.stop)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
     sigma = given if given is not None else 1e-2 * scales if former is None else former.sigma
     span = (
@@ -181,20 +181,24 @@ def fitted(
     else:
         states = _states(former, data, pieces, sigma, setting)
     costs: list[float] = []
-    finer = 1.0
+    made, finer = None, 1.0
     for attempt in range(1 + ROUNDS):
         reached = span
         tolerance = np.clip(0.02 * finer * sigma, 1e-12 * scales, 1e-4 * scales)
-        method = chosen_method(model, theta, pieces, tolerance, HALVINGS if attempt else FIRST_HALVINGS)
+        halvings = HALVINGS if attempt else FIRST_HALVINGS
+        method = chosen_method(model, theta, pieces, tolerance, halvings, setting.stop)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
         gain = FINE if (attempt or former is not None) and setting.plausible(sigma) else COARSE
         most = STEPS if model.stepper is None else OWN_STEPS
         patience = 3 if former is None else 1  # near the minimum a step tells
         fit = minimized(problem, theta, states, iterations=most, gain=gain, patience=patience, stop=setting.stop)
+        if made is not None and setting.stop() and not math.isfinite(fit.cost):
+            return made
         theta, before = fit.theta, sigma
         costs += [cost / data.n_values for cost in fit.costs]
         if given is None:
             sigma = np.maximum(fit.noise(), FINEST * scales)
+        made = Fitted(model, theta, sigma, fit, reached, costs)
         if not math.isfinite(fit.cost) or setting.stop() or setting.hopeless(np.maximum(fit.noise(), FINEST * scales)):
             break
         orbits = np.concatenate(fit.orbits, axis=1)
@@ -207,7 +211,8 @@ def fitted(
         if longer > 1.5 * span:
             span, pieces = longer, data.pieces(span=longer)
         states = orbits[:, _starts(pieces.runs)].T
-    return Fitted(model, theta, sigma, fit, reached, costs)
+    assert made is not None
+    return made
 
 
 def kept(found: Fitted) -> dict[str, Any]:

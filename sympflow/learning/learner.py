@@ -38,7 +38,7 @@ from sympflow.learning.fitting import (
     restored,
 )
 from sympflow.learning.library import library_for
-from sympflow.learning.models import Formula, FreeField, Model, Pairs, Part, Polynomial
+from sympflow.learning.models import Distances, Formula, FreeField, Model, Part, Polynomial
 from sympflow.learning.shooting import Field, Method
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
@@ -532,7 +532,8 @@ class Search:
         if not deadline.over():
             smooth = replace(setting, seen=None) if self.winner[2].lag else setting
             found = fitted(candidate.model, self.whole or self.all, smooth, self.final)
-            self.final = self.final if setting.stop() and found.span < self.final.span else found
+            shorter = found.span < self.final.span or not math.isfinite(found.fit.cost)
+            self.final = self.final if setting.stop() and shorter else found
         self.final = without_growth(self.final)
         self.cut = deadline.over()
 
@@ -692,8 +693,6 @@ class Search:
             f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: "
             f"{held.complaint}."
         )
-        if self.cut:
-            said += " The time budget ended the search: give it more."
         deadline = session.deadline
         free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
         if free is not None:
@@ -707,6 +706,8 @@ class Search:
                 return
         smooth = smoothed(self._whole(self.data))
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
+        if self.cut:
+            otherwise = f"The time budget ended the search: give it more. {otherwise}"
         library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.said.rates > 0
         said += " " + hint(library, smooth, self.data, otherwise, damped)
         warnings.warn(said, UserWarning, stacklevel=4)
@@ -784,9 +785,9 @@ class Search:
         if not parts or any(part.of == "y" and not part.inertial for part in parts):
             groups.append((range(2 * d), None))
         else:
-            pairs = next((part for part in parts if isinstance(part, Pairs)), None)
-            if pairs is not None:
-                groups.append((q, Pairs(pairs.bodies, (2,), 1.0, shared=False)))
+            distances = next((part for part in parts if isinstance(part, Distances)), None)
+            if distances is not None:
+                groups.append((q, distances.squares()))
             elif any(part.of != "p" for part in parts):
                 groups.append((q, None))
             if any(part.of != "q" for part in parts):

@@ -502,41 +502,61 @@ class Network(Part):
         return sympy.Add(*made)
 
 
-class Pairs(Part):
-    """Σ over pairs of bodies of Σ_j θ_j (r/s)^e_j, the logarithm of r/s where e_j = 0.
+class Distances(Part):
+    """Σ_k θ_k (r_k/s)^e_k, of distances r between two bodies, or of one from the origin; log(r/s) where e is 0.
 
     Parameters
     ----------
     bodies : ndarray of int, shape (n_bodies, dim)
         The places of the coordinates of each body in q.
-    powers : sequence of int
-        The exponents e.
+    terms : sequence of (int, int or None, int)
+        Two bodies, or one and None for the origin, and the exponent e.
     scale : float
         s, of the size of the distances.
-    shared : bool
-        True if all pairs have the same numbers.
     """
 
-    def __init__(self, bodies: np.ndarray, powers: Sequence[int], scale: float, shared: bool) -> None:
-        self.of, self.bodies, self.powers, self.scale, self.shared = "q", bodies, tuple(powers), scale, shared
-        self.pairs = list(combinations(range(len(bodies)), 2))
-        self.n = len(self.powers) * (1 if shared else len(self.pairs))
+    of = "q"
 
-    def _numbers(self, pair: int) -> slice:
-        """The places of the numbers of a pair."""
-        start = 0 if self.shared else pair * len(self.powers)
-        return slice(start, start + len(self.powers))
+    def __init__(self, bodies: np.ndarray, terms: Sequence[tuple[int, int | None, int]], scale: float) -> None:
+        self.bodies, self.kinds, self.scale, self.n = bodies, list(terms), scale, len(terms)
 
-    def _distance(self, x: np.ndarray, pair: int) -> tuple[np.ndarray, np.ndarray]:
-        a, b = self.pairs[pair]
-        line = (x[self.bodies[a]] - x[self.bodies[b]]) / self.scale
+    @classmethod
+    def between(cls, bodies: np.ndarray, powers: Sequence[int], scale: float, central: bool = False) -> Distances:
+        """All powers of the distances of all pairs of bodies, and from the origin if asked for."""
+        n = len(bodies)
+        lines = [*combinations(range(n), 2), *((a, None) for a in range(n) if central)]
+        return cls(bodies, [(*line, e) for line in lines for e in powers], scale)
+
+    @property
+    def terms(self) -> bool:
+        return True
+
+    def subset(self, kept: np.ndarray) -> Distances:
+        return Distances(self.bodies, [kind for kind, keep in zip(self.kinds, kept, strict=True) if keep], self.scale)
+
+    def squares(self) -> Distances:
+        """The squares of the same distances."""
+        return Distances(self.bodies, [(*line, 2) for line in self._lines], 1.0)
+
+    @cached_property
+    def _lines(self) -> dict[tuple[int, int | None], list[int]]:
+        """The numbers of each distance."""
+        made: dict[tuple[int, int | None], list[int]] = {}
+        for k, (a, b, _) in enumerate(self.kinds):
+            made.setdefault((a, b), []).append(k)
+        return made
+
+    def _distance(self, x: np.ndarray, a: int, b: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """The line from b to a, and its length, in units of s."""
+        line = (x[self.bodies[a]] - (0.0 if b is None else x[self.bodies[b]])) / self.scale
         return line, np.sqrt(np.sum(line * line, axis=0))
 
-    def _functions(self, r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """f, f' and f'' of each power, (j, N)."""
-        f = np.stack([r**e if e else np.log(r) for e in self.powers])
-        first = np.stack([e * r ** (e - 1) if e else 1 / r for e in self.powers])
-        second = np.stack([e * (e - 1) * r ** (e - 2.0) if e else -1 / r**2 for e in self.powers])
+    def _functions(self, numbers: list[int], r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """f, f' and f'' of some terms, (k, N)."""
+        powers = [self.kinds[k][2] for k in numbers]
+        f = np.stack([r**e if e else np.log(r) for e in powers])
+        first = np.stack([e * r ** (e - 1.0) if e else 1 / r for e in powers])
+        second = np.stack([e * (e - 1) * r ** (e - 2.0) if e else -1 / r**2 for e in powers])
         return f, first, second
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
@@ -544,49 +564,40 @@ class Pairs(Part):
         value = np.zeros((m, N))
         slopes = np.zeros((m, m, N)) if slope else None
         by = np.zeros((m, self.n, N)) if by_parameters else None
-        for pair, (a, b) in enumerate(self.pairs):
-            place = self._numbers(pair)
-            line, r = self._distance(x, pair)
+        for (a, b), places in self._lines.items():
+            line, r = self._distance(x, a, b)
             unit = line / r
-            _, first, second = self._functions(r)
-            pull = theta[place] @ first
-            for axis, (i, j) in enumerate(zip(self.bodies[a], self.bodies[b], strict=True)):
-                force = pull * unit[axis] / self.scale
-                value[i] += force
-                value[j] -= force
+            _, first, second = self._functions(places, r)
+            pull = theta[places] @ first
+            curved = (theta[places] @ second - pull / r) * unit[:, None] * unit
+            curved[np.diag_indices(len(unit))] += pull / r
+            ends = [(self.bodies[a], 1.0)] + ([] if b is None else [(self.bodies[b], -1.0)])
+            for rows, sign in ends:
+                value[rows] += sign / self.scale * pull * unit
                 if by is not None:
-                    column = first * unit[axis] / self.scale
-                    by[i, place] += column
-                    by[j, place] -= column
+                    by[np.ix_(rows, places)] += sign / self.scale * unit[:, None] * first
                 if slopes is not None:
-                    for other, (k, n) in enumerate(zip(self.bodies[a], self.bodies[b], strict=True)):
-                        curved = (theta[place] @ second - pull / r) * unit[axis] * unit[other]
-                        curved = (curved + (pull / r if axis == other else 0.0)) / self.scale**2
-                        slopes[i, k] += curved
-                        slopes[j, n] += curved
-                        slopes[i, n] -= curved
-                        slopes[j, k] -= curved
+                    for others, turn in ends:
+                        slopes[np.ix_(rows, others)] += sign * turn / self.scale**2 * curved
         return Linear(value, slopes, by)
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         total = np.zeros(x.shape[1])
-        for pair in range(len(self.pairs)):
-            total += theta[self._numbers(pair)] @ self._functions(self._distance(x, pair)[1])[0]
+        for line, places in self._lines.items():
+            total += theta[places] @ self._functions(places, self._distance(x, *line)[1])[0]
         return total
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
         import sympy
 
         made = []
-        for pair, (a, b) in enumerate(self.pairs):
-            square = sympy.Add(
-                *((x[i] - x[j]) ** 2 for i, j in zip(self.bodies[a].tolist(), self.bodies[b].tolist(), strict=True))
-            )
-            for c, e in zip(theta[self._numbers(pair)], self.powers, strict=True):
-                if e:
-                    made.append(_float(c / self.scale**e) * square ** sympy.Rational(e, 2))
-                else:
-                    made.append(_float(c / 2) * sympy.log(square))
+        for c, (a, b, e) in zip(theta, self.kinds, strict=True):
+            others = [0 if b is None else x[i] for i in self.bodies[a if b is None else b]]
+            square = sympy.Add(*((x[i] - other) ** 2 for i, other in zip(self.bodies[a], others, strict=True)))
+            if e:
+                made.append(_float(c / self.scale**e) * square ** sympy.Rational(e, 2))
+            else:
+                made.append(_float(c / 2) * sympy.log(square))
         return sympy.Add(*made)
 
 

@@ -31,6 +31,7 @@ from sympflow.learning.models import Forced, FreeField, Linear, Model, VectorFie
 from sympflow.learning.trajectories import Run, Trajectories
 from sympflow.schemes import Scheme, scheme_named
 from sympflow.training.least_squares import Damping, LinearModel, descend
+from sympflow.training.session import OutOfTime
 
 Field = Model | Forced | FreeField
 """A vector field with numbers θ."""
@@ -414,9 +415,9 @@ class Problem:
         return batches(self.data.runs, 2 * self.model.ndof + (0 if self.frozen else self.model.n))
 
     def _orbits(
-        self, batch: Batch, theta: np.ndarray, states: np.ndarray, derivatives: bool
+        self, batch: Batch, theta: np.ndarray, states: np.ndarray, derivatives: bool, stop: Stop = lambda: False
     ) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
-        """States and derivatives at each point of a batch."""
+        """States and derivatives at each point of a batch, until the time is up."""
         m = 2 * self.model.ndof
         x, X = np.ascontiguousarray(states[batch.index].T), None
         if derivatives:
@@ -424,6 +425,8 @@ class Problem:
             X[np.arange(m), np.arange(m)] = 1.0
         orbit = self.method.stepper.orbit(self.method, self.model, theta, x, X, batch.gaps)
         for k, (x, X) in enumerate(orbit):
+            if stop():
+                raise OutOfTime
             yield k, x, X
 
     def _weighted(self, batch: Batch, k: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -440,11 +443,11 @@ class Problem:
         return 0.0 if self.frozen else float(np.sum((self.model.prior * theta) ** 2))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def cost(self, theta: np.ndarray, states: np.ndarray) -> float:
+    def cost(self, theta: np.ndarray, states: np.ndarray, stop: Stop = lambda: False) -> float:
         """Σ ρ(r), and what numbers of an unlikely size cost; not finite where an orbit is not."""
         total = self._unlikely(theta)
         for batch in self.batches:
-            for k, x, _ in self._orbits(batch, theta, states, False):
+            for k, x, _ in self._orbits(batch, theta, states, False, stop):
                 seen, _ = self.model.observed(theta, x, None)
                 total += self._cost(self._weighted(batch, k, seen)[0])
                 if not math.isfinite(total):
@@ -476,14 +479,14 @@ class Problem:
         return made
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def normal(self, theta: np.ndarray, states: np.ndarray) -> Normal:
+    def normal(self, theta: np.ndarray, states: np.ndarray, stop: Stop = lambda: False) -> Normal:
         """The normal equations at a point, as far as its orbits are finite."""
         N, m, n = len(states), 2 * self.model.ndof, 0 if self.frozen else self.model.n
-        made = Normal(np.empty((N, m, m)), np.empty((N, m, n)), np.zeros((n, n)), np.empty((N, m)), np.zeros(n), 0.0)
+        made = Normal(np.zeros((N, m, m)), np.zeros((N, m, n)), np.zeros((n, n)), np.zeros((N, m)), np.zeros(n), 0.0)
         for batch in self.batches:
             size = len(batch.index)
             A, B, a = np.zeros((m, m, size)), np.zeros((m, n, size)), np.zeros((m, size))
-            for k, x, X in self._orbits(batch, theta, states, True):
+            for k, x, X in self._orbits(batch, theta, states, True, stop):
                 seen, by = self.model.observed(theta, x, X)
                 r, weight = self._weighted(batch, k, seen)
                 made.cost += self._cost(r)
@@ -621,11 +624,15 @@ def minimized(
 ) -> Fit:
     """Levenberg–Marquardt steps until `patience` of them together gain less than this share of the cost."""
     start = theta, states
-    known: dict[str, Any] = {"here": (start, problem.normal(*start)), "tried": (None, None)}
+    try:
+        first = problem.normal(theta, states, stop)
+    except OutOfTime:
+        first = problem.normal(theta, np.full_like(states, np.nan))  # which ends at once
+    known: dict[str, Any] = {"here": (start, first), "tried": (None, None)}
 
     def normal_at(x: Any) -> Normal:
         found = next((normal for point, normal in known.values() if point is x and normal is not None), None)
-        return problem.normal(*x) if found is None else found
+        return problem.normal(x[0], x[1], stop) if found is None else found
 
     def model_at(x: Any) -> _Arrow:
         known["here"] = x, normal_at(x)
@@ -633,15 +640,21 @@ def minimized(
         return _Arrow(x, known["here"][1], scale, problem.frozen)
 
     def cost(x: Any, attempt: int) -> float:
-        known["tried"] = x, None if attempt else problem.normal(*x)  # the first is mostly taken
-        return problem.cost(*x) if attempt else known["tried"][1].cost
+        known["tried"] = x, None if attempt else problem.normal(x[0], x[1], stop)  # the first is mostly taken
+        return problem.cost(x[0], x[1], stop) if attempt else known["tried"][1].cost
 
     scale, costs = np.diagonal(normal_at(start).C).copy(), [normal_at(start).cost]
     if not math.isfinite(costs[0]):
-        return Fit(problem, theta, states, costs[0], normal_at(start), costs, "the orbits are not finite at the start")
+        reason = "it was stopped" if stop() else "the orbits are not finite at the start"
+        return Fit(problem, theta, states, costs[0], first, costs, reason)
     options: Any = {"tries": TRIES, "iterations": iterations, "patience": patience, "gain": gain, "stop": stop}
     end, reason = descend(start, costs, model_at, cost, damping=Damping(damping, LEAST_DAMPING), **options)
-    return Fit(problem, end[0], end[1], costs[-1], normal_at(end), costs, reason)
+    try:
+        normal = normal_at(end)
+    except OutOfTime:  # the point before is known
+        end, normal = known["here"]
+        costs.append(normal.cost)
+    return Fit(problem, end[0], end[1], costs[-1], normal, costs, reason)
 
 
 @dataclass(frozen=True)
@@ -666,7 +679,12 @@ class _Arrow(LinearModel):
 
 
 def chosen_method(
-    model: Field, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray, halvings: int = 12
+    model: Field,
+    theta: np.ndarray,
+    data: Trajectories,
+    tolerance: np.ndarray,
+    halvings: int = 12,
+    stop: Stop = lambda: False,
 ) -> Method:
     """The cheapest scheme and step whose error over the gaps between points is below a tolerance (2d,).
 
@@ -686,7 +704,7 @@ def chosen_method(
         method = Method(stepper.within(tolerance), widest)
         end, before = _ends(model, theta, method, starts, gaps), math.inf
         for _ in range(halvings):
-            if best is not None and cost(method) > best[0]:
+            if stop() or (best is not None and cost(method) > best[0]):
                 break
             finer = replace(method, longest=method.longest / 2)
             after = _ends(model, theta, finer, starts, gaps)
@@ -725,7 +743,14 @@ def _ends(model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: 
     return model.observed(theta, method.over(model, theta, x.copy(), None, gaps)[0], None)[0]
 
 
-def matched(model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1) -> np.ndarray:
+def matched(
+    model: Field,
+    theta: np.ndarray,
+    data: Trajectories,
+    weights: np.ndarray,
+    steps: int = 1,
+    stop: Stop = lambda: False,
+) -> np.ndarray:
     """θ by which the observed increments are the integrals of the field along the observed states, by least squares.
 
     No orbit is computed: y(t) − ∫ f_θ(y) dt is compared with a constant for each piece. That is linear where f is
@@ -744,7 +769,9 @@ def matched(model: Field, theta: np.ndarray, data: Trajectories, weights: np.nda
     level = Damping(1e-10 if steps == 1 else 1e-3)
     r, J = _increments(model, theta, pieces, weights)
     prior = model.prior * np.sqrt(r @ r / len(r))
-    for _ in range(steps):
+    for done in range(steps):
+        if done and stop():
+            break
         scale = np.sqrt(np.sum(J * J, axis=0))
         D = np.where(scale > 0, scale, 1.0)
         normal = (J / D).T @ (J / D) + np.diag((prior / D) ** 2)

@@ -96,7 +96,7 @@ def _check_kept(sol: Solution, what: str) -> None:
 
 def _hold(series: np.ndarray, ends: np.ndarray, values: np.ndarray, t: np.ndarray) -> None:
     """Write to `series` at each time t the value after the last step that has ended by then. Later calls overwrite."""
-    tolerance = 1e-12 * np.maximum(1.0, np.abs(t))
+    tolerance = 1e-12 * np.maximum(np.abs(t), np.ptp(ends))
     if (ends.reshape(len(ends), -1) == ends.reshape(len(ends), -1)[:, :1]).all():  # all trajectories step together
         index = np.searchsorted(ends.reshape(len(ends), -1)[:, 0], t + tolerance, side="right")
         series[index > 0] = values[index[index > 0] - 1]

@@ -165,3 +165,12 @@ def test_words_for_stiff_directions_that_do_not_turn():
     magnetic = HamiltonianSystem.from_sympy("(p1 + q2)**2/2 + (p2 - q1)**2/2 + 30*q1**2 + q2**4", y0=[1, 0, 0, 0])
     with pytest.raises(ValueError, match=r"quadratic terms alone\. Use 'implicit_midpoint'"):
         _ = magnetic.linear_part
+
+
+@pytest.mark.parametrize("unit", [1e-16, 1e-8, 1.0, 1e8])
+def test_the_quadratic_part_is_the_same_in_any_unit_of_length(unit):
+    """H with a linear term, whose centre is taken out, in multiples of a unit."""
+    H = f"p**2/2 + q**2/2 + 0.1*q**3/({unit!r}) - 0.3*({unit!r})*q"
+    system = HamiltonianSystem.from_sympy(H, y0=[0.2 * unit, 0.0], t_span=(0, 10), dt=0.1)
+    ends = [solve(system, method).y[0, -1] / unit for method in ("linear_srkn11b", "kahan_li8")]
+    assert ends == pytest.approx([0.2910658290115, 0.2910658290115], rel=1e-10)

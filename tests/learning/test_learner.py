@@ -24,7 +24,7 @@ from sympflow.learning.learner import (
     without_growth,
 )
 from sympflow.learning.library import Library, Terms
-from sympflow.learning.models import FixedKinetic, Formula, Kinetic, Model, Network, Pairs, Polynomial, Waves
+from sympflow.learning.models import Distances, FixedKinetic, Formula, Kinetic, Model, Network, Polynomial, Waves
 from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
@@ -172,7 +172,8 @@ PARTS = [
     Polynomial.up_to(3, "q", [1.3, 0.9]),
     Waves.up_to(2, 2, "q", np.array([1.3, 0.9]), np.array([2 * np.pi, np.inf])),
     Network("q", 4, [1.0, 2.0], np.array([4.0, np.inf])),
-    Pairs(np.array([[0], [1]]), (-2, 0, 1), 1.3, shared=False),
+    Distances.between(np.array([[0], [1]]), (-2, 0, 1), 1.3),
+    Distances(np.array([[0, 1]]), [(0, None, -1), (0, None, 0), (0, None, 3)], 1.3),
     Inertia(Waves.up_to(1, 1, "q", np.ones(1), np.array([2 * np.pi]), constant=True)),
     Formula("q", sympy.sin(Q[0]) * Q[1] ** 2, Q),
     Terms(Library([Q[0] ** 2 * Q[1], sympy.cos(Q[0] - Q[1]), 1 / Q[1]], 2), "q"),
@@ -200,14 +201,59 @@ def test_parts_of_h_are_what_their_derivatives_say(part):
     assert np.ptp(values - part.value(theta, x)) < 1e-12
 
 
+@pytest.mark.parametrize("part", [PARTS[0], PARTS[2]], ids=lambda part: type(part).__name__)
+def test_a_fit_ends_within_an_orbit_when_its_time_is_up(part):
+    """At any step: the time is asked for at every point of the orbits, and what was fitted is kept."""
+    t = np.linspace(0, 20, 101)
+    data = Trajectories.read([(t, np.stack([a * np.cos(t), np.sin(t), -a * np.sin(t), np.cos(t)])) for a in (0.5, 1)])
+    model, asked = Model(2, (Kinetic([1.0, 1.0]), part)), []
+    for most in (0, 3, 40, 400):
+        asked.clear()
+
+        def stop(most=most):
+            asked.append(True)
+            return len(asked) > most
+
+        found = fitted(model, data, Setting(stop=stop))
+        assert len(asked) <= most + 30  # a few for each of the loops that end
+        assert np.isfinite(found.theta).all()
+
+
 def test_bodies_whose_total_momentum_changes_are_no_bodies():
     """Two momenta cancel along each axis of coordinates in the order x1, x2, y1, y2."""
     x, y = np.random.default_rng(0).normal(size=(2, 50))
     runs = [(np.arange(50.0), np.stack([x, y, y, x, x, -x, y, -y]))]
     said = _said(Trajectories.read([*runs, *runs]), None, None, False, None, None)
     names = [candidate.name for candidate in FAMILIES["pairs"].models(said)]
+    names = [name for name in names if "origin" not in name]
     assert len(names) == 2
     assert all("one axis after another" in name for name in names)
+
+
+@pytest.mark.parametrize("observed", ["qp", "qv", "q"])
+@pytest.mark.parametrize(
+    ("force", "V"), [(lambda r: -2 / r**2, lambda r: -2 / r), (lambda r: -1 / r - r, lambda r: np.log(r) + r**2 / 2)]
+)
+def test_central_fields_are_found(force, V, observed):
+    """To 1 % of its spread along the orbits, of a noise of 1e-3."""
+    rng, t = np.random.default_rng(0), np.linspace(0, 8, 81)
+
+    def field(_, y):
+        r = np.hypot(*y[:2])
+        return [*y[2:], *(force(r) * y[:2] / r)]
+
+    starts = [[1.0 + 0.1 * k, 0.0, 0.1 * k - 0.2, 1.1 + 0.03 * k] for k in range(8)]
+    orbits = [solve_ivp(field, (0, 8), y0, t_eval=t, rtol=1e-9, atol=1e-10).y for y0 in starts]
+    rows = [0, 1] if observed == "q" else [0, 1, 2, 3]
+    runs = [(t, y[rows] + 1e-3 * rng.normal(size=(len(rows), 81))) for y in orbits]
+    data = Trajectories.read(runs, observed=observed)
+    said = _said(data, None, None, False, None, None)
+    found = [fitted(candidate.model, data, Setting()) for candidate in FAMILIES["central"].models(said)]
+    best = min(found, key=lambda one: one.loss(np.full(4, 1e-3)))
+    y = np.concatenate(orbits, axis=1)
+    H = (y[2:] ** 2).sum(0) / 2 + V(np.hypot(*y[:2]))
+    learned = best.model.hamiltonian(best.theta, y)
+    assert np.ptp(learned - H) < 0.01 * np.ptp(H)
 
 
 # learn ----------------------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from sympflow.learning.models import Pairs
+from sympflow.learning.models import Distances
 from sympflow.learning.unseen import unseen
 
 random = np.random.default_rng(0)
@@ -41,7 +41,7 @@ def test_bodies_at_one_distance():
     place = random.normal(size=(400, 2))
     q = np.concatenate([place, place + np.concatenate([np.cos(angle), np.sin(angle)], axis=1)], axis=1)
     states = np.concatenate([q, random.normal(size=q.shape)], axis=1)
-    part = Pairs(bodies, (2,), 1.0, shared=False)
+    part = Distances.between(bodies, (2,), 1.0)
     assert len(unseen(states, np.zeros(8), range(4), part)) == 1
     states[:, 2:4] += random.normal(size=(400, 2))
     assert unseen(states, np.zeros(8), range(4), part) == []

@@ -274,15 +274,25 @@ class Began(Exception):
     pass
 
 
+def array(q):
+    """Numbers of NumPy alone, so that the functions below are not traced."""
+    return np.asarray(q, dtype=float)
+
+
 def pendulum_by(what):
     arguments = {"ndof": 1, "domain": PENDULUM.domain}
     if what == "torch":
         return HamiltonianSystem(lambda q: (1 - torch.cos(q)).sum(-1), **arguments)
+
+    def V(q):
+        return (1 - np.cos(array(q))).sum(-1)
+
+    def gradient(q):
+        return np.sin(array(q))
+
     if what == "a gradient alone":
-        return HamiltonianSystem(lambda q: (1 - np.cos(q)).sum(-1), gradient=np.sin, **arguments)
-    return HamiltonianSystem(
-        lambda q: (1 - np.cos(q)).sum(-1), gradient=np.sin, hessian_vector=lambda q, v: np.cos(q) * v, **arguments
-    )
+        return HamiltonianSystem(V, gradient=gradient, **arguments)
+    return HamiltonianSystem(V, gradient=gradient, hessian_vector=lambda q, v: np.cos(array(q)) * v, **arguments)
 
 
 @pytest.mark.parametrize("what", ["torch", "a gradient alone", "NumPy"])
