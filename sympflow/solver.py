@@ -122,7 +122,8 @@ def solve(
         "kinetic" take them as numbers of one compiled run, and each trajectory is that of a batch on
         ``system.with_params(...)``, up to rounding with compensated sums, force gradients, friction or a drive.
         Elsewhere trajectories of equal values run together, one set of values after the other. A trained flow holds for
-        its own parameters alone.
+        its own parameters alone. Gradients flow to tensors that require them, by splitting methods on the splitting
+        "kinetic".
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
@@ -141,8 +142,9 @@ def solve(
         never changes the run: longer steps are sampled within, by the dense output, as `max_step` does inside
         `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and every step for adaptive methods.
     backend : "auto", "compiled" or "array"
-        "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states, everything
-        else with array operations; tensors on a GPU too. What ran is in `stats["backend"]`.
+        "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states and, by
+        splitting methods, for tensors on the CPU; everything else with array operations, tensors on a GPU too. What ran
+        is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
