@@ -384,7 +384,7 @@ LATE = HamiltonianSystem.from_sympy(
         {"params": {"c": [1.03, 0.77, 2.0]}, "t_eval": [0, 1.5, 3]},
         {"y0": torch.tensor([0.5, 0.1], dtype=torch.float64)},
     ],
-    ids=lambda options: "+".join(options),
+    ids="+".join,
 )
 def test_what_a_run_gives_where_it_lands_on_jumps(options):
     sol = solve(LATE, "kahan_li8", **options)
