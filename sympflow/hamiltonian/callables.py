@@ -50,7 +50,7 @@ class Functions(Definition):
         self._scene = y0, domain, inverse_mass, t_span
 
     @cached_property
-    def form(self) -> TracedHamiltonian | None:  # type: ignore[override]
+    def form(self) -> TracedHamiltonian | None:
         if self.numba_functions is not None:
             self.untraced = "it is a Numba function"
             return None
