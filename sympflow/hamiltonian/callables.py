@@ -54,6 +54,9 @@ class Functions(Definition):
         if self.numba_functions is not None:
             self.untraced = "it is a Numba function"
             return None
+        if not self.given and self._functions[2] is not None:  # of which `potential` may be a dummy
+            self.untraced = "with check=False the `gradient` is taken as it is: leave one of them out"
+            return None
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             try:
