@@ -21,7 +21,7 @@ from sympflow.compiler.program import Program, Recording, Traced
 
 __all__ = ["TracedArray", "Untraceable", "trace"]
 
-MOST_OPERATIONS = 50_000  # recorded of one function
+MOST_OPERATIONS, MOST_VARIABLES = 50_000, 300  # of one function; larger systems run as array operations
 LARGEST_COFACTORS = 3  # of matrices; larger ones are eliminated
 
 
@@ -700,6 +700,8 @@ def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], to
     Untraceable
         With the reason.
     """
+    if sum(1 if isinstance(each, str) else len(each) for each in names) > MOST_VARIABLES:
+        raise Untraceable(f"it has more than {MOST_VARIABLES} variables")
     recording = _Recorded()
     kind = TracedTensor if torch else TracedArray
     inputs, args = [], []

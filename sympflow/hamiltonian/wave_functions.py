@@ -70,7 +70,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
             k = self.transform.angles(axis) * (n / length)
             with np.errstate(all="ignore"):
                 of_axis, other = w(k), w(-k)
-            size = float(np.nanmax(np.abs(of_axis), initial=0.0))
+            size = float(np.max(np.abs(of_axis), initial=0.0, where=np.isfinite(of_axis)))
             if not np.allclose(of_axis, other, rtol=1e-12, atol=1e-12 * size, equal_nan=True):
                 raise ValueError(
                     f"`dispersion` {self.w} must be an even function of k, such as 'k**2/2' or '1 - cos(k)': waves to "

@@ -44,6 +44,7 @@ LOST_AROUND = 0.1
 TOO_LONG = 0.25
 """Energy error, over the size of the energy, of a run whose step is too long."""
 LARGE = 200  # degrees of freedom
+FEW_STEPS = 20
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 """The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
 that share of errors there is told."""
@@ -303,7 +304,8 @@ def _end(
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
     """Warn of what a method doubts, and where the energy of a run with fixed steps is off by `TOO_LONG` of its size.
 
-    H is evaluated at the start and a few outputs, of large systems at one for every 200 steps. Its size is the largest
+    H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
+    steps, which would take twice the time. Its size is the largest
     of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
     """
     system, n = problem.system, len(outcome.t)
@@ -311,7 +313,8 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         warn(doubt, RuntimeWarning)
     if not isinstance(integrator, FixedStep) or integrator.trained or not system.keeps_energy:
         return
-    seen = LOOKED_AT if system.ndof <= LARGE else min(LOOKED_AT, outcome.stats.get("n_steps", 0) // 200)
+    n_steps = outcome.stats.get("n_steps", 0)
+    seen = LOOKED_AT * (n_steps >= FEW_STEPS) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
     if not n or not seen or problem.letters is not None or problem.system.between_impulses is not problem.system:
         return
     width = 2 * system.ndof

@@ -152,7 +152,7 @@ def test_velocities_of_no_momenta_are_refused():
 
 def test_families_are_those_that_velocities_tell():
     said = Said(np.ones(4), None, None, 0, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
-    assert families(said, None) == ["pairs", "waves", "polynomial", "network", "inertia", "magnetic"]
+    assert families(said, None) == ["central", "pairs", "waves", "polynomial", "network", "inertia", "magnetic"]
     assert "magnetic" not in families(replace(said, velocities=False), None)
     with pytest.raises(ValueError, match="`family` 'whole-polynomial' does not apply"):
         families(said, "whole-polynomial")

@@ -94,7 +94,7 @@ def test_tensors_are_detached():
     data = solved(y0).to_xarray()
     assert data.q.dtype == data.energy.dtype == np.float32
     assert data.q.dims == ("orbit", "dof", "time")
-    assert data.attrs["backend"] == "torch"
+    assert data.attrs["backend"] == "compiled"
 
 
 @needs_data
