@@ -92,5 +92,5 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
         units=UNITS,
         name="solar_system",
         domain=Tube(orbit, np.repeat(_THICKNESS * size, 3), groups),
-        t_span=(0.0, 3_652_500.0),
+        t_span=(0.0, 365_250.0),
     )
