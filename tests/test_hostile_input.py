@@ -433,9 +433,7 @@ def test_callables(row, methods):
                 outcomes.append((method, (type(sound), re.escape(str(sound)[:60])), got))
         elif error is not None:
             outcomes.append((method, (None, None), got))
-        elif re.match(
-            "`hessian_vector` is needed|`system` .custom. is given by functions, from", str(got)
-        ):
+        elif re.match("`hessian_vector` is needed|`system` .custom. is given by functions, from", str(got)):
             continue  # a sound gradient is that of what is traced
         elif isinstance(got, Exception) or got.status != -1 or not np.isfinite(got.y).all():
             failed[method] = repr(got)

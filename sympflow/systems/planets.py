@@ -53,7 +53,7 @@ def solar_system(planets: int | Sequence[str] = 8) -> HamiltonianSystem:
     to some hundred thousandths of a radian, not the osculating ones of an ephemeris; there is neither relativity nor
     the Moon.
 
-    The domain is a `Tube` about the ellipses. The default interval is 10,000 years, the default step a twentieth of the
+    The domain is a `Tube` about the ellipses. The default interval is 1,000 years, the default step a twentieth of the
     shortest period.
 
     References
