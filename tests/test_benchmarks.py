@@ -377,8 +377,8 @@ def test_on_kepler_the_logarithmic_methods_race():
 @pytest.mark.parametrize("optimizer", training_optimizers.OPTIMIZERS)
 def test_each_optimizer_stops_when_its_time_is_over(optimizer):
     made = training_optimizers.recipe_of("harmonic_oscillator", "sympflow")
-    fits = tuple(dataclasses.replace(fit, points=n) for fit, n in zip(made.fits, (40, 60), strict=True))
-    quick = dataclasses.replace(made, fits=fits)
+    further = tuple((dataclasses.replace(fit, points=60), solver) for fit, solver in made.further)
+    quick = dataclasses.replace(made, fit=dataclasses.replace(made.fit, points=40), further=further)
     result = training_optimizers.trained(quick, optimizer, 0.05)
     assert result.steps >= 1
     assert 0 < result.at_dt < 10

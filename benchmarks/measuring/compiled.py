@@ -29,13 +29,13 @@ class Loops:
 def scheme_loops(system: HamiltonianSystem, name: str) -> Loops:
     """The loops of a splitting scheme of the package."""
     kernel = get(name)().composed(system).kernel(False)
-    return Loops(kernel.run, partial(kernel.run_batch, threads=1))
+    return Loops(kernel.run, partial(kernel.run, threads=1))
 
 
 def flow_loops(system: HamiltonianSystem, flow: Any) -> Loops:
     """The loops of a trained flow, which keep its numbers from call to call."""
     kernel = flow.kernel_for(system)
-    return Loops(kernel.run, partial(kernel.run_batch, threads=1))
+    return Loops(kernel.run, partial(kernel.run, threads=1))
 
 
 def method_loops(system: HamiltonianSystem, method: Any) -> Run:
