@@ -203,7 +203,7 @@ class Solution(Shown):
     def _energy_text(self) -> str:
         """The largest relative energy error in words; empty where there is none, or it takes long."""
         large = isinstance(self, StoredSolution) or math.prod(self.y.shape) > LARGE or not len(self.t)
-        if large or not (self.system.conservative and self.system.autonomous):
+        if large or not self.system.keeps_energy:
             return ""
         with warnings.catch_warnings(action="ignore"), suppress(ArithmeticError, ValueError, TypeError, RuntimeError):
             return f"{np.abs(energy_change(self)).max():.1e}, relative"
@@ -215,26 +215,17 @@ class Solution(Shown):
     def plot(self, kinds: Sequence[str] = KINDS, path: str | os.PathLike[str] | None = None) -> Figure:
         """Draw the orbit, the phase plane and the energy error over time, of 16 trajectories of a batch at most.
 
+        With a `path` (.png, .pdf or .svg) the figure is saved too; matplotlib is needed.
+
         Parameters
         ----------
         kinds : sequence of str
             Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
             p₁, and "energy", which is left out where energy is not kept.
-        path : path, optional
-            File to save it to: .png, .pdf or .svg.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        ImportError
-            Without matplotlib.
         """
         y = to_numpy(self.y)
         error = None
-        if self.system.conservative and self.system.autonomous:
+        if self.system.keeps_energy:
             with warnings.catch_warnings(action="ignore"):
                 error = energy_change(self).reshape(-1, len(self.t))
         heading = f"{self.system.title}, {method_text(self.integrator, self.stats.get('dt'))}"

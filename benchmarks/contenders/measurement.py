@@ -197,7 +197,7 @@ def measure(
     for contender in contenders:
         leader = steppers[contender.same_steps_as or contender.label, contender.trajectories]
         control = (leader.choices or [leader.guesses[max(leader.guesses)]])[0]
-        contender.run(control, PROBE * scene.t_end)  # what the first call compiles is no part of any time
+        contender.run(control, PROBE * scene.t_end)  # compiles, before anything is timed
         if contender.same_steps_as:
             check_agreement(scene, contender, leader, control)
 

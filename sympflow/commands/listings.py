@@ -69,11 +69,11 @@ def methods(
     ctx: typer.Context,
     name: Annotated[
         str | None,
-        typer.Argument(help="One method, of which all is shown.", autocompletion=completion.one_method),
+        typer.Argument(help="A method, to show all that is known of it.", autocompletion=completion.one_method),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """List the methods with their orders, costs and sources; of one all that is known, its options too.
+    """List the methods with their orders, costs and sources, or show one with its options.
 
     Examples:
 
@@ -86,28 +86,25 @@ def methods(
 
         if name is not None:
             cls = get(name)
-            rows: list[tuple[str, ...]] = [("options", ", ".join(cls.options())), ("source", cls.summary())]
-            rows = [("order", _order(cls)), ("symplectic", _yes(cls)), ("forces a step", cls.forces_a_step()), *rows]
-            print_table((cls.name, ""), rows)
+            cells = _cells(cls)
+            print_table((cls.name, ""), [*zip(TITLES, cells, strict=True), ("options", ", ".join(cls.options()))])
             return
-        rows = []
+        rows: list[tuple[str, ...]] = []
         for each in available():
             try:
                 cls = get(each)
             except ImportError as error:
                 rows.append((each, "", "", "", str(error)))
                 continue
-            rows.append((each, _order(cls), _yes(cls), cls.forces_a_step(), cls.summary()))
-        print_table(("name", "order", "symplectic", "forces a step", "source"), rows, width=LISTED)
+            rows.append((each, *_cells(cls)))
+        print_table(("name", *TITLES), rows, width=LISTED)
 
 
+TITLES = ("order", "symplectic", "forces a step", "source")
 LISTED = 100
 """Columns of the list of methods, where the terminal has no more."""
 
 
-def _order(cls: type[Integrator]) -> str:
-    return "trained" if cls.trained else str(cls.order or "–")
-
-
-def _yes(cls: type[Integrator]) -> str:
-    return "yes" if cls.symplectic else "no"
+def _cells(cls: type[Integrator]) -> tuple[str, ...]:
+    order = "trained" if cls.trained else str(cls.order or "–")
+    return order, "yes" if cls.symplectic else "no", cls.forces_a_step(), cls.summary()

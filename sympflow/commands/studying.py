@@ -316,9 +316,9 @@ def section(
             ready_folder(to)
         way = None if direction is None else DIRECTIONS[direction]
         asked = {"dt": dt, "tol": tol, "coordinate": coordinate, "level": level, "direction": way, "sample": sample}
-        asked |= {"period": period, "energy": energy}
+        asked |= {"period": period}
         if energy is not None:
-            asked |= {"n": orbits, "seed": seed}
+            asked |= {"energy": energy, "n": orbits, "seed": seed}
         options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
         with progress() as say:
             say(f"{scene.key}: {method_name or 'section'}")

@@ -352,14 +352,10 @@ class Ensemble(Shown):
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
         """Draw what was kept: states in the plane of q₁ and p₁, the last ones where there are several; else histograms.
 
-        Returns
-        -------
-        matplotlib.figure.Figure
+        With a `path` (.png, .pdf or .svg) the figure is saved too; matplotlib is needed.
 
         Raises
         ------
-        ImportError
-            Without matplotlib.
         ValueError
             If nothing was kept that is a number for each orbit.
         """

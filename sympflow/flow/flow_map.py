@@ -23,7 +23,7 @@ from sympflow.flow.known import KnownFlow
 from sympflow.flow.records import MAX_DT, MIN_DT, Provenance
 from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.show.cards import Card
+from sympflow.show.cards import Card, Shown
 from sympflow.show.pictures import trajectory_figure
 from sympflow.show.style import saved
 
@@ -59,7 +59,7 @@ class MeanHamiltonian:
         return torch.stack([flow.hamiltonian_unchecked(flow.dt * t, x) for t in MEAN_TIMES]).mean(0)
 
 
-class FlowMap(KnownFlow, nn.Module):
+class FlowMap(KnownFlow, Shown, nn.Module):
     """A learned map ψ̄_t, t ∈ [0, Δt], of states [q, p], and its extension ψ_t to every t.
 
     Duties of a subclass
@@ -546,21 +546,15 @@ class FlowMap(KnownFlow, nn.Module):
     def plot(self, system: HamiltonianSystem | None = None, path: str | os.PathLike[str] | None = None) -> Figure:
         """Draw orbits of the flow from four states of its domain, and their energy error.
 
+        With a `path` (.png, .pdf or .svg) the figure is saved too; matplotlib is needed.
+
         Parameters
         ----------
         system : HamiltonianSystem, optional
             The system that it was trained for; by default the one that it knows. Without one there is no energy.
-        path : path, optional
-            File to save it to: .png, .pdf or .svg.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
 
         Raises
         ------
-        ImportError
-            Without matplotlib.
         ValueError
             If it has neither a domain nor a system with a `y0`.
         """

@@ -16,7 +16,6 @@ from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, 
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
-from sympflow.show.cards import Shown
 
 UNCOMPENSATED = (
     "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave it out, or take a "
@@ -53,7 +52,7 @@ class _Told:
         setattr(flow.provenance, self.name, value)
 
 
-class KnownFlow(Shown):
+class KnownFlow:
     """A flow of a system, as far as it is known without its map."""
 
     kind: ClassVar[str]

@@ -369,14 +369,7 @@ class Trajectories(Shown):
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
         """Draw the samples of 16 trajectories at most: q₁ against q₂, or q over t, and q₁ against the second half.
 
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        ImportError
-            Without matplotlib.
+        With a `path` (.png, .pdf or .svg) the figure is saved too; matplotlib is needed.
         """
         runs, d = self.runs[:MOST_LINES], self.ndof
         most = max(run.n_points for run in runs)

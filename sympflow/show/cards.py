@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ LONGEST = 100
 
 @dataclass(frozen=True)
 class Card:
-    """What is shown of an object: values are cut to `LONGEST` characters, those that are empty are left out."""
+    """Caption, facts and text of an object. Values are cut to `LONGEST` characters; empty ones are left out."""
 
     caption: str
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -54,12 +55,12 @@ class Card:
         return "<div>" + "".join(f"<div>{part}</div>" for part in parts if part) + "</div>"
 
 
-class Shown:
+class Shown(ABC):
     """An object that has a card; with a `preview`, drawn in notebooks once matplotlib is loaded."""
 
+    @abstractmethod
     def card(self) -> Card:
-        """Return what is shown of the object."""
-        raise NotImplementedError
+        """Return the card of the object."""
 
     def preview(self) -> Figure | None:
         """Return the figure that a notebook shows with it; None if there is none."""

@@ -105,6 +105,7 @@ def poincare_section(
     """
     system = given_system(system)
     plane = {"coordinate": coordinate, "level": level, "direction": direction, "sample": sample}
+    plane |= {"energy": energy, "n": n}
     T = _checked_period(system, period, [name for name, value in plane.items() if value is not None])
     if T is not None:
         orbits = checked_orbits(system, method, t_span, y0, options, "a stroboscopic section is one of")
@@ -193,11 +194,10 @@ def states_of_energy(system: HamiltonianSystem, energy: float, n: int, plane: Pl
             y += (reached(y, rays) * rng.uniform(size=n) ** (1 / (2 * d - 2)))[:, None] * rays
         up = np.zeros((n, 2 * d))
         up[:, partner] = 1 / factors[partner]
-        for sign in (1.0, -1.0):
-            ends = y + sign * reached(y, sign * up)[:, None] * up
-            way = np.sign(np.asarray(system.vector_field(ends))[:, c])
-            if plane.direction == 0 or (way == plane.direction).mean() > 0.5:
-                break
+        ends, others = (y + reached(y, way)[:, None] * way for way in (up, -up))
+        if plane.direction:
+            crosses = np.sign(np.asarray(system.vector_field(ends))[:, c]) == plane.direction
+            ends = np.where(crosses[:, None], ends, others)
     if not np.isfinite(ends).all():
         raise ValueError(
             f"`energy` {energy:g} does not bound the states on the plane: along a ray no state has it. Lower it, or "

@@ -291,7 +291,7 @@ def _reference(conditions: Conditions) -> tuple[Reference | None, str]:
 
 
 SETTINGS = ("dt", "tolerance")
-"""What is chosen of a method."""
+"""Settings of a method: the largest that reaches an error is the cheapest."""
 
 
 # read off the points --------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import json
 import math
 import os
 import unicodedata
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
 
 
-class Report(Shown, ABC):
+class Report(Shown):
     """The result of a study. A subclass gives its rows, settings, table and figure."""
 
     columns: ClassVar[tuple[str, ...]]
