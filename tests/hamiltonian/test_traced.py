@@ -218,13 +218,12 @@ ANY = ["gauss_legendre4", "implicit_midpoint", "rk4", "tao4"]
 METHODS = [*ANY, "verlet", "srkn11b", "chin4a", "kahan_li8", "strang_parts", "linear_kahan_li6", "log_kahan_li8"]
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("kind", SYSTEMS)
+@pytest.mark.parametrize(
+    ("kind", "method"), [(kind, m) for kind in SYSTEMS for m in (ANY if "general" in kind else METHODS)]
+)
 def test_every_method_runs_as_for_the_same_text(kind, method):
     given, (text, options) = SYSTEMS[kind]
     system = HamiltonianSystem(**given, ndof=2)
-    if not system.separable and method not in ANY:
-        return
     same = HamiltonianSystem.from_sympy(text, **options)
     try:
         solve(same, method, (0, 0.1), Y0, dt=0.05)
