@@ -273,6 +273,16 @@ def test_special_functions_are_compiled(text):
             np.testing.assert_allclose(run.y, reference.y, rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("n", "backend", "said"),
+    [(300, "compiled$", ", traced>$"), (301, "numpy: `potential` could not .* 300 variables: give", "300 variables")],
+)
+def test_large_functions_run_with_arrays_and_say_so(n, backend, said):
+    system = HamiltonianSystem(lambda q: (q**2).sum(-1) / 2, gradient=lambda q: q, ndof=n, y0=np.ones(2 * n))
+    assert re.match(backend, solve(system, "verlet", (0, 1), dt=0.1).stats["backend"])
+    assert re.search(said, repr(system))
+
+
 def test_deviation_vectors_run_compiled():
     given, (text, _) = SYSTEMS["NumPy"]
     systems = HamiltonianSystem(**given, ndof=2), HamiltonianSystem.from_sympy(text)
