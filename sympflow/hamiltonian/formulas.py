@@ -235,11 +235,14 @@ class TracedHamiltonian:
         """∇³V(v, w), (..., d)."""
         return self._assembled(self._along[1], q, *t, more=(v, w))
 
+    @cached_property
+    def _in_time(self) -> Program:
+        inputs = self.program.inputs
+        return Program(inputs, gradient(self.program.outputs[0], inputs[:1]))
+
     def time_derivative(self, x: Array, t: Any) -> Array:
         """∂V/∂t or ∂H/∂t, (...)."""
-        inputs = self.program.inputs
-        slope = Program(inputs, gradient(self.program.outputs[0], inputs[:1]))
-        return self._assembled(slope, x, t)[..., 0]
+        return self._assembled(self._in_time, x, t)[..., 0]
 
     def _assembled(self, program: Program, x: Array, *t: Any, more: Sequence[Array] = ()) -> Array:
         arrays = (x, *more)
@@ -321,7 +324,7 @@ def _without_time(f: Formula, time: Letter, found: dict[Letter, Formula]) -> For
     for x in program.operations:
         if any(isinstance(a, Traced) and a.order in moving for a in x.args):
             moving.add(x.order)
-    used = [a for x in (*program.operations,) if x.order in moving for a in x.args] + list(program.outputs)
+    used = [a for x in program.operations if x.order in moving for a in x.args] + list(program.outputs)
     own: dict[int, Letter] = {}
     for a in used:
         if isinstance(a, Traced) and a.order not in moving and a.order not in own:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import is_tensor
+from sympflow.compiler.control import Value
 from sympflow.compiler.functions import apply, where
 
 SHORT = 0.25  # βX² up to which a series of so many terms is exact to rounding
@@ -65,7 +66,7 @@ def stumpff(X: Any, beta: Any) -> tuple[Any, Any, Any, Any]:
 
 def repeated(body: Callable[..., tuple[Any, Numbers]], values: Numbers) -> Numbers:
     """Apply `body`, which gives a condition and new values, again while the condition holds anywhere."""
-    if hasattr(values[0], "code"):
+    if isinstance(values[0], Value):
         code = values[0].code
 
         def turn(given: Numbers) -> tuple[Any, Numbers]:
