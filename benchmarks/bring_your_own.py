@@ -21,7 +21,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from measuring.machine import pin_to_one_thread
+from measuring.machine import least, pin_to_one_thread
 
 pin_to_one_thread()
 
@@ -80,16 +80,6 @@ FUNCTIONS: dict[str, tuple[dict[str, Any], str, str]] = {
 }
 
 
-def least(run: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """The least processor time of a call, in seconds."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        run()
-        times.append(time.process_time() - start)
-    return min(times)
-
-
 def of_functions() -> list[list[Any]]:
     """A traced function beside the same H by text, in turn in one process."""
     rows = []
@@ -111,7 +101,7 @@ def of_functions() -> list[list[Any]]:
         ends = [run(system) for system in systems]
         assert all(end.stats["backend"] == "compiled" for end in ends)
         np.testing.assert_allclose(ends[0].y, ends[1].y, rtol=1e-6)
-        times = np.array([[least(partial(run, s), 1) for s in systems] for _ in range(REPEATS)]).min(0)
+        times = np.array([[least(partial(run, s), 1)[0] for s in systems] for _ in range(REPEATS)]).min(0)
         rows.append([name, method, traced * 1e3, first * 1e3, *(times / STEPS * 1e9), times[0] / times[1]])
     return rows
 
@@ -126,7 +116,7 @@ def of_peers() -> list[list[Any]]:
             rows.append([name, None, str(error)])
             continue
         run()
-        rows.append([name, least(run, 3) * 1e3, ""])
+        rows.append([name, 1e3 * least(run, 3)[0], ""])
     return rows
 
 

@@ -13,13 +13,11 @@ the least of the repeats, on one thread. REBOUND runs from the same state, witho
 from __future__ import annotations
 
 import argparse
-import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from measuring.machine import pin_to_one_thread
+from measuring.machine import least, pin_to_one_thread
 
 pin_to_one_thread()
 
@@ -39,16 +37,6 @@ METHODS = {
     "srkn11b": ("srkn11b", {}, None),
 }
 """Ours, with options, and REBOUND's integrator of the same scheme, with attributes."""
-
-
-def least(run: Callable[[], Any], repeats: int) -> tuple[float, Any]:
-    """The least processor time of a call in seconds, and its result."""
-    best = np.inf
-    for _ in range(repeats):
-        begin = time.process_time()
-        result = run()
-        best = min(best, time.process_time() - begin)
-    return best, result
 
 
 def ours(system: Any, name: str, days: float, years: float, repeats: int) -> tuple[float, float]:
