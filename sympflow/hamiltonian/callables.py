@@ -34,7 +34,7 @@ class Functions(Definition):
     library : str
         "numpy" or "torch", whose arrays the functions take; "" if they fail on both.
     untraced : str
-        Why there is no program, a clause; "" if there is one.
+        The reason for which there is no program, a clause; "" if there is one.
     """
 
     library: str = ""
@@ -287,9 +287,9 @@ class CallableHamiltonian(Functions):
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
         traced = self.traced or self.form is not None
-        if traced and self.library == "numpy" and (is_tensor(like) or self._gradient is None):
-            like = np.empty(0)
-        if self.differentiates_itself and not is_tensor(like) and not (traced and self.library == "numpy"):
+        if traced and self.library == "numpy":
+            like = np.empty(0) if is_tensor(like) or self._gradient is None else like
+        elif self.differentiates_itself and not is_tensor(like):
             import torch
 
             like = torch.from_numpy(np.empty(0, like.dtype))

@@ -97,7 +97,7 @@ class Entries:
 
 
 class TracedHamiltonian:
-    """The form of a system that was given by Python functions: what a `SymbolicHamiltonian` is for one by symbols.
+    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ class TracedDriving:
         return _at_time(self._letters, time)
 
     def check(self) -> None:
-        """All that was traced has a compiled form."""
+        """Do nothing: all that was traced has a compiled form."""
 
 
 class TracedLetters:

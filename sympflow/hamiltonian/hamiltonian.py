@@ -588,7 +588,7 @@ class Hamiltonian:
 
     @property
     def untraced(self) -> str:
-        """Why functions of Python could not be traced, a clause; "" if they were, or there are none."""
+        """The reason for which Python functions could not be traced, a clause; "" if they were, or there are none."""
         return "" if self.form is not None else self._definition.untraced
 
     @property

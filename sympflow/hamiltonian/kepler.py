@@ -105,7 +105,7 @@ def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any) -> Any:
 
 
 def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta: Any, mu: Any, t: Any) -> Numbers:
-    """f − 1, g, f′ and g′ − 1 after one step of Newton's method from X, in which so small a step is linear; and it."""
+    """f − 1, g, f′, g′ − 1 after a step d of Newton's method from X, so short that it is linear; d; g as rG₁ + ηG₂."""
     G0, G1, G2, G3 = G
     slope = 1.0 / (r + (eta * G1 + zeta * G2))
     d = -((r * X + (eta * G2 + zeta * G3) - t) * slope)
