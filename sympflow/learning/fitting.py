@@ -17,7 +17,6 @@ from sympflow.learning.shooting import (
     Fit,
     Method,
     Problem,
-    Stop,
     chosen_method,
     first_states,
     matched,
@@ -91,7 +90,7 @@ class Setting:
 
     noise: np.ndarray | None = None
     huber: float | None = None
-    stop: Stop = lambda: False
+    stop: Stop = never
     seen: np.ndarray | None = None
     lag: float = 0.0
     rival: np.ndarray | None = None
