@@ -25,6 +25,7 @@ from sympflow.learning.shooting import (
     steppers,
 )
 from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.training.least_squares import Stop, never
 
 FIRST_POINTS, SKETCH_POINTS = 10, 30  # of the pieces that a fit begins with, and that one of all terms has
 MATCHED_POINTS = 24  # of those whose increments give its start

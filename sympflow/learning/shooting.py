@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -42,7 +42,6 @@ TRIES = 12
 FINEST = 1e-13  # of an observation, relative to the spread of the coordinate
 SLOPE_POINTS = 10  # of a piece, that give a velocity which was not observed
 SOLVED = 1e-4  # of the error of a scheme, to which its equations are solved
-
 
 
 # orbits with their derivatives ----------------------------------------------------------------------------------------

@@ -591,7 +591,8 @@ DEFAULTS: dict[str, Any] = {"residual_weight": 1.0} | {
     f.name: f.default
     for cls in (LossFit, Adam)
     for f in fields(cls)
-    if f.name in ("matching_times", "seed", "validation_points", "reference_states", "learning_rate", "schedule", "clip")
+    if f.name
+    in ("matching_times", "seed", "validation_points", "reference_states", "learning_rate", "schedule", "clip")
 }
 """Values that mean the same as a keyword that is left out, for every fit and solver."""
 

@@ -72,7 +72,7 @@ class LossRun(Run):
         solver: Resolved,
         deadline: Deadline | None = None,
     ) -> LossRun:
-        """A run with fresh points, of a fit and a solver without open choices; labels are made if none are handed in."""
+        """A run with fresh points, of a fit and a solver in which no choice is left open."""
         method = optimizer(flow, solver)
         _check_memory(flow, fit, solver)
         data: Labelled | None = fit.data
