@@ -182,6 +182,15 @@ def test_keywords_say_what_fits_and_solvers_say(system, fit, solver, keywords):
     assert all(torch.equal(v, plain.state_dict()[name]) for name, v in objects.state_dict().items())
 
 
+@pytest.mark.parametrize(
+    ("cls", "name"), [(SplitFit, "points"), (ClockedFit, "points"), (PrimedFit, "label_times"), (Adam, "steps")]
+)
+def test_none_is_refused_where_no_choice_is_left_open(cls, name):
+    with pytest.raises(ValueError, match=f"^`{name}` must be a positive integer; got None: give 1 or more"):
+        cls(**{name: None})
+    assert PrimedFit(points=None).points is Adam(refresh=None).refresh is None
+
+
 def test_a_fit_makes_its_own_split_flow_or_clock():
     spring = systems.spring_pendulum(1e3, coordinates="polar")
     flow = train(spring, SplitFit(dt=0.05, stages=1, terms=2, **QUICK), solver=GaussNewton(1, 1), progress=False)
