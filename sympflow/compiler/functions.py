@@ -74,7 +74,7 @@ def _multiply_add(a: Any, b: Any, c: Any) -> Any:
 
 
 def _sign(x: Any) -> Any:
-    """The sign of tensors, NaN of NaN."""
+    """The sign of tensors, NaN where they are NaN."""
     return x.sign().where(~x.isnan(), x)
 
 
