@@ -691,7 +691,9 @@ def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], to
         With the reason.
     """
     if sum(1 if isinstance(each, str) else len(each) for each in names) > MOST_VARIABLES:
-        raise Untraceable(f"it has more than {MOST_VARIABLES} variables")
+        raise Untraceable(
+            f"it has more than {MOST_VARIABLES} variables: give one site or pair, to HamiltonianSystem.lattice or pairs"
+        )
     recording = _Recorded()
     kind = TracedTensor if torch else TracedArray
     inputs, args = [], []

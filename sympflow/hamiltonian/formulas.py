@@ -97,7 +97,7 @@ class Entries:
 
 
 class TracedHamiltonian:
-    """The form of a system that was given by Python functions: what a `SymbolicHamiltonian` is for one by symbols.
+    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
 
     Parameters
     ----------
@@ -238,11 +238,14 @@ class TracedHamiltonian:
         """∇³V(v, w), (..., d)."""
         return self._assembled(self._along[1], q, *t, more=(v, w))
 
+    @cached_property
+    def _in_time(self) -> Program:
+        inputs = self.program.inputs
+        return Program(inputs, gradient(self.program.outputs[0], inputs[:1]))
+
     def time_derivative(self, x: Array, t: Any) -> Array:
         """∂V/∂t or ∂H/∂t, (...)."""
-        inputs = self.program.inputs
-        slope = Program(inputs, gradient(self.program.outputs[0], inputs[:1]))
-        return self._assembled(slope, x, t)[..., 0]
+        return self._assembled(self._in_time, x, t)[..., 0]
 
     def _assembled(self, program: Program, x: Array, *t: Any, more: Sequence[Array] = ()) -> Array:
         arrays = (x, *more)
@@ -280,7 +283,7 @@ class TracedDriving:
         return _at_time(self._letters, time)
 
     def check(self) -> None:
-        """All that was traced has a compiled form."""
+        """Do nothing: all that was traced has a compiled form."""
 
 
 class TracedLetters:
@@ -324,7 +327,7 @@ def _without_time(f: Formula, time: Letter, found: dict[Letter, Formula]) -> For
     for x in program.operations:
         if any(isinstance(a, Traced) and a.order in moving for a in x.args):
             moving.add(x.order)
-    used = [a for x in (*program.operations,) if x.order in moving for a in x.args] + list(program.outputs)
+    used = [a for x in program.operations if x.order in moving for a in x.args] + list(program.outputs)
     own: dict[int, Letter] = {}
     for a in used:
         if isinstance(a, Traced) and a.order not in moving and a.order not in own:
