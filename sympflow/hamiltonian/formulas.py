@@ -173,7 +173,7 @@ class TracedHamiltonian:
     @cached_property
     def size(self) -> int:
         """Operations of ∇V, or of ∇H."""
-        return len(self._orders[0])
+        return len(self._slope)
 
     @cached_property
     def driving(self) -> TracedDriving:
@@ -188,13 +188,16 @@ class TracedHamiltonian:
     # arrays, of V in q or of H in [q, p] --------------------------------------------------------------------------
 
     @cached_property
-    def _orders(self) -> tuple[Program, Program]:
-        """The gradient, and the Hessian row by row to the diagonal."""
-        y, inputs = self.program.outputs[0], self.program.inputs
+    def _slope(self) -> Program:
+        inputs = self.program.inputs
+        return Program(inputs, gradient(self.program.outputs[0], inputs[1:] if self.time else inputs))
+
+    @cached_property
+    def _hessian(self) -> Program:
+        """The Hessian row by row to the diagonal."""
+        inputs = self.program.inputs
         x = inputs[1:] if self.time else inputs
-        slope = gradient(y, x)
-        rows = [entry for i, s in enumerate(slope) for entry in gradient(s, x[: i + 1])]
-        return Program(inputs, slope), Program(inputs, rows)
+        return Program(inputs, [entry for i, s in enumerate(self._slope.outputs) for entry in gradient(s, x[: i + 1])])
 
     @cached_property
     def _along(self) -> tuple[Program, Program]:
@@ -206,7 +209,7 @@ class TracedHamiltonian:
         def products(*numbers: Any) -> list[Any]:
             x = numbers[n - d : n]
             v, w = numbers[n : n + d], numbers[n + d :]
-            product = tangent(self._orders[0](*numbers[:n]), x, v)
+            product = tangent(self._slope(*numbers[:n]), x, v)
             return [*product, *tangent(product, x, w)]
 
         both = traced(products, *names)
@@ -218,12 +221,12 @@ class TracedHamiltonian:
 
     def gradient(self, x: Array, *t: Any) -> Array:
         """Its gradient, (..., n)."""
-        return self._assembled(self._orders[0], x, *t)
+        return self._assembled(self._slope, x, *t)
 
     def hessian(self, x: Array, *t: Any) -> Array:
         """Its Hessian, (..., n, n)."""
         n = x.shape[-1]
-        rows = self._assembled(self._orders[1], x, *t)
+        rows = self._assembled(self._hessian, x, *t)
         pairs = [(max(i, j), min(i, j)) for i in range(n) for j in range(n)]
         return rows[..., [i * (i + 1) // 2 + j for i, j in pairs]].reshape(*x.shape[:-1], n, n)
 
