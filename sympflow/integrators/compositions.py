@@ -159,16 +159,16 @@ class KineticPotential(Composition):
             )
 
     def check_system(self, dt: float) -> None:
-        friction = self.system.friction
-        back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
-        if friction.largest * back * dt > MOST_GROWTH:
-            raise ValueError(
-                f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {friction.largest:.6g}: its "
-                f"drifts of {back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
-                f"exp({friction.largest * back * dt:.3g}). Use a `dt` of at most "
-                f"{MOST_GROWTH / (friction.largest * back):.3g}, or a scheme without such drifts, as 'verlet' or "
-                "'chin4c'."
-            )
+        if self.system.friction:
+            damping = self.system.friction.largest
+            back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
+            if damping * back * dt > MOST_GROWTH:
+                raise ValueError(
+                    f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {damping:.6g}: its "
+                    f"drifts of {back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
+                    f"exp({damping * back * dt:.3g}). Use a `dt` of at most {MOST_GROWTH / (damping * back):.3g}, or "
+                    "a scheme without such drifts, as 'verlet' or 'chin4c'."
+                )
         if self.system.kinetic_timed:
             self.system.drift(np.zeros(self.system.ndof), 0.0, 0.0)
 
