@@ -373,7 +373,7 @@ class StoredRun:
         self.earlier: dict[str, Any] = {}
         self.pieces: Pieces
         self.before: tuple[Any, ...] | None = None
-        """Where the window that is under way began; None between windows."""
+        """The beginning of the window that is under way; None between windows."""
 
     def outcome(self) -> Outcome:
         """Run up to the end, a failure or Ctrl-C."""
