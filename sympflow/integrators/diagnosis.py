@@ -458,7 +458,7 @@ def _tail_states(
 def _end_of_solution(
     system: HamiltonianSystem, t: np.ndarray, y: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times at which solutions from y (n, 2d) at t (n,) to `end` become infinite, or NaN; which go on; which are open."""
+    """Times at which solutions from y (n, 2d) at t (n,) become infinite, or NaN; which reach `end`; which are open."""
     from scipy.integrate import DOP853
 
     A, B, E3, E5 = DOP853.A, DOP853.B, DOP853.E3, DOP853.E5
