@@ -274,7 +274,7 @@ ENDINGS = "non-finite|not finite|underflow|ceased|Newton|Required step size"
 GRADIENT, POTENTIAL, H = "`gradient` must return", "`potential` must return", "`hamiltonian` must return"
 REAL = " real numbers"
 good = {
-    from_gradient: lambda q: q,
+    from_gradient: lambda q: (1 + 1e-8) * q,  # not exactly that of V: like the others it is not traced
     from_potential: lambda q: (q**2).sum(-1) / 2,
     from_hamiltonian: lambda q, p: ((q**2).sum(-1) + (p**2).sum(-1)) / 2,
     from_numba: numba_gradient,
@@ -433,8 +433,6 @@ def test_callables(row, methods):
                 outcomes.append((method, (type(sound), re.escape(str(sound)[:60])), got))
         elif error is not None:
             outcomes.append((method, (None, None), got))
-        elif re.match("`hessian_vector` is needed|`system` .custom. is given by functions, from", str(got)):
-            continue  # a sound gradient is that of what is traced
         elif isinstance(got, Exception) or got.status != -1 or not np.isfinite(got.y).all():
             failed[method] = repr(got)
         elif not re.search(message, got.message):

@@ -42,11 +42,11 @@ def scaled(form, units=(1.0, 1.0, 1.0)):
 
 
 def of_states(form, units):
-    """What states [q, p] of size 1 are multiplied by."""
+    """The factors by which states [q, p] of size 1 are multiplied."""
     return np.repeat(units[:2], len(FORMS[form][1]) // 2)
 
 
-def alike(measure, form, rtol=1e-8):
+def assert_alike(measure, form, rtol=1e-8):
     """Assert that a measure of a system and its units, free of dimensions, is the same in all units, without a word."""
     expected = np.asarray(measure(scaled(form), (1.0, 1.0, 1.0)), dtype=float)
     assert np.isfinite(expected).any()
@@ -87,7 +87,7 @@ def test_methods(method):
             assert sol.success, sol.message
             return sol.y[:, -1] / of_states(form, units)
 
-        alike(end, form, 1e-5 if adaptive else 1e-9)
+        assert_alike(end, form, 1e-5 if adaptive else 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ RELATIVE = {"compare": 1e-4, "stability": 1e-3, "frequencies": 1e-6}  # by diffe
 @pytest.mark.parametrize("form", ["well", "kepler", "bent"])
 @pytest.mark.parametrize("name", MEASURES)
 def test_metrics(name, form):
-    alike(MEASURES[name], form, RELATIVE.get(name, 1e-8))
+    assert_alike(MEASURES[name], form, RELATIVE.get(name, 1e-8))
 
 
 OF_DRIVEN = {
@@ -197,12 +197,12 @@ OF_DRIVEN = {
 
 @pytest.mark.parametrize("name", OF_DRIVEN)
 def test_metrics_of_driven_systems(name):
-    alike(OF_DRIVEN[name], "driven", 1e-4 if name == "compare" else 1e-7)
+    assert_alike(OF_DRIVEN[name], "driven", 1e-4 if name == "compare" else 1e-7)
 
 
 def test_metrics_of_damped_systems():
-    alike(lambda s, u: sympflow.conformal_defect(steps_of(s)), "damped")
-    alike(compared, "damped")
+    assert_alike(lambda s, u: sympflow.conformal_defect(steps_of(s)), "damped")
+    assert_alike(compared, "damped")
 
 
 @pytest.mark.parametrize("form", FORMS)

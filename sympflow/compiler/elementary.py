@@ -2,10 +2,13 @@
 
 Each function reduces its argument by an identity, which a comment states, and evaluates a polynomial by Estrin's rule.
 What few arguments need, very large ones for instance, is given by the C library, one lane after the other, behind a
-branch that others never take. float32 is computed in double precision. Errors in units in the last place: below 1 for
-exp and log, 3 for tanh, 2 for the others; on machines without fused operations 3 for sin, cos and tan; of angles beyond
-`FAR` those of the C library. Of what C gives, constant powers differ in this: a half power of −∞ is NaN, x^(−3/2) is 0
-where it would be subnormal.
+branch that others never take. float32 is computed in double precision.
+
+Errors in units in the last place, for all arguments: below 1 for exp and log, 3 for tanh, 2 for expm1, log1p, atan and
+powers; up to `FAR` 2 for sin, cos and tan, 3 on machines without fused operations. Angles beyond `FAR` have the errors
+of the C library, and so have the functions that are its own: with glibc below 1 for angles, up to 16 where a sine or
+cosine is below 1e-18, and below 4 for the functions. digamma and trigamma are right to 16 units of their largest term.
+Constant powers differ from those of C in this: a half power of −∞ is NaN, x^(−3/2) is 0 where it would be subnormal.
 
 Polynomials of sin, cos and log are those of fdlibm (Sun Microsystems, 1993, free to use with this notice); the others
 interpolate at Chebyshev's points. Products after Dekker (1971).

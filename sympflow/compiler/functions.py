@@ -74,7 +74,7 @@ def _multiply_add(a: Any, b: Any, c: Any) -> Any:
 
 
 def _sign(x: Any) -> Any:
-    """The sign of tensors, NaN of NaN."""
+    """The sign of tensors, NaN where they are NaN."""
     return x.sign().where(~x.isnan(), x)
 
 
@@ -89,7 +89,7 @@ def _trigamma_of_tensors(x: Any) -> Any:
 
 
 def _no_further(y: Any, x: Any) -> tuple[Any]:
-    raise NotImplementedError("the third derivative of lgamma is not in the table: use a method without it.")
+    raise ValueError("`trigamma` has no derivative here: use a method with fewer derivatives of H, or backend='array'.")
 
 
 def _choice(y: Any, c: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
@@ -124,14 +124,12 @@ def _no_tensors(name: str) -> Callable[..., Any]:
     return function
 
 
-def _by_last(slope: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
-    """Derivatives of a function of an order, a number, and of x."""
+def _by_last(name: str, slope: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
+    """Derivatives of a function of an order, which is constant, and of x."""
 
     def partials(y: Any, order: Any, x: Any) -> tuple[Any, Any]:
         if not isinstance(order, float | int):
-            raise NotImplementedError(
-                "the order of a special function must be a number, by which it has no derivative."
-            )
+            raise ValueError(f"`{name}` has no derivative by its order, its first argument: make that a number.")
         return 0.0, slope(y, order, x)
 
     return partials
@@ -192,13 +190,13 @@ FUNCTIONS: dict[str, Function] = {
     "trigamma": Function(_trigamma, _trigamma_of_tensors, _no_further, 160),
     "gamma": Function(_special("gamma"), _no_tensors("gamma"), lambda y, x: (y * apply("digamma", x),), 160),
     "gammainc": Function(_special("gammainc"), _no_tensors("gammainc"), _by_last(
-        lambda y, s, x: apply("pow", x, s - 1.0) * apply("exp", -x) / apply("gamma", s)), 200),
+        "gammainc", lambda y, s, x: apply("pow", x, s - 1.0) * apply("exp", -x) / apply("gamma", s)), 200),
     "gammaincc": Function(_special("gammaincc"), _no_tensors("gammaincc"), _by_last(
-        lambda y, s, x: -(apply("pow", x, s - 1.0) * apply("exp", -x)) / apply("gamma", s)), 200),
-    "jv": Function(_special("jv"), _no_tensors("jv"), _by_last(_bessel("jv", 1.0, -1.0)), 300),
-    "yv": Function(_special("yv"), _no_tensors("yv"), _by_last(_bessel("yv", 1.0, -1.0)), 300),
-    "iv": Function(_special("iv"), _no_tensors("iv"), _by_last(_bessel("iv", 1.0, 1.0)), 300),
-    "kv": Function(_special("kv"), _no_tensors("kv"), _by_last(_bessel("kv", -1.0, -1.0)), 300),
+        "gammaincc", lambda y, s, x: -(apply("pow", x, s - 1.0) * apply("exp", -x)) / apply("gamma", s)), 200),
+    "jv": Function(_special("jv"), _no_tensors("jv"), _by_last("jv", _bessel("jv", 1.0, -1.0)), 300),
+    "yv": Function(_special("yv"), _no_tensors("yv"), _by_last("yv", _bessel("yv", 1.0, -1.0)), 300),
+    "iv": Function(_special("iv"), _no_tensors("iv"), _by_last("iv", _bessel("iv", 1.0, 1.0)), 300),
+    "kv": Function(_special("kv"), _no_tensors("kv"), _by_last("kv", _bessel("kv", -1.0, -1.0)), 300),
     "ellipk": Function(_special("ellipk"), _no_tensors("ellipk"), lambda y, m: (
         (apply("ellipe", m) - (1.0 - m) * y) / (2.0 * m * (1.0 - m)),), 200),
     "ellipe": Function(_special("ellipe"), _no_tensors("ellipe"), lambda y, m: (

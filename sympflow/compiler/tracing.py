@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arrays import is_tensor
 from sympflow.compiler.functions import OF_SCIPY, apply
 from sympflow.compiler.program import Program, Recording, Traced
 
@@ -224,9 +225,7 @@ def _wrapped(x: Any, kind: type[TracedArray]) -> Any:
     """A result of raw arrays as it is given to the function again."""
     if isinstance(x, Traced) or (isinstance(x, np.ndarray) and x.dtype == object):
         return _array(x, kind)
-    if isinstance(x, tuple) and hasattr(x, "_fields"):
-        return type(x)(*(_wrapped(y, kind) for y in x))
-    return type(x)(_wrapped(y, kind) for y in x) if type(x) in (list, tuple) else x
+    return type(x)(_wrapped(y, kind) for y in x) if type(x) in (list, tuple, _Extremes) else x
 
 
 def _plain(x: Any) -> Any:
@@ -237,10 +236,10 @@ def _plain(x: Any) -> Any:
         return type(x)(_plain(y) for y in x)
     if type(x) is dict:
         return {key: _plain(y) for key, y in x.items()}
-    if hasattr(x, "detach") and hasattr(x, "requires_grad"):
+    if is_tensor(x):
         if x.requires_grad:
             raise Untraceable("it has a tensor that requires gradients, such as weights of a network")
-        return x.detach().cpu().numpy()
+        return x.cpu().numpy()
     return x
 
 
@@ -513,13 +512,13 @@ def _softmax(x: Any, axis: int = -1, **_: Any) -> Any:
 
 
 def _extremes(name: str) -> Callable[..., Any]:
-    """torch's max and min: of two arrays, along an axis with indices, which are not to be had, or of all."""
+    """Return torch's max or min: of two arrays, of all, or along an axis, without the indices that torch has."""
 
     def function(x: Any, *args: Any, **options: Any) -> Any:
         if args and isinstance(args[0], np.ndarray):
             return _each(name, x, args[0])
         found = _extreme(name)(x, *args, **options)
-        return _Extremes(found) if args or "axis" in options else found
+        return _Extremes([found]) if args or "axis" in options else found
 
     return function
 
@@ -527,18 +526,9 @@ def _extremes(name: str) -> Callable[..., Any]:
 class _Extremes(tuple[Any, ...]):
     """The values along an axis, in place of torch's pair of values and indices."""
 
-    _fields = ("values",)
-
-    def __new__(cls, values: Any) -> _Extremes:
-        return super().__new__(cls, (values,))
-
     @property
     def values(self) -> Any:
         return self[0]
-
-
-def _in_place(name: str) -> Callable[..., Any]:
-    return lambda x, y, **_: getattr(operator, name)(x, y)
 
 
 def _reshaped(x: Any, *shape: Any) -> Any:
@@ -701,7 +691,9 @@ def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], to
         With the reason.
     """
     if sum(1 if isinstance(each, str) else len(each) for each in names) > MOST_VARIABLES:
-        raise Untraceable(f"it has more than {MOST_VARIABLES} variables")
+        raise Untraceable(
+            f"it has more than {MOST_VARIABLES} variables: give one site or pair, to HamiltonianSystem.lattice or pairs"
+        )
     recording = _Recorded()
     kind = TracedTensor if torch else TracedArray
     inputs, args = [], []

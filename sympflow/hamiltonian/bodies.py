@@ -159,7 +159,7 @@ class PairsHamiltonian(LocalHamiltonian):
         other = copy.copy(self)
         other.params = _checked_params({**self.params, **values})
         other.constants = (*other.params.values(), *self.constants[len(self.params) :])
-        for name in ("terms", "bond_length", "written"):
+        for name in ("bond_length", "written"):
             vars(other).pop(name, None)
         other._check_continuous()
         return other

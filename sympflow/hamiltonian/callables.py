@@ -34,7 +34,7 @@ class Functions(Definition):
     library : str
         "numpy" or "torch", whose arrays the functions take; "" if they fail on both.
     untraced : str
-        Why there is no program, a clause; "" if there is one.
+        The reason for which there is no program, a clause; "" if there is one.
     """
 
     library: str = ""
@@ -54,7 +54,7 @@ class Functions(Definition):
         if self.numba_functions is not None:
             self.untraced = "it is a Numba function"
             return None
-        if not self.given and self._functions[2] is not None:  # of which `potential` may be a dummy
+        if not self.given and self._functions[2] is not None:  # then `potential` may be a dummy
             self.untraced = "with check=False the `gradient` is taken as it is: leave one of them out"
             return None
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -64,6 +64,20 @@ class Functions(Definition):
             except Untraceable as reason:
                 self.untraced = str(reason)
                 return None
+
+    @property
+    def has_hessian_vector(self) -> bool:  # type: ignore[override]
+        *_, gradient, product = self._functions
+        return gradient is None or product is not None or self.form is not None
+
+    @property
+    def has_third_derivative(self) -> bool:  # type: ignore[override]
+        return self.form is not None and self.library == "numpy"
+
+    @property
+    def differentiates_itself(self) -> bool:  # type: ignore[override]
+        *_, gradient, product = self._functions
+        return gradient is None and product is None and not self.has_third_derivative
 
     @property
     def _name(self) -> str:
@@ -214,9 +228,9 @@ class CallableHamiltonian(Functions):
     """The functions of a system given by V(q) or H(q, p). See `HamiltonianSystem` for the arguments."""
 
     time: float | None = None
-    """The time at which those of a driven system are taken, for messages."""
+    """The time of the functions of a driven system, for messages."""
     traced: bool = False
-    """True of those at a time, of a driven system that was traced."""
+    """True of functions at one time of a driven system that was traced."""
 
     def __init__(
         self,
@@ -257,18 +271,6 @@ class CallableHamiltonian(Functions):
         self._potential, self._gradient = arrays.potential, arrays.gradient
         self._hessian_vector = None if hessian_vector is None else arrays.hessian_vector
 
-    @property
-    def has_hessian_vector(self) -> bool:  # type: ignore[override]
-        return self._gradient is None or self._hessian_vector is not None or self.form is not None
-
-    @property
-    def has_third_derivative(self) -> bool:  # type: ignore[override]
-        return self.form is not None and self.library == "numpy"
-
-    @property
-    def differentiates_itself(self) -> bool:  # type: ignore[override]
-        return self._gradient is None and self._hessian_vector is None and not self.has_third_derivative
-
     def identity_parts(self) -> Any:
         return [self.ndof, *self._functions]
 
@@ -285,9 +287,9 @@ class CallableHamiltonian(Functions):
     def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
         traced = self.traced or self.form is not None
-        if traced and self.library == "numpy" and (is_tensor(like) or self._gradient is None):
-            like = np.empty(0)
-        if self.differentiates_itself and not is_tensor(like) and not (traced and self.library == "numpy"):
+        if traced and self.library == "numpy":
+            like = np.empty(0) if is_tensor(like) or self._gradient is None else like
+        elif self.differentiates_itself and not is_tensor(like):
             import torch
 
             like = torch.from_numpy(np.empty(0, like.dtype))
@@ -435,7 +437,7 @@ def _check_callable(**functions: Any) -> None:
 
 
 def _is_numba(function: Any) -> bool:
-    """True of a function compiled by Numba, which is asked only where it has been imported already."""
+    """True of a function compiled by Numba, which none is before Numba is imported."""
     numba = sys.modules.get("numba.core.dispatcher")
     return numba is not None and isinstance(function, numba.Dispatcher)
 
@@ -564,19 +566,7 @@ class DrivenCallables(Functions):
             self.numba_functions = (potential, gradient, hessian_vector)
         check_flag("check", check)
         self.ndof, self.given, self.separable = ndof, bool(check), potential is not None
-        self._at(0.0)  # which refuses what does not fit
-
-    @property
-    def has_hessian_vector(self) -> bool:  # type: ignore[override]
-        return self._functions[2] is None or self._functions[3] is not None or self.form is not None
-
-    @property
-    def has_third_derivative(self) -> bool:  # type: ignore[override]
-        return self.form is not None and self.library == "numpy"
-
-    @property
-    def differentiates_itself(self) -> bool:  # type: ignore[override]
-        return self._functions[2] is None and self._functions[3] is None and not self.has_third_derivative
+        self._at(0.0)  # refuses what does not fit
 
     def identity_parts(self) -> Any:
         return [self.ndof, self._functions]
@@ -680,7 +670,7 @@ _OF_FORM = {
     "potential_hessian": "hessian",
     "hessian_vector": "hessian_vector",
 }
-"""Those of a form, by those of functions."""
+"""Methods of a form, by the functions of which they give derivatives."""
 _ARGUMENTS = {"potential": "t, q", "hamiltonian": "t, q, p", "gradient": "t, q", "hessian_vector": "t, q, v"}
 
 

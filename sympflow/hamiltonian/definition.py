@@ -56,7 +56,7 @@ class Definition:
     given_functions : bool
         True if H is given by functions of Python, which are traced where that is possible.
     untraced : str
-        Why functions could not be traced, a clause, once `form` was asked for.
+        The reason for which functions could not be traced, a clause, known after `form`.
     poles : Poles or None
         The places that a step may leap over at which H as it is written is infinite or no number.
     """
@@ -99,7 +99,7 @@ class Definition:
         return None
 
     def place(self, y0: Any, domain: Any, inverse_mass: np.ndarray | None, t_span: tuple[float, float]) -> None:
-        """Take what a system knows beside its functions, with which they are traced."""
+        """Take the scene of the system, at whose states functions are traced."""
 
     def check_unchanged(self) -> None:
         """Raise a ValueError if a function has another value than when it was traced."""

@@ -97,7 +97,7 @@ class Entries:
 
 
 class TracedHamiltonian:
-    """The form of a system that was given by Python functions: what a `SymbolicHamiltonian` is for one by symbols.
+    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class TracedHamiltonian:
     @cached_property
     def size(self) -> int:
         """Operations of ∇V, or of ∇H."""
-        return len(self._orders[0])
+        return len(self._slope)
 
     @cached_property
     def driving(self) -> TracedDriving:
@@ -188,13 +188,16 @@ class TracedHamiltonian:
     # arrays, of V in q or of H in [q, p] --------------------------------------------------------------------------
 
     @cached_property
-    def _orders(self) -> tuple[Program, Program]:
-        """The gradient, and the Hessian row by row to the diagonal."""
-        y, inputs = self.program.outputs[0], self.program.inputs
+    def _slope(self) -> Program:
+        inputs = self.program.inputs
+        return Program(inputs, gradient(self.program.outputs[0], inputs[1:] if self.time else inputs))
+
+    @cached_property
+    def _hessian(self) -> Program:
+        """The Hessian row by row to the diagonal."""
+        inputs = self.program.inputs
         x = inputs[1:] if self.time else inputs
-        slope = gradient(y, x)
-        rows = [entry for i, s in enumerate(slope) for entry in gradient(s, x[: i + 1])]
-        return Program(inputs, slope), Program(inputs, rows)
+        return Program(inputs, [entry for i, s in enumerate(self._slope.outputs) for entry in gradient(s, x[: i + 1])])
 
     @cached_property
     def _along(self) -> tuple[Program, Program]:
@@ -206,7 +209,7 @@ class TracedHamiltonian:
         def products(*numbers: Any) -> list[Any]:
             x = numbers[n - d : n]
             v, w = numbers[n : n + d], numbers[n + d :]
-            product = tangent(self._orders[0](*numbers[:n]), x, v)
+            product = tangent(self._slope(*numbers[:n]), x, v)
             return [*product, *tangent(product, x, w)]
 
         both = traced(products, *names)
@@ -218,12 +221,12 @@ class TracedHamiltonian:
 
     def gradient(self, x: Array, *t: Any) -> Array:
         """Its gradient, (..., n)."""
-        return self._assembled(self._orders[0], x, *t)
+        return self._assembled(self._slope, x, *t)
 
     def hessian(self, x: Array, *t: Any) -> Array:
         """Its Hessian, (..., n, n)."""
         n = x.shape[-1]
-        rows = self._assembled(self._orders[1], x, *t)
+        rows = self._assembled(self._hessian, x, *t)
         pairs = [(max(i, j), min(i, j)) for i in range(n) for j in range(n)]
         return rows[..., [i * (i + 1) // 2 + j for i, j in pairs]].reshape(*x.shape[:-1], n, n)
 
@@ -235,11 +238,14 @@ class TracedHamiltonian:
         """∇³V(v, w), (..., d)."""
         return self._assembled(self._along[1], q, *t, more=(v, w))
 
+    @cached_property
+    def _in_time(self) -> Program:
+        inputs = self.program.inputs
+        return Program(inputs, gradient(self.program.outputs[0], inputs[:1]))
+
     def time_derivative(self, x: Array, t: Any) -> Array:
         """∂V/∂t or ∂H/∂t, (...)."""
-        inputs = self.program.inputs
-        slope = Program(inputs, gradient(self.program.outputs[0], inputs[:1]))
-        return self._assembled(slope, x, t)[..., 0]
+        return self._assembled(self._in_time, x, t)[..., 0]
 
     def _assembled(self, program: Program, x: Array, *t: Any, more: Sequence[Array] = ()) -> Array:
         arrays = (x, *more)
@@ -277,7 +283,7 @@ class TracedDriving:
         return _at_time(self._letters, time)
 
     def check(self) -> None:
-        """All that was traced has a compiled form."""
+        """Do nothing: all that was traced has a compiled form."""
 
 
 class TracedLetters:
@@ -321,7 +327,7 @@ def _without_time(f: Formula, time: Letter, found: dict[Letter, Formula]) -> For
     for x in program.operations:
         if any(isinstance(a, Traced) and a.order in moving for a in x.args):
             moving.add(x.order)
-    used = [a for x in (*program.operations,) if x.order in moving for a in x.args] + list(program.outputs)
+    used = [a for x in program.operations if x.order in moving for a in x.args] + list(program.outputs)
     own: dict[int, Letter] = {}
     for a in used:
         if isinstance(a, Traced) and a.order not in moving and a.order not in own:

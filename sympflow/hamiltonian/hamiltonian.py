@@ -583,12 +583,12 @@ class Hamiltonian:
 
     @property
     def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
-        """What programs are recorded of: the symbolic definition, or functions that were traced; else None."""
+        """The definition that programs are recorded of: symbols, or functions that were traced; else None."""
         return self.symbols if self.symbols is not None else self._definition.form
 
     @property
     def untraced(self) -> str:
-        """Why functions of Python could not be traced, a clause; "" if they were, or there are none."""
+        """The reason for which Python functions could not be traced, a clause; "" if they were, or there are none."""
         return "" if self.form is not None else self._definition.untraced
 
     @property
@@ -622,7 +622,7 @@ class Hamiltonian:
 
     @property
     def few_sites(self) -> Self:
-        """The system by which a flow that knows no size knows this one: a few of its sites or bodies. Else itself."""
+        """A few of the sites of a lattice, by which a flow for any size knows it; else the system itself."""
         return self
 
     @property

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import is_tensor
+from sympflow.compiler.control import Value
 from sympflow.compiler.functions import apply, where
 
 SHORT = 0.25  # βX² up to which a series of so many terms is exact to rounding
@@ -65,7 +66,7 @@ def stumpff(X: Any, beta: Any) -> tuple[Any, Any, Any, Any]:
 
 def repeated(body: Callable[..., tuple[Any, Numbers]], values: Numbers) -> Numbers:
     """Apply `body`, which gives a condition and new values, again while the condition holds anywhere."""
-    if hasattr(values[0], "code"):
+    if isinstance(values[0], Value):
         code = values[0].code
 
         def turn(given: Numbers) -> tuple[Any, Numbers]:
@@ -104,7 +105,7 @@ def solved(r: Any, eta: Any, zeta: Any, beta: Any, mu: Any, t: Any) -> Any:
 
 
 def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta: Any, mu: Any, t: Any) -> Numbers:
-    """f − 1, g, f′ and g′ − 1 after one step of Newton's method from X, in which so small a step is linear; and it."""
+    """f − 1, g, f′, g′ − 1 after a step d of Newton's method from X, so short that it is linear; d; g as rG₁ + ηG₂."""
     G0, G1, G2, G3 = G
     slope = 1.0 / (r + (eta * G1 + zeta * G2))
     d = -((r * X + (eta * G2 + zeta * G3) - t) * slope)

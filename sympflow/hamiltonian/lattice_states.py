@@ -60,7 +60,7 @@ class LatticeStates:
         bounds = tuple(given) if isinstance(given, tuple | list | np.ndarray) else (given, given)
         if len(bounds) != 2 or not all(real_number(x) and 0 < x < math.inf for x in bounds) or bounds[0] > bounds[1]:
             raise ValueError(
-                f"`density` must be positive, the energy of a site or body above rest, or two such bounds, low ≤ high; "
+                f"`density` must be positive, the energy of a site above rest, or two such bounds, low ≤ high; "
                 f"got {given!r}."
             )
         object.__setattr__(self, "density", (float(bounds[0]), float(bounds[1])))

@@ -81,7 +81,7 @@ class PartFunctions(SymbolicHamiltonian):
         self.H, self.q, self.p, self.ndof = H, q, p, len(q)
         self.V = self.T = None
         self.separable = False
-        self.of_positions = not H.has(*p)  # a value, which tracers of torch do not ask SymPy for
+        self.of_positions = not H.has(*p)  # once, for torch cannot follow SymPy
         self.time = whole.time if whole.time in H.free_symbols else None
         if whole.samples:
             self.samples = whole.samples

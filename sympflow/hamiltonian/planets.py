@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from sympflow.arguments import plain, real_number
-from sympflow.arrays import Array, is_tensor, like, stack, to_numpy
+from sympflow.arrays import Array, concatenate, like, masked, stack, to_numpy
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
 
@@ -146,7 +146,7 @@ class Frame:
             centres.append(R)
         planets = stack(x, axis=-2)
         if len(self.test):
-            planets = _joined(planets, q[..., self.test, :] - stack(centres, axis=-2)[..., self.inside, :])
+            planets = concatenate([planets, q[..., self.test, :] - stack(centres, axis=-2)[..., self.inside, :]], -2)
         return planets, R
 
     def absolute(self, x: Array, centre: Array) -> Array:
@@ -160,7 +160,7 @@ class Frame:
         bodies = stack(q, axis=-2)
         n = len(self.order)
         if len(self.test):
-            bodies = _joined(bodies, x[..., n:, :] + stack(centres, axis=-2)[..., self.inside, :])
+            bodies = concatenate([bodies, x[..., n:, :] + stack(centres, axis=-2)[..., self.inside, :]], -2)
         return (bodies + (centre - R)[..., None, :])[..., self._places, :]
 
     @cached_property
@@ -182,13 +182,13 @@ class Frame:
             q, u = self.absolute(x, Q), self.absolute(v, U)
         else:
             share = like((self.masses[self.bodies] / self.masses.sum())[:, None], x)
-            q = _joined(0 * x[..., :1, :], x) + (Q - (share * x).sum(-2))[..., None, :]
+            q = concatenate([0 * x[..., :1, :], x], -2) + (Q - (share * x).sum(-2))[..., None, :]
             star = -(like((self.masses[self.bodies] / self.masses[0])[:, None], v) * v).sum(-2)
-            u = _joined(star[..., None, :], v) + U[..., None, :]
+            u = concatenate([star[..., None, :], v], -2) + U[..., None, :]
             q, u = q[..., self._places, :], u[..., self._places, :]
         p = u * like(self.inertia[:, None], u)
         d = self.local.ndof
-        return _joined(q.reshape(*q.shape[:-2], d), p.reshape(*p.shape[:-2], d), -1)
+        return concatenate([q.reshape(*q.shape[:-2], d), p.reshape(*p.shape[:-2], d)])
 
     # the two flows of the splitting, by array operations ------------------------------------------------------------
 
@@ -205,7 +205,7 @@ class Frame:
         share = like((self.masses[self.bodies] / self.masses[0])[:, None], x)
         if not self.jacobi:
             x = x + t / 2 * (share * v).sum(-2, keepdims=True)
-        q = self.absolute(x, centre) if self.jacobi else _joined(0 * x[..., :1, :], x)[..., self._places, :]
+        q = self.absolute(x, centre) if self.jacobi else concatenate([0 * x[..., :1, :], x], -2)[..., self._places, :]
         slope = self.local.potential_gradient(q.reshape(*q.shape[:-2], -1)).reshape(q.shape)
         a = -slope / like(self.inertia[:, None], q)
         a = self.relative(a)[0] if self.jacobi else a[..., self.bodies, :]
@@ -215,7 +215,7 @@ class Frame:
             x = x + t / 2 * (share * v).sum(-2, keepdims=True)
         near = self.near(q)
         if near is not None:
-            x = x + _nan_where(near.any(-1), x)[..., None, None]
+            x = masked(x, near.any(-1)[..., None, None], math.nan)
         return x, v
 
     def near(self, q: Array) -> Array | None:
@@ -252,7 +252,7 @@ class Frame:
         x, v = states_of(self.elements, self.G * (masses[0] + masses[1:]))
         d, u = (y[one - 1] - y[other - 1] for y in (x, v))
         r = np.linalg.norm(d, axis=-1)
-        close = r < MOON * np.maximum(self._hill(one), self._hill(other))
+        close = r < MOON * np.maximum(self.hill_radii(one, one, 0.0), self.hill_radii(other, other, 0.0))
         bound = close & ((u * u).sum(-1) / 2 < self.G * (masses[one] + masses[other]) / r)
         if bound.any():
             first, second = sorted(int(i[bound][0]) for i in (one, other))
@@ -260,9 +260,6 @@ class Frame:
                 f"`method` {method!r} has each body on an orbit about the star, and bodies {first} and {second} are "
                 "bound to each other: take the splitting 'kinetic', such as 'srkn11b', or one body in place of both."
             )
-
-    def _hill(self, i: np.ndarray) -> np.ndarray:
-        return self.size[i - 1] * np.cbrt(self.masses[i] / (3 * self.masses[0]))
 
     def crossing(self) -> tuple[int, int] | None:
         """Two planets with masses whose distances from the star overlap, or None."""
@@ -273,39 +270,12 @@ class Frame:
         return None
 
 
-def _joined(x: Array, y: Array, axis: int = -2) -> Array:
-    if is_tensor(x):
-        import torch
-
-        return torch.cat([x, y], dim=axis)
-    return np.concatenate([x, y], axis=axis)
-
-
-def _nan_where(condition: Any, x: Array) -> Any:
-    """NaN where the condition (...) holds, else 0, of the kind of x."""
-    if is_tensor(x):
-        return (0 * x[..., 0, 0].detach()).masked_fill(condition, math.nan)
-    return np.where(condition, np.nan, 0.0).astype(x.dtype)
-
-
-def frame_of(method: str, name: str, local: Any, y0: Any) -> Frame:
-    """The frame of a system of planets, or of any star and bodies in pairs that attract each other as these do.
-
-    Raises
-    ------
-    ValueError
-        If the system, of that name and piece, is none, or has no `y0`.
-    """
+def frame_of(local: Any, y0: Any) -> Frame | None:
+    """The frame of planets, or of a star and bodies in pairs that attract each other as these do; None of others."""
     if isinstance(local, PlanetsHamiltonian):
         return local.frame
-    G = None if not isinstance(local, PairsHamiltonian) else newtonian(local)
-    if G is None or y0 is None:
-        raise ValueError(
-            f"`method` {method!r} is for planets about a star, which {name!r} is not: make it by "
-            "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
-        )
-    assert isinstance(local, PairsHamiltonian)
-    return Frame(local, G, np.asarray(to_numpy(y0)))
+    G = newtonian(local) if isinstance(local, PairsHamiltonian) else None
+    return None if G is None or y0 is None else Frame(local, G, np.asarray(to_numpy(y0)))
 
 
 def newtonian(local: PairsHamiltonian) -> float | None:
@@ -390,7 +360,8 @@ class PlanetsHamiltonian(PairsHamiltonian):
                 e = u[..., light, :] - u[..., j : j + 1, :]
                 total = total + w * (e - 3 * (d * e).sum(-1)[..., None] / square * d)
         known = heavy.reshape(*heavy.shape[:-1], len(order), 3)
-        whole = _joined(known + 0 * total[..., :1, :], total)[..., np.argsort(np.concatenate([order, light])), :]
+        whole = concatenate([known + 0 * total[..., :1, :], total], -2)
+        whole = whole[..., np.argsort(np.concatenate([order, light])), :]
         return whole.reshape(*whole.shape[:-2], self.ndof)
 
     @cached_property

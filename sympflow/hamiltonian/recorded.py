@@ -101,7 +101,7 @@ def can_be_recorded(f: sp.Expr) -> bool:
 
 
 def _takes_order(f: sp.Basic) -> bool:
-    """True unless the order of a special function is none that the table has."""
+    """False of a special function of an order for which there is no rule."""
     if isinstance(f, sp.polygamma):
         return f.args[0] in (0, 1)
     ordered = (sp.besselj, sp.bessely, sp.besseli, sp.besselk, sp.lowergamma, sp.uppergamma)

@@ -1,4 +1,4 @@
-"""Scene: what a system is usually solved with."""
+"""Scenes: the domain, the start, the interval and the step that a system brings along."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SceneOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Scene:
-    """What a system is usually solved with: see `HamiltonianSystem`."""
+    """The defaults with which a system is solved: see `HamiltonianSystem`."""
 
     name: str = UNNAMED
     domain: Domain | None = None

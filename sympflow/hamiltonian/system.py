@@ -40,7 +40,8 @@ PROPER = {"henon_heiles": "Hénon–Heiles"}
 SHOWN_NAMES = (
     *("autonomous", "conservative", "damping", "domain", "dt", "energy_scale", "exact", "expression", "force"),
     *("from_sympy", "gradient", "hamiltonian", "hessian", "kinetic", "lattice", "linear_part", "name", "ndof", "pairs"),
-    *("params", "period", "potential", "separable", "symbols", "t_span", "vector_field", "velocity"),
+    *("params", "period", "planets", "potential", "program", "schroedinger", "separable", "symbols", "t_span"),
+    *("vector_field", "velocity"),
     *("with_force", "with_params", "y0"),
 )
 """The attributes that `dir` lists: those that users need. All others are for methods and studies."""
@@ -392,16 +393,11 @@ class HamiltonianSystem(Hamiltonian, Shown):
         masses: ArrayLike,
         *,
         elements: Mapping[str, ArrayLike] | ArrayLike | None = None,
-        y0: ArrayLike | None = None,
         G: float | None = None,
         units: str | Sequence[str] | None = None,
         coordinates: str = "jacobi",
         encounter: float | None = 1.0,
-        name: str = "planets",
-        domain: Domain | None = None,
-        t_span: tuple[float, float] | None = None,
-        dt: float | None = None,
-        energy_scale: float | None = None,
+        **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """Planets about a star: H = Σ_i |p_i|²/(2 m_i) − G Σ_{i<j} m_i m_j/r_ij, for methods of the splitting "kepler".
 
@@ -416,10 +412,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
             are per unit mass, and no part of H.
         elements : mapping of str to array_like of shape (n − 1,), or array_like of shape (n − 1, 6)
             Heliocentric orbital elements of the planets: "a", "e", "inc", "node" (ascending), "peri" (the argument of
-             the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Of hyperbolas
-            e > 1 and a < 0. The centre of mass is at rest at the origin.
-        y0 : array_like of shape (6n,)
-            In place of elements: the initial state.
+            the pericentre) and "M" (the mean anomaly), in radians; all but a are 0 by default. Of hyperbolas
+            e > 1 and a < 0. The centre of mass is at rest at the origin. Give them or `y0`.
         G : float, optional
             The gravitational constant, by default 1.
         units : str or sequence of 3 str, optional
@@ -431,12 +425,9 @@ class HamiltonianSystem(Hamiltonian, Shown):
         encounter : float or None
             Two planets that come closer to each other than so many Hill radii end a run of the splitting "kepler", with
             status −1, their numbers and the time. None for no such end.
-        name, domain, energy_scale
-            As for the class.
-        t_span : (float, float), optional
-            By default a thousand of the longest periods.
-        dt : float, optional
-            By default a twentieth of the shortest period.
+        name, domain, y0, t_span, dt, energy_scale, exact
+            As for the class; `t_span` is by default a thousand of the longest periods, `dt` a twentieth of the
+            shortest.
 
         Raises
         ------
@@ -451,11 +442,11 @@ class HamiltonianSystem(Hamiltonian, Shown):
         """
         from sympflow.hamiltonian.planets import PlanetsHamiltonian, checked_planets
 
-        masses, G, start = checked_planets(masses, elements, y0, G, units)
-        local = PlanetsHamiltonian(masses, G, start, coordinates, encounter)
-        end = (0.0, 1000 * float(local.frame.periods.max())) if t_span is None else t_span
-        step = local.frame.longest_step if dt is None else dt
-        return cls._of_pieces(local, None, Scene(name, domain, start, end, step, energy_scale))
+        masses, G, y0 = checked_planets(masses, elements, scene.get("y0"), G, units)
+        local = PlanetsHamiltonian(masses, G, y0, coordinates, encounter)
+        span, dt = (0.0, 1000 * float(local.frame.periods.max())), local.frame.longest_step
+        given = {name: value for name, value in scene.items() if value is not None} | {"y0": y0}
+        return cls._of_pieces(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))
 
     def piece(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
@@ -636,7 +627,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
 
     @property
     def scene(self) -> Scene:
-        """What the system is usually solved with, but for an `exact` solution, which is one of its parameters."""
+        """The scene for other parameters: an `exact` solution belongs to those of the system, and is left out."""
         return Scene(self.name, self.domain, self.y0, self.t_span, self.dt, self.energy_scale)
 
     @property

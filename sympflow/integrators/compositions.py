@@ -604,7 +604,12 @@ class KeplerInteraction(Composition):
         if "kepler" not in known:
             from sympflow.hamiltonian.planets import frame_of
 
-            frame = frame_of(method, system.name, system.local, system.y0)
+            frame = frame_of(system.local, system.y0)
+            if frame is None:
+                raise ValueError(
+                    f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
+                    "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
+                )
             frame.check(method)
             known["kepler"] = frame
         self.frame: Frame = known["kepler"]

@@ -20,7 +20,7 @@ from sympflow.kernels.stages import StageTable, run_table, single_table, with_la
 from sympflow.schemes import CURVATURE, Scheme
 
 if TYPE_CHECKING:
-    from sympflow.kernels.rollouts import Rollouts
+    from sympflow.kernels.rollouts import SplittingRollouts
 
 __all__ = [
     "ClockedFlowKernel",
@@ -177,7 +177,7 @@ class PrimedFlowKernel(Kernel):
             return self._splitting.damped_kernel(scheme, partial(_stepped_by, step))
         return self._splitting.kernel(scheme, self._compensated, self._ranges)
 
-    def _functions(self) -> Rollouts:
+    def _functions(self) -> SplittingRollouts:
         """The compiled functions for the kicks of the flow."""
         tables = self._tables
         return self._splitting.functions(tables.level, self._compensated, tables.monomials, ranges=self._ranges)

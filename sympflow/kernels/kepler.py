@@ -72,13 +72,6 @@ class KeplerCode(Rollouts):
         near[: len(frame.order)] = ((frame.encounter or 0.0) * frame.hill_radii(frame.order, frame.order, 0.0)) ** 2
         self.data = (table, limits, self.report, np.ascontiguousarray(of_light), near)
 
-    def prepared(self, table: Columns) -> Columns:
-        return table
-
-    def own_columns(self, table: Columns, values: np.ndarray, width: int) -> Columns:
-        entries, kinds = table
-        return np.ascontiguousarray(entries[values[:, 0].astype(int)]), kinds
-
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
         """A kick and a drift, which may be of length 0."""
         code, type = room.code, Type("double", LANES)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sympflow.compiler.control import Code, Value
 from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
-from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.threads import given
 
@@ -98,9 +98,6 @@ class OneStep(Rollouts):
         self.parameters = len(symbols.parameters)
         self.size = 1 + self.parameters + self.driven + more
         super().__init__(n_values, 2 * symbols.ndof)
-
-    def prepared(self, table: Columns) -> Columns:
-        return table
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         if name != "step":

@@ -208,14 +208,6 @@ class PartsCode(Rollouts):
     def __reduce__(self) -> tuple[Any, ...]:
         return PartsCode, (self.maps, self.groups)
 
-    def prepared(self, table: Columns) -> Columns:
-        return table
-
-    def own_entries(self, table: Columns, values: np.ndarray) -> Columns:
-        """The columns (n, m, size) of the rows whose numbers are `values` (n, 1)."""
-        entries, kinds = table
-        return entries[values[:, 0].astype(int)], kinds
-
     def columns(self, groups: Sequence[Sequence[int]], entries: np.ndarray) -> Columns:
         """The columns (n, k, size) of groups of maps, whose numbers are (n, m, size), and their kinds (k,)."""
         n, _, size = entries.shape

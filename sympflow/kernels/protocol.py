@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -200,7 +201,7 @@ class Steps(NamedTuple):
     iterations: int = 0
 
 
-class Kernel:
+class Kernel(ABC):
     """Compiled loops of a method on one system; states are [q, p], float64. A subclass says `runs` and `step`.
 
     Attributes
@@ -253,25 +254,17 @@ class Kernel:
             carry.running = carry.running[0]
         return Run(found.states[0], int(found.n_finite[0]), found.iterations)
 
+    @abstractmethod
     def runs(self, task: Task) -> Run:
         """The runs of a task, in vector lanes and, where it pays, on several threads."""
-        raise NotImplementedError
 
+    @abstractmethod
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,), of a driven system at times t."""
-        raise NotImplementedError
 
     def check_reverse(self) -> None:
-        """Raise a ValueError, with the reason, where runs cannot be differentiated: see `recorded`."""
+        """Raise a ValueError, with the reason, where runs cannot be differentiated: see `SplittingKernel.recorded`."""
         raise ValueError("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
-
-    def recorded(self, task: Task) -> Any:
-        """`runs`, as a `Recorded` run, of which cotangents can be pulled back."""
-        raise NotImplementedError
-
-    def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
-        """A step of tensors, with `values` of the parameters, by tensor operations."""
-        raise NotImplementedError
 
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The `step` from each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d); None where they are not compiled."""

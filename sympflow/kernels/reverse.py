@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sympflow.kernels.protocol import Batch
-from sympflow.kernels.rollouts import Rollouts, aligned, zeros
+from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.threads import BLOCK, NEVER, given, run_rows
+
+if TYPE_CHECKING:
+    from sympflow.kernels.splittings import SplittingCode
 
 __all__ = ["Recorded"]
 
@@ -23,7 +27,7 @@ class Recorded:
 
     Parameters
     ----------
-    code : Rollouts
+    code : SplittingCode
         With a reverse of its stages.
     table
         Its rows are numbers.
@@ -42,7 +46,7 @@ class Recorded:
     """
 
     def __init__(
-        self, code: Rollouts, table: np.ndarray, y0: np.ndarray, n_steps: int, save: np.ndarray, work: float
+        self, code: SplittingCode, table: np.ndarray, y0: np.ndarray, n_steps: int, save: np.ndarray, work: float
     ) -> None:
         self._code, self._table, self._y0, self._work = code, table, given(y0), work
         self._n_steps, self._save, self._link = n_steps, given(save, np.int64), table.shape[1] - 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
@@ -12,10 +13,10 @@ import numpy as np
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.protocol import Batch
-from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, reverse_function, run_function
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
 from sympflow.kernels.threads import NEVER
 
-__all__ = ["Columns", "Rollouts", "aligned", "filled", "zeros"]
+__all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "zeros"]
 
 LINE = 8  # numbers in a line of memory
 START = np.zeros(1, dtype=np.int64)
@@ -49,7 +50,7 @@ def filled(x: np.ndarray, lanes: int, times: int = 1) -> np.ndarray:
     return np.concatenate([each, more], axis=-1).reshape(*x.shape[:-1], times * lanes)
 
 
-class Rollouts:
+class Rollouts(ABC):
     """The compiled functions of one stage. A method says what its stage is, and how its tables become columns.
 
     Attributes
@@ -100,30 +101,9 @@ class Rollouts:
         self._lock = threading.RLock()
         self._functions: dict[Any, Callable[..., None]] = {}
 
+    @abstractmethod
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
-        raise NotImplementedError
-
-    def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
-    ) -> tuple[list[Value], list[Value]]:
-        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
-        raise NotImplementedError
-
-    def check_reverse(self) -> None:
-        """Raise a ValueError, with the reason, where there is none."""
-        raise ValueError("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
-
-    def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
-        """A step of length h at t from tensors (..., 2d), by tensor operations.
-
-        `numbers` (n, m) are those of the columns of a step of length 1, `values` those of the parameters.
-        """
-        raise NotImplementedError
-
-    def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-        """From cotangents (m, size, …) of the numbers of columns to those of the numbers of a table (n, m, …)."""
-        raise NotImplementedError
 
     def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
         """One column of many states: see `sympflow.kernels.runs.Over`."""
@@ -131,7 +111,7 @@ class Rollouts:
 
     def look(self, values: Any) -> Any:
         """The running state changed, where there is `every`: see `sympflow.kernels.runs.run_function`."""
-        raise NotImplementedError
+        return values
 
     @cached_property
     def size(self) -> int:
@@ -139,8 +119,9 @@ class Rollouts:
         raise NotImplementedError
 
     def prepared(self, table: Any) -> Columns:
-        """The columns of a table."""
-        raise NotImplementedError
+        """The columns of a table; a table may be these already."""
+        columns: Columns = table
+        return columns
 
     def own_columns(self, table: Any, values: np.ndarray, width: int) -> Columns:
         """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
@@ -150,8 +131,9 @@ class Rollouts:
         return np.ascontiguousarray(full.reshape(groups, width, *entries.shape[1:]).transpose(0, 2, 3, 1)), kinds
 
     def own_entries(self, table: Any, values: np.ndarray) -> Columns:
-        """The numbers (N, m, size) of the columns of each, and their kinds (m,)."""
-        raise NotImplementedError
+        """The numbers (N, m, size) of the columns of each, and their kinds (m,); `values` are places in the table."""
+        entries, kinds = table
+        return entries[values[:, 0].astype(int)], kinds
 
     @property
     def place(self) -> Callable[..., Memory] | None:
@@ -173,11 +155,8 @@ class Rollouts:
         return found
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "run", "kept", "reverse", "slopes", each " own" too, or "map"."""
+        """Compile the function of a name: "run" or "kept", each " own" too, or "map"."""
         memory, (what, _, own_tables) = self.place, name.partition(" ")
-        if what in ("reverse", "slopes"):
-            sizes = self.n_values, self.n_out, self.size
-            return reverse_function(*sizes, self.adjoint, width, bool(own_tables), what == "slopes")
         if name == "map":
             return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
@@ -262,12 +241,6 @@ class Rollouts:
             if save[row] <= n_finite[i]:
                 out[i, row:], n_finite[i] = np.nan, save[row] - 1
 
-    def step_rows(
-        self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
-    ) -> None:
-        """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
-        raise NotImplementedError
-
     def mapped(self, table: Any, y: np.ndarray, out: np.ndarray, steps: np.ndarray = START) -> None:
         """All columns of a table, applied to rows `y` (N, 2d) after steps (n,), one row after the other and again.
 
@@ -278,3 +251,17 @@ class Rollouts:
         entries, kinds = self.prepared(table)
         width = 1 if len(y) == 1 else self.lanes
         self.call("map", width, entries, kinds, len(kinds), steps, len(steps), y, len(y), out)
+
+
+class SplittingRollouts(Rollouts):
+    """The compiled functions of splitting schemes, whose tables are the numbers of kicks and drifts."""
+
+    @abstractmethod
+    def step_rows(
+        self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
+    ) -> None:
+        """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
+
+    def check_reverse(self) -> None:
+        """Raise a ValueError, with the reason, where stages have no compiled reverse: see `SplittingCode.adjoint`."""
+        raise ValueError("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")

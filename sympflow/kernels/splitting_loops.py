@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.reverse import Recorded
-    from sympflow.kernels.rollouts import Rollouts
+    from sympflow.kernels.rollouts import SplittingRollouts
     from sympflow.kernels.splittings import Splitting
     from sympflow.kernels.stage_times import Driving
 
@@ -86,7 +86,7 @@ class SplittingLoops:
         self._form: Any = system.form if symbols is system.symbols else symbols
         self._driving: Driving | TracedDriving | None = None
         self._written: Callable[..., Splitting] | None = None
-        self._compile: Callable[..., Rollouts]
+        self._compile: Callable[..., SplittingRollouts]
         self._longs: dict[int, bool] = {}
         self.abreast = 1.0
         self.driven = not system.autonomous
@@ -163,7 +163,7 @@ class SplittingLoops:
             )
         self._system: ref[HamiltonianSystem] | None = ref(system)  # which keeps these loops
         self._has_curvature = system.form is not None or system.local is not None
-        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], Rollouts] = {}
+        self._variants: dict[tuple[int, bool, Monomials, bool, Ranges | None], SplittingRollouts] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         """The attributes, with the ranges, for which the system would be asked."""
@@ -206,7 +206,7 @@ class SplittingLoops:
         monomials: Monomials = (),
         varied: bool = False,
         ranges: Ranges | None = None,
-    ) -> Rollouts:
+    ) -> SplittingRollouts:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
         Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
@@ -231,7 +231,7 @@ class SplittingLoops:
 
     def _made(
         self, level: int, compensated: bool, monomials: Monomials, varied: bool, ranges: Ranges | None
-    ) -> Rollouts:
+    ) -> SplittingRollouts:
         if not self.traced:
             return self._compile(level, compensated, monomials)
         if not varied and self._long(level):
@@ -381,15 +381,19 @@ class SplittingKernel(Kernel):
         self._functions().check_reverse()
 
     def recorded(self, task: Task) -> Recorded:
+        """`runs`, as a run of which cotangents can be pulled back: after `check_reverse`."""
         from sympflow.kernels.reverse import Recorded
 
         table, rows = self.table(task.h, task.t0), self._rows(task)
         work = table.shape[1] * self.loops.work / self.loops.abreast
-        return Recorded(self._functions(), table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
+        code: Any = self._functions()
+        return Recorded(code, table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
 
     def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of tensors, with `values` of the parameters, by tensor operations: after `check_reverse`."""
         rows = self.loops.rows(replace(step_table(self.scheme), more=None))[..., 0]
-        return self._functions().stepped(rows, y, h, t, values)
+        code: Any = self._functions()
+        return code.stepped(rows, y, h, t, values)
 
     def varied(self, values: np.ndarray) -> VariedKernel:
         """The loops of batches whose trajectories have these values (k, N) of `SplittingLoops.values`."""
@@ -399,7 +403,7 @@ class SplittingKernel(Kernel):
         """The states of a task as the loops read them, where they have more; a run that goes on reads none."""
         return None
 
-    def _functions(self) -> Rollouts:
+    def _functions(self) -> SplittingRollouts:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, ranges=self._ranges)
 
 
@@ -449,7 +453,7 @@ class VariedKernel(SplittingKernel):
         """The states of a batch with the values behind them."""
         return np.concatenate([y, np.tile(self._values, (len(y) // len(self._values), 1))], axis=1, dtype=np.float64)
 
-    def _functions(self) -> Rollouts:
+    def _functions(self) -> SplittingRollouts:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)
 
 

@@ -21,8 +21,8 @@ from sympflow.compiler.functions import FUNCTIONS, added, dot, times
 from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.kernels.rollouts import Columns, Rollouts
-from sympflow.kernels.runs import Numbers, step_function
+from sympflow.kernels.rollouts import Columns, SplittingRollouts
+from sympflow.kernels.runs import Numbers, reverse_function, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
@@ -372,7 +372,7 @@ def shared(key: Any, make: Callable[[], Any]) -> Any:
     return found
 
 
-class SplittingCode(Rollouts):
+class SplittingCode(SplittingRollouts):
     """The compiled functions of splitting schemes on one symbolic system.
 
     Parameters
@@ -458,35 +458,27 @@ class SplittingCode(Rollouts):
     # the reverse --------------------------------------------------------------------------------------------------
 
     @cached_property
-    def _plain(self) -> list[Stage]:
-        """The stages of each kind, to be differentiated."""
-        kinds = [kind for kind in self._kinds if isinstance(kind, Stage)]
-        if len(kinds) < len(self._kinds):
-            raise NotImplementedError("its kicks are no plain programs.")
-        return kinds
-
-    @cached_property
     def _adjoints(self) -> list[Program]:
-        """Of the stage of each kind: the state, the numbers of a column, the time if it counts, and the cotangents."""
+        """The reverse of the stage of each kind, of the state, a column, the time if it counts, and the cotangents."""
         if not self.timed:
-            return [adjoint(kind.plain) for kind in self._plain]
+            return [adjoint(kind.plain) for kind in self._kinds]
         names = [f"x_{i}" for i in range(self.n_values)], [f"number_{i}" for i in range(self.size)]
 
         def stage(body: Any, numbers: Sequence[Any]) -> list[Any]:
             state, given, time = numbers[: self.n_values], numbers[self.n_values : -1], numbers[-1]
             return body.plain(*state, *body.table(*self._lettered(time, given)))
 
-        return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._plain]
+        return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._kinds]
 
     def check_reverse(self) -> None:
-        try:
-            self._adjoints  # noqa: B018
-        except (NotImplementedError, AttributeError, TypeError) as error:
-            raise ValueError(f"`system` has stages without a compiled reverse: {error}") from error
+        if self._splitting.symbols.samples or not all(isinstance(kind, Stage) for kind in self._kinds):
+            super().check_reverse()
+        self._adjoints  # noqa: B018
 
     def adjoint(
         self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
     ) -> tuple[list[Value], list[Value]]:
+        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
         code, type = step.code, values[0].type
         zero = code.constant(0.0, type)
         found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
@@ -502,6 +494,7 @@ class SplittingCode(Rollouts):
         return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
     def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+        """From cotangents (m, size, …) of the numbers of columns to those of the numbers of a table (n, m, …)."""
         if self.timed:
             return slopes.swapaxes(0, 1)
         found = np.zeros((len(table), *np.delete(slopes.shape, 1)))
@@ -517,9 +510,13 @@ class SplittingCode(Rollouts):
 
     @cached_property
     def _of_tables(self) -> list[Program]:
-        return [adjoint(kind.table) for kind in self._plain]
+        return [adjoint(kind.table) for kind in self._kinds]
 
     def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
+        """A step of length h at t from tensors (..., 2d), by tensor operations.
+
+        `numbers` (n, m) are those of the columns of a step of length 1, `values` those of the parameters.
+        """
         import torch
 
         state = [*y.unbind(-1), *[torch.zeros_like(y[..., 0])] * (self.n_values - self.n_out)]
@@ -533,7 +530,7 @@ class SplittingCode(Rollouts):
                 )
             else:
                 given += values
-            state = self._plain[k].plain(*state, *self._plain[k].table(*given))
+            state = self._kinds[k].plain(*state, *self._kinds[k].table(*given))
         return torch.stack([x.expand(y.shape[:-1]) for x in state[: self.n_out]], dim=-1)
 
     @property
@@ -547,8 +544,11 @@ class SplittingCode(Rollouts):
         return last.body(*values, *last.table(*given))
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "step" and "step own" too."""
+        """Compile the function of a name: "step", "reverse" and "slopes", each " own" too."""
         what, _, own = name.partition(" ")
+        if what in ("reverse", "slopes"):
+            sizes = self.n_values, self.n_out, self.size
+            return reverse_function(*sizes, self.adjoint, width, bool(own), what == "slopes")
         if what != "step":
             return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]

@@ -7,6 +7,7 @@ hundred bodies. Those of a team run the same compiled code from the first step t
 from __future__ import annotations
 
 import os
+from abc import abstractmethod
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
@@ -17,7 +18,7 @@ import numpy as np
 
 from sympflow.compiler.control import INT, Type, Value
 from sympflow.compiler.machine import address
-from sympflow.kernels.rollouts import Columns, Rollouts
+from sympflow.kernels.rollouts import Columns, SplittingRollouts
 from sympflow.kernels.runs import BLOCK
 from sympflow.kernels.threads import NEVER, threads_for
 
@@ -115,7 +116,7 @@ class Member:
     others: Any = ()
 
 
-class SharedRollouts(Rollouts):
+class SharedRollouts(SplittingRollouts):
     """The compiled functions of systems of any size, whose states are in memory and which threads may share.
 
     Attributes
@@ -134,10 +135,10 @@ class SharedRollouts(Rollouts):
     pieces: int
     terms: int
 
+    @abstractmethod
     def members(self, meeting: np.ndarray, stop: np.ndarray, threads: int, block: int) -> Callable[[int], Member]:
         """The maker of the members of a team: by the numbers where it meets and what ends it, the threads, and the most
         steps between two looks for an interrupt."""
-        raise NotImplementedError
 
     def prepared(self, table: np.ndarray) -> Columns:
         """The columns of a table; their kinds tell the last of b, g and c that is not 0, from 1 on."""

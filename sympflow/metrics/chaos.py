@@ -10,7 +10,6 @@ References
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import as_float, check_counts, check_one_of, check_t_eval, floats
+from sympflow.arguments import as_float, check_counts, check_one_of, check_t_eval, floats, warn
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import FINISHED
@@ -318,7 +317,7 @@ def indicator(
     length = integrator.step_length(system) if integrator.on_grid else None
     told, jumps = landings(integrator, system, t0, t1, backend != "compiled")
     if told:
-        warnings.warn(told, RuntimeWarning, stacklevel=4)
+        warn(told, RuntimeWarning)
     if length is not None:
         grid = Grid(t0, t1, length)
         if grid.n_steps == 0:

@@ -69,10 +69,10 @@ def elements(solution: Solution | ArrayLike, system: HamiltonianSystem | None = 
         raise ValueError(f"`about` must be 'star' or 'jacobi'; got {about!r}.")
     frame = _frame(system)
     if about == "jacobi":
-        x, v, *_ = frame.into(y) if frame.jacobi else Frame(frame.local, frame.G, np.asarray(system.y0)).into(y)
+        frame = frame if frame.jacobi else Frame(frame.local, frame.G, np.asarray(system.y0))
+        x, v, *_ = frame.into(y)
         order = np.argsort(frame.bodies)
-        inside = frame.sums[1:] if not len(frame.test) else np.append(frame.sums[1:], frame.sums[frame.inside])
-        x, v, mu = x[..., order, :], v[..., order, :], frame.G * inside[order]
+        x, v, mu = x[..., order, :], v[..., order, :], frame.mu[order]
     else:
         q, u = frame.states(y)
         x, v = q[..., 1:, :] - q[..., :1, :], u[..., 1:, :] - u[..., :1, :]
@@ -145,7 +145,7 @@ def _bodies(solution: Any, system: HamiltonianSystem | None) -> tuple[np.ndarray
 
 
 def _states(solution: Any, system: HamiltonianSystem | None) -> tuple[np.ndarray, HamiltonianSystem, bool]:
-    """States (..., 2d), time first where they are those of a solution, the system, and whether they are."""
+    """States (..., 2d), the system, and True for a solution, whose time comes first."""
     if isinstance(solution, Solution):
         return np.moveaxis(to_numpy(solution.y), -1, 0), solution.system, True
     if not isinstance(system, HamiltonianSystem):
@@ -159,4 +159,10 @@ def _states(solution: Any, system: HamiltonianSystem | None) -> tuple[np.ndarray
 def _frame(system: HamiltonianSystem) -> Frame:
     if not isinstance(system, HamiltonianSystem):
         raise TypeError(f"`system` must be a HamiltonianSystem; got {type(system).__name__}.")
-    return frame_of("elements", system.name, system.local, system.y0)
+    frame = frame_of(system.local, system.y0)
+    if frame is None:
+        raise ValueError(
+            f"`system` {system.name!r} has no planets about a star, whose elements these are: make it by "
+            "HamiltonianSystem.planets."
+        )
+    return frame

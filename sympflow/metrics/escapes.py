@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import real_number
+from sympflow.arguments import real_number, warn
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import FINISHED, Problem
@@ -200,7 +199,7 @@ def escapes(orbits: Orbits, region: Outside, backend: str) -> tuple[np.ndarray, 
         )
     told, _ = landings(integrator, orbits.system, *orbits.t_span, able=False)
     if told:
-        warnings.warn(told, RuntimeWarning, stacklevel=3)
+        warn(told, RuntimeWarning)
     rows = orbits.rows
     most = max(1, MOST_VALUES // (WINDOW * rows.shape[1]))
     with naming_plugin(integrator):

@@ -1,7 +1,8 @@
-"""Dual numbers: their rates are the tangents of programs."""
+"""Dual numbers: their rates are the tangents of programs, and those that torch finds."""
 
 import numpy as np
 import pytest
+import torch
 
 from sympflow.compiler.dual import Dual
 from sympflow.compiler.functions import apply, fma, where
@@ -28,6 +29,8 @@ def test_rates_are_tangents(name):
     np.testing.assert_allclose(found.value, f(x, y), rtol=1e-14)
     np.testing.assert_allclose(found.rate, moved(x, y, dx, dy)[0], rtol=1e-13)
     np.testing.assert_allclose(f(Dual(x, dx), y).rate, moved(x, y, dx, 0.0 * y)[0], rtol=1e-13)
+    given = [tuple(map(torch.tensor, pair)) for pair in ((x, y), (dx, dy))]
+    np.testing.assert_allclose(found.rate, torch.func.jvp(f, *given)[1], rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", FORMULAS)

@@ -236,7 +236,11 @@ def test_a_potential_that_jumps_is_refused(name):
 
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_a_potential_with_kinks_stays(name):
-    HamiltonianSystem.from_sympy(CONTINUOUS[name])
+    system = HamiltonianSystem.from_sympy(CONTINUOUS[name])
+    H, states = sp.sympify(CONTINUOUS[name]), np.random.default_rng(0).normal(size=(5, 2 * system.ndof))
+    for y in states.tolist():
+        names = [f"{letter}{i + 1}" for letter in "qp" for i in range(system.ndof)] if system.ndof > 1 else ["q", "p"]
+        assert system.hamiltonian(np.array(y)) == pytest.approx(float(H.subs(dict(zip(names, y, strict=True)))))
 
 
 def test_jumps_of_lattices_pairs_and_parameters():
@@ -356,10 +360,12 @@ def test_a_method_keeps_its_order_at_jumps_or_warns(method, order, t_jump):
         assert [str(w.message)[:35] for w in told] == [said.format(method if t_jump == 1 else 1 / n)[:35]] * (
             order == 1
         )
-    if order == 1:
-        assert errors[1] > 1e-4
+    if order is None:
+        assert errors[1] < 1e-13
+    elif order == 1 and t_jump != 1:
+        assert errors[1] > 1e-4  # it depends on where in a step the jump lies
     else:
-        assert errors[1] < 1e-13 if order is None else math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.2)
+        assert math.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.15)
 
 
 LATE = HamiltonianSystem.from_sympy(

@@ -226,6 +226,14 @@ def test_bad_arguments(options, message):
         HamiltonianSystem.planets(given.pop("masses"), **given)
 
 
+def test_the_scene_of_planets():
+    given = {"elements": ELEMENTS, "G": GAUSS}
+    system = HamiltonianSystem.planets(MASSES, **given, name="giants", dt=None, t_span=(0, 9), domain=None)
+    assert (system.name, system.t_span, system.dt) == ("giants", (0.0, 9.0), system.local.frame.longest_step)
+    with pytest.raises(TypeError, match=r"^`damping` is no argument of this system, nor of its scene, name, domain"):
+        HamiltonianSystem.planets(MASSES, **given, damping=0.1)
+
+
 @pytest.mark.parametrize(
     ("system", "method", "options", "message"),
     [
@@ -308,7 +316,7 @@ def test_elements_of_solutions_and_back():
         (lambda: sympflow.elements(GIANTS.y0), TypeError, "`system` must be given"),
         (lambda: sympflow.elements(GIANTS.y0[:7], GIANTS), ValueError, "`solution` must be a Solution, or states"),
         (lambda: sympflow.elements(GIANTS.y0, GIANTS, about="sun"), ValueError, "`about` must be"),
-        (lambda: sympflow.elements(np.ones(4), systems.henon_heiles()), ValueError, "is for planets about a star"),
+        (lambda: sympflow.elements(np.ones(4), systems.henon_heiles()), ValueError, "^`system` .* no planets about"),
         (lambda: sympflow.momentum(np.ones(4), systems.henon_heiles()), ValueError, "has no bodies"),
         (lambda: sympflow.states_of_elements({"a": [1.0]}, GIANTS), ValueError, "`elements` must have a, e"),
     ],
