@@ -153,7 +153,7 @@ def check_counts(**values: Any) -> None:
     """Positive integers."""
     for name, value in values.items():
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"`{name}` must be a positive integer; got {value!r}.")
+            raise ValueError(f"`{name}` must be a positive integer; got {value!r}: give 1 or more.")
 
 
 def positive_numbers(name: str, values: Any) -> list[float]:
@@ -190,7 +190,7 @@ def as_float(value: Any) -> float:
 def check_positive(name: str, value: Any, most: float = sys.float_info.max) -> None:
     """Raise unless the argument `name` is a positive and finite real number."""
     if not (real_number(value) and 0 < value <= most):
-        raise ValueError(f"`{name}` must be positive and finite; got {value!r}.")
+        raise ValueError(f"`{name}` must be positive and finite; got {value!r}: give a number above 0.")
 
 
 def check_one_of(name: str, value: Any, known: Iterable[str]) -> None:

@@ -372,7 +372,7 @@ def _odd(n: Value) -> Value:
 
 
 def _circle(x: Value) -> list[Value]:
-    """sin x and cos x: of r, exchanged and negated as the quarter asks."""
+    """sin x and cos x: those of r, exchanged and negated by the quarter."""
     n, r, _ = _quarters(abs(x))
     z = r * r
     s, c = fma(r * z, _estrin(SIN, z), r), fma(z, _estrin(COS, z), 1.0)
@@ -382,7 +382,7 @@ def _circle(x: Value) -> list[Value]:
 
 
 def _circle_far(x: Value) -> Value:
-    """Both packed, of angles of which some are large."""
+    """Both packed, where some angles are large."""
     far, pairs = _is_far(x), zip(("sin", "cos"), _circle(x), strict=True)
     return x.code.pack([where(far, _by_library(x, name=name), y) for name, y in pairs])
 

@@ -22,7 +22,7 @@ class Number:
     __array_ufunc__ = None  # NumPy leaves the operators to this class
 
     def apply(self, name: str, args: Sequence[Any]) -> Any:
-        """Return the value of the function `name` of the table, of arguments one of which is this number."""
+        """Return the value of the function `name` of the table; this number is one of the arguments."""
         raise NotImplementedError
 
     def __add__(self, other: Any) -> Any:

@@ -16,7 +16,7 @@ __all__ = ["Program", "Traced", "adjoint", "derivatives", "fused", "gradient", "
 
 
 class Traced(Number):
-    """A number of which only its operation is known: of a recording, whose numbers it can be combined with."""
+    """A number that is known by its operation only; it can be combined with others of its recording."""
 
     __slots__ = ("args", "name", "order", "recording")
 

@@ -27,7 +27,7 @@ LARGEST_COFACTORS = 3  # of matrices; larger ones are eliminated
 
 
 class Untraceable(TypeError):
-    """The reason why a function is no program, a clause."""
+    """The reason why a function cannot be recorded, a clause."""
 
 
 BRANCH = "it branches on a value: write np.where(condition, a, b) in place of `if`, `min` and `max`"
@@ -99,44 +99,6 @@ class TracedArray(np.ndarray):
     def _of(self, result: Any) -> Any:
         return _wrapped(result, type(self))
 
-    # NumPy's methods that do not pass through the protocols
-
-    def sum(self, *args: Any, **options: Any) -> Any:
-        return self._called("sum", args, options)
-
-    def prod(self, *args: Any, **options: Any) -> Any:
-        return self._called("prod", args, options)
-
-    def mean(self, *args: Any, **options: Any) -> Any:
-        return self._called("mean", args, options)
-
-    def var(self, *args: Any, **options: Any) -> Any:
-        return self._called("var", args, options)
-
-    def std(self, *args: Any, **options: Any) -> Any:
-        return self._called("std", args, options)
-
-    def max(self, *args: Any, **options: Any) -> Any:
-        return self._called("max", args, options)
-
-    def min(self, *args: Any, **options: Any) -> Any:
-        return self._called("min", args, options)
-
-    def clip(self, *args: Any, **options: Any) -> Any:
-        return self._called("clip", args, options)
-
-    def dot(self, *args: Any, **options: Any) -> Any:
-        return self._called("dot", args, options)
-
-    def any(self, *args: Any, **options: Any) -> Any:
-        return self._called("any", args, options)
-
-    def all(self, *args: Any, **options: Any) -> Any:
-        return self._called("all", args, options)
-
-    def cumsum(self, *args: Any, **options: Any) -> Any:
-        return self._called("cumsum", args, options)
-
     def astype(self, *args: Any, **options: Any) -> Any:
         return self.copy()
 
@@ -150,11 +112,18 @@ class TracedArray(np.ndarray):
     @classmethod
     def __torch_function__(cls, function: Any, types: Any, args: Any = (), options: Any = None) -> Any:
         name = getattr(function, "__name__", str(function))
-        given = {_OF_NUMPY.get(key, key): _plain(x) for key, x in (options or {}).items() if key != "dtype"}
         rule = _torch_rule(name)
         if rule is None:
             raise Untraceable(f"torch.{name} has no rule")
-        return _wrapped(rule(*_plain(args), **given), TracedTensor)
+        return _by_rule(rule, args, options or {})
+
+
+def _method(name: str) -> Callable[..., Any]:
+    return lambda self, *args, **options: self._called(name, args, options)
+
+
+for _name in ("sum", "prod", "mean", "var", "std", "max", "min", "clip", "dot", "any", "all", "cumsum"):
+    setattr(TracedArray, _name, _method(_name))  # NumPy's own do not pass through the protocols
 
 
 class TracedTensor(TracedArray):
@@ -187,11 +156,7 @@ class TracedTensor(TracedArray):
         if rule is None:
             return super().__getattribute__(name)
 
-        def method(*args: Any, **options: Any) -> Any:
-            given = {_OF_NUMPY.get(key, key): _plain(x) for key, x in options.items() if key != "dtype"}
-            return _wrapped(rule(_raw(self), *_plain(args), **given), TracedTensor)
-
-        return method
+        return lambda *args, **options: _by_rule(rule, (self, *args), options)
 
     def detach(self) -> Any:
         raise Untraceable("it calls detach(), item() or numpy(), which cut derivatives off: leave these out")
@@ -201,6 +166,12 @@ class TracedTensor(TracedArray):
 
 _KEPT = {"shape", "ndim", "T", "flags", "dtype"}
 _OF_NUMPY = {"dim": "axis", "keepdim": "keepdims", "input": "x", "other": "y"}
+
+
+def _by_rule(rule: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any]) -> Any:
+    """The result of a function of torch."""
+    given = {_OF_NUMPY.get(key, key): _plain(x) for key, x in options.items() if key != "dtype"}
+    return _wrapped(rule(*_plain(args), **given), TracedTensor)
 
 
 def _torch() -> Any:
@@ -248,8 +219,7 @@ def _holds_traced(index: Any) -> bool:
 
 
 def _module(function: Any) -> str:
-    module = getattr(function, "__module__", None) or "numpy"
-    return f"{module}." if module != "numpy" or not isinstance(function, np.ufunc) else "numpy."
+    return f"{getattr(function, '__module__', None) or 'numpy'}."
 
 
 # functions of elements ---------------------------------------------------------------------------------------------

@@ -77,8 +77,6 @@ class Coefficients(FreeTable):
         The i of the c_i that are not always 0; the default is all.
     """
 
-    always, present = False, None  # of pickles of earlier versions, which did not have them
-
     def __init__(
         self,
         n: int,

@@ -153,7 +153,7 @@ ACTIVATIONS: dict[str, Activation] = {name: _Closed(name, *forms) for name, form
 
 
 class Register(Generic[T]):
-    """What files call by name: built-in, registered in this process, or announced by a plug-in."""
+    """Things that files name: built-in, registered in this process, or announced by a plug-in."""
 
     def __init__(self, kind: str, group: str, built_in: Mapping[str, T], checked: Callable[[str, Any], T]) -> None:
         self.kind, self.group, self.built_in, self.checked = kind, group, dict(built_in), checked

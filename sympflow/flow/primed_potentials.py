@@ -232,8 +232,6 @@ class PrimedPotential(Potential):
     Of a driven system, U_j(q, t), x is (d + 1, N), the positions and the times, and gradients are those by q.
     """
 
-    _passed: Factor | None = None  # of pickles of earlier versions, which did not have it
-
     def __init__(
         self,
         ndof: int,

@@ -52,7 +52,7 @@ class Refused(Exception):
 
 @dataclass
 class Provenance:
-    """What is known of a flow beside its map: its system, its domain, its figures, and where these hold.
+    """The facts about a flow beside its map: its system, its domain, its figures, and where these hold.
 
     Attributes
     ----------

@@ -490,17 +490,9 @@ class SympFlow(FlowMap):
             If this is no flow of networks of a driven system, or the system has other degrees of freedom, or a period
             where this one has none.
         """
-        drive = None if self.drive is None else Drive.of(system, self.drive.harmonics)
-        if (
-            drive is None
-            or self.drive is None
-            or system.autonomous
-            or (system.ndof, drive.size)
-            != (
-                self.ndof,
-                self.drive.size,
-            )
-        ):
+        mine = self.drive
+        drive = None if mine is None or system.autonomous else Drive.of(system, mine.harmonics)
+        if mine is None or drive is None or (system.ndof, drive.size) != (self.ndof, mine.size):
             raise ValueError(
                 f"`system` {system.name!r} must be driven, with {self.ndof} degrees of freedom and "
                 f"{'a' if self.period else 'no'} period, as that of the flow: train a new one by train(system)."
@@ -509,7 +501,7 @@ class SympFlow(FlowMap):
 
     def check_system(self, system: HamiltonianSystem) -> None:
         super().check_system(system)
-        own = system.autonomous is False and system.period == self.period
+        own = not system.autonomous and system.period == self.period
         if self.drive is not None and self.fingerprint is None and not own:
             raise ValueError(
                 f"`system` {system.name!r} has {'no drive' if system.autonomous else f'the period {system.period}'}, "

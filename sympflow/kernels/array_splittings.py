@@ -145,7 +145,7 @@ class Functions:
         self._called(room, 1, [q, v], out, d, letters)
 
     def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        raise NotImplementedError
+        raise NotImplementedError("Numba functions have no third derivative.")
 
     def _called(
         self, room: Room, which: int, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]

@@ -201,7 +201,7 @@ class _Reach:
         return self.code.select(self.code.apply("eq", (j, self.link)), self.one, j + 1)
 
     def _target(self, k: Value) -> Value:
-        """The time of output k, of the first one where there is no such."""
+        """The time of output k; behind the last, that of the first."""
         return self.code.load(self.targets, self.code.select(k < self.n_targets, k, self.zero))
 
     def _waits(self, saved: Value, lane: Value) -> Value:

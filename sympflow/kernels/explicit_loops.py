@@ -80,7 +80,7 @@ class Field:
         assert symbols is not None
         forces = getattr(force, "expressions", None)
         if force is not None and (forces is None or system.symbols is None):
-            raise ValueError("`system` has a force that is no formula, which is not compiled: use backend='array'.")
+            raise ValueError("`system` has a force by a function, which is not compiled: use backend='array'.")
         self.large = is_large(symbols) and force is None
         symbols = symbols if is_large(symbols) else symbols.parametric
         self.lettered = lettered(symbols, [symbols.H, *(forces or [])])

@@ -103,7 +103,7 @@ class KeplerCode(Rollouts):
                 self._light(room, turn, kick, drift, c[0]["star"])
 
     def _light(self, room: Room, g: Value, kick: Value, drift: Value, star: Value) -> None:
-        """The same of a group of bodies without mass, of which all have the same planets inside of their orbits."""
+        """The same of a group of bodies without mass, which have the same planets inside their orbits."""
         code, type, light = room.code, Type("double", LANES), len(self.light)
         place = code.at(room.state, (g + self.groups) * NUMBERS)
         x, v = ([code.load(place, LANES * (k + i), type) for i in range(AXES)] for k in (0, AXES))

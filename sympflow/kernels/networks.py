@@ -336,13 +336,14 @@ def _by_numba(function: Any) -> Any:
     """A function (n, a, values, slopes) of addresses."""
     try:
         from numba import carray, cfunc, njit, types
+        from numba.extending import is_jitted
     except ImportError as error:
         raise ValueError(
             "`compiled`, with which the activation of the flow was registered, has branches or calls functions, which "
             f"Numba compiles: {needed('numba', 'numba')}, or write it by operators."
         ) from error
 
-    compiled = function if hasattr(function, "py_func") else njit(error_model="numpy")(function)
+    compiled = function if is_jitted(function) else njit(error_model="numpy")(function)
     numbers = types.CPointer(types.float64)
 
     @cfunc(types.void(types.int64, numbers, numbers, numbers))

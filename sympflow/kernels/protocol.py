@@ -114,7 +114,7 @@ class Batch(NamedTuple):
 
     @classmethod
     def whole(cls, y0: np.ndarray, n_steps: int, save: np.ndarray, n_out: int) -> Batch:
-        """A run from its beginning, of which the end is not needed."""
+        """A run from its beginning, whose end is not kept."""
         out, n_finite = np.empty((len(y0), len(save), n_out)), np.empty(len(y0), dtype=np.int64)
         return cls(y0, n_steps, save, out, n_finite, 0, np.empty((len(y0), 0)))
 

@@ -410,7 +410,7 @@ class _Registers:
         return self.code.constant(every, INT)
 
     def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
-        """Read a state, of which the first numbers are given and the others are 0."""
+        """Read a state; numbers behind those that are given are 0."""
         given = self.n_values if given is None else given
         lanes = self._lanes if given + own == self.n_values else Lanes(self.code, given + own, self._lanes.width)
         x = lanes.loaded(rows, begin, n_rows)[:given]
@@ -650,7 +650,7 @@ def _state(
 
 
 def _no_stage(*_: Any) -> Any:
-    """The stage of a column of which the numbers alone are asked for."""
+    """The stage of a column that is read for its numbers only."""
 
 
 def groups(code: Code, n_rows: Value, width: int) -> Value:
@@ -714,7 +714,7 @@ class Lanes:
 
 
 class ColumnStage:
-    """The stage of a column, the numbers of which are those of all lanes, or one for each in tables of a length."""
+    """The stage of a column: all lanes have the same numbers, or each its own, in tables of a length."""
 
     def __init__(
         self,

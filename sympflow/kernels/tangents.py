@@ -148,7 +148,7 @@ def _vector_moved(
 
 
 def _place(i: int, j: int) -> int:
-    """The place of an entry of a symmetric matrix, of which the rows are known to the diagonal."""
+    """The place of an entry of a symmetric matrix, whose rows end at the diagonal."""
     return max(i, j) * (max(i, j) + 1) // 2 + min(i, j)
 
 

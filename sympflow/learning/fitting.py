@@ -17,7 +17,6 @@ from sympflow.learning.shooting import (
     Fit,
     Method,
     Problem,
-    Stop,
     chosen_method,
     first_states,
     matched,
@@ -26,6 +25,7 @@ from sympflow.learning.shooting import (
     steppers,
 )
 from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.training.least_squares import Stop, never
 
 FIRST_POINTS, SKETCH_POINTS = 10, 30  # of the pieces that a fit begins with, and that one of all terms has
 MATCHED_POINTS = 24  # of those whose increments give its start
@@ -91,7 +91,7 @@ class Setting:
 
     noise: np.ndarray | None = None
     huber: float | None = None
-    stop: Stop = lambda: False
+    stop: Stop = never
     seen: np.ndarray | None = None
     lag: float = 0.0
     rival: np.ndarray | None = None

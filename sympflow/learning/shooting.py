@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -30,7 +30,7 @@ from scipy.linalg import cho_factor, cho_solve
 from sympflow.learning.models import Forced, FreeField, Linear, Model, VectorField
 from sympflow.learning.trajectories import Run, Trajectories
 from sympflow.schemes import Scheme, scheme_named
-from sympflow.training.least_squares import Damping, LinearModel, descend
+from sympflow.training.least_squares import Damping, LinearModel, Stop, descend, never
 from sympflow.training.session import OutOfTime
 
 Field = Model | Forced | FreeField
@@ -42,8 +42,6 @@ TRIES = 12
 FINEST = 1e-13  # of an observation, relative to the spread of the coordinate
 SLOPE_POINTS = 10  # of a piece, that give a velocity which was not observed
 SOLVED = 1e-4  # of the error of a scheme, to which its equations are solved
-
-Stop = Callable[[], bool]
 
 
 # orbits with their derivatives ----------------------------------------------------------------------------------------
@@ -415,7 +413,7 @@ class Problem:
         return batches(self.data.runs, 2 * self.model.ndof + (0 if self.frozen else self.model.n))
 
     def _orbits(
-        self, batch: Batch, theta: np.ndarray, states: np.ndarray, derivatives: bool, stop: Stop = lambda: False
+        self, batch: Batch, theta: np.ndarray, states: np.ndarray, derivatives: bool, stop: Stop = never
     ) -> Iterator[tuple[int, np.ndarray, np.ndarray | None]]:
         """States and derivatives at each point of a batch, until the time is up."""
         m = 2 * self.model.ndof
@@ -443,7 +441,7 @@ class Problem:
         return 0.0 if self.frozen else float(np.sum((self.model.prior * theta) ** 2))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def cost(self, theta: np.ndarray, states: np.ndarray, stop: Stop = lambda: False) -> float:
+    def cost(self, theta: np.ndarray, states: np.ndarray, stop: Stop = never) -> float:
         """Σ ρ(r), and what numbers of an unlikely size cost; not finite where an orbit is not."""
         total = self._unlikely(theta)
         for batch in self.batches:
@@ -479,7 +477,7 @@ class Problem:
         return made
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-    def normal(self, theta: np.ndarray, states: np.ndarray, stop: Stop = lambda: False) -> Normal:
+    def normal(self, theta: np.ndarray, states: np.ndarray, stop: Stop = never) -> Normal:
         """The normal equations at a point, as far as its orbits are finite."""
         N, m, n = len(states), 2 * self.model.ndof, 0 if self.frozen else self.model.n
         made = Normal(np.zeros((N, m, m)), np.zeros((N, m, n)), np.zeros((n, n)), np.zeros((N, m)), np.zeros(n), 0.0)
@@ -620,7 +618,7 @@ def minimized(
     gain: float = 1e-3,
     patience: int = 3,
     damping: float = 1e-3,
-    stop: Stop = lambda: False,
+    stop: Stop = never,
 ) -> Fit:
     """Levenberg–Marquardt steps until `patience` of them together gain less than this share of the cost."""
     start = theta, states
@@ -679,12 +677,7 @@ class _Arrow(LinearModel):
 
 
 def chosen_method(
-    model: Field,
-    theta: np.ndarray,
-    data: Trajectories,
-    tolerance: np.ndarray,
-    halvings: int = 12,
-    stop: Stop = lambda: False,
+    model: Field, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray, halvings: int = 12, stop: Stop = never
 ) -> Method:
     """The cheapest scheme and step whose error over the gaps between points is below a tolerance (2d,).
 
@@ -744,12 +737,7 @@ def _ends(model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: 
 
 
 def matched(
-    model: Field,
-    theta: np.ndarray,
-    data: Trajectories,
-    weights: np.ndarray,
-    steps: int = 1,
-    stop: Stop = lambda: False,
+    model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1, stop: Stop = never
 ) -> np.ndarray:
     """θ by which the observed increments are the integrals of the field along the observed states, by least squares.
 

@@ -32,7 +32,7 @@ FRACTIONAL_TIMES = 50
 
 def train_clock(system: HamiltonianSystem, fit: ClockedFit, domain: Domain) -> ClockedFlow:
     """A flow with a trained clock for a separable system, with its record."""
-    dt, points, label_times, seed = 1.0 if fit.dt is None else fit.dt, fit.points or 1, fit.label_times, fit.seed
+    dt, points, label_times, seed = 1.0 if fit.dt is None else fit.dt, fit.points, fit.label_times, fit.seed
     scheme, terms = fit.scheme, fit.terms
     started, cpu = time.perf_counter(), time.process_time()
     shift = default_shift(system)

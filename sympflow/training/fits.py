@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import check_counts, check_positive, plain, real_number
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
@@ -42,23 +42,8 @@ WEIGHTS = ("residual_weight", "matching_weight", "label_weight")
 # checks ---------------------------------------------------------------------------------------------------------
 
 
-def check_counts(**values: Any) -> None:
-    """Positive integers, or None where a choice is left open."""
-    for name, given in values.items():
-        value = plain(given)
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-            raise ValueError(f"`{name}` must be a positive integer; got {value!r}: give 1 or more, or leave it out.")
-
-
-def check_positive(**values: Any) -> None:
-    """Positive finite numbers, or None where a choice is left open."""
-    for name, value in values.items():
-        if value is not None and not (real_number(value) and 0 < value < math.inf):
-            raise ValueError(f"`{name}` must be positive and finite; got {value!r}: leave it out for the default.")
-
-
 def check_weights(**weights: Any) -> None:
-    """Weights of the losses, of which some may be 0, but not all."""
+    """Weights of the losses: some may be 0, but not all."""
     for name, value in weights.items():
         if not (real_number(value) and 0 <= value < math.inf):
             raise ValueError(f"`{name}` must be finite and at least 0; got {value!r}: 0 leaves the loss out.")
@@ -79,7 +64,8 @@ class _Options:
     COUNTS: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
-        check_counts(**{name: getattr(self, name) for name in self.COUNTS})
+        left_open = {f.name for f in fields(self) if getattr(self, f.name) is None and "None" in f.type}  # type: ignore[arg-type]
+        check_counts(**{name: plain(getattr(self, name)) for name in self.COUNTS if name not in left_open})
 
     @classmethod
     def names(cls) -> list[str]:
@@ -124,7 +110,6 @@ class GaussNewton(_Options):
     name: ClassVar[str] = "gauss-newton"
     COUNTS: ClassVar[tuple[str, ...]] = ("steps", "restarts", "refresh", "validate_every", "checkpoint_every")
     POINTS: ClassVar[int] = 1500
-    STEPS: ClassVar[int] = 200
 
 
 @dataclass(frozen=True)
@@ -159,7 +144,9 @@ class Adam(_Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_of("schedule", self.schedule, SCHEDULES)
-        check_positive(learning_rate=self.learning_rate, clip=self.clip)
+        check_positive("learning_rate", self.learning_rate)
+        if self.clip is not None:
+            check_positive("clip", self.clip)
 
     def rate(self, step: int) -> float:
         """The learning rate of a step."""
@@ -241,6 +228,8 @@ class Fit(_Options):
     COUNTS: ClassVar[tuple[str, ...]] = ("points", "label_times", "reference_states")
     OF_FLOW: ClassVar[tuple[str, ...]] = ("dt",)
     """The options that describe the new flow."""
+    OPEN: ClassVar[dict[str, int]] = {}
+    """The numbers of a solver that leaves them open."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -253,7 +242,7 @@ class Fit(_Options):
     @property
     def of_a_given_flow(self) -> Self:
         """The same without what describes the new flow."""
-        described: Any = {f.name: f.default for f in fields(self) if f.name in self.OF_FLOW and f.name != "runs"}
+        described: Any = {f.name: f.default for f in fields(self) if f.name in self.OF_FLOW}
         return replace(self, **described)
 
     def flow(self, system: HamiltonianSystem, domain: Domain, earlier: FlowMap | None = None) -> Any:
@@ -268,9 +257,7 @@ class Fit(_Options):
     def record(self, solver: Solver) -> dict[str, Any]:
         """The record of a recipe and a checkpoint: what determines the trained numbers."""
         mine = {name: getattr(self, name) for name in self.names() if name not in (*self.OF_FLOW, "data", "loss")}
-        data = getattr(self, "data", None)
         mine |= {name: getattr(solver, name) for name in solver.names()}
-        mine |= {"data": None if data is None else _checksum(data)}
         found = {"optimizer": solver.name, "loss": self.losses, **mine}
         return {name: plain(value) for name, value in found.items() if value is not None}
 
@@ -287,6 +274,9 @@ class _LossFit(Fit):
     data: Data | None = field(default=None, repr=False, compare=False)
 
     COUNTS: ClassVar[tuple[str, ...]] = (*Fit.COUNTS, "matching_times")
+
+    def record(self, solver: Solver) -> dict[str, Any]:
+        return super().record(solver) | ({} if self.data is None else {"data": _checksum(self.data)})
 
     def _named(self, loss: Any) -> dict[str, Any]:
         """The weights of the losses that are named, 0 for those that are left out."""
@@ -363,11 +353,12 @@ class PrimedFit(_LossFit):
     kind: ClassVar[str] = "primed"
     COUNTS: ClassVar[tuple[str, ...]] = (*_LossFit.COUNTS, "loss_points", "runs")
     SHAPE: ClassVar[tuple[str, ...]] = ("curvature", "polynomial", "first", "scheme", "force_gradient")
-    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "stages", "processor", *SHAPE, "dtype", "device", "runs")
+    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "stages", "processor", *SHAPE, "dtype", "device")
+    OPEN: ClassVar[dict[str, int]] = {"restarts": 24, "steps": 1000}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(frozen_weight=self.frozen_weight)
+        check_positive("frozen_weight", self.frozen_weight)
         if not (real_number(self.energy_weight) and 0 <= self.energy_weight < math.inf):
             raise ValueError(
                 f"`energy_weight` must be finite and at least 0; got {self.energy_weight!r}: 0 leaves the energy out."
@@ -436,7 +427,7 @@ class SplitFit(Fit):
         See `Fit`.
     """
 
-    points: int | None = 150
+    points: int = 150
     label_times: int = 16
     turn: float = 10.0
     stages: int = 4
@@ -447,10 +438,12 @@ class SplitFit(Fit):
 
     kind: ClassVar[str] = "split"
     OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "turn", "stages", "terms", "force_gradient")
+    OPEN: ClassVar[dict[str, int]] = {"restarts": 8, "steps": 150}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(frozen_weight=self.frozen_weight, turn=self.turn)
+        check_positive("frozen_weight", self.frozen_weight)
+        check_positive("turn", self.turn)
         if self.loss not in (None, "labels"):
             raise ValueError(f"`loss` {self.loss!r} is not one that Gauss–Newton fits split flows by: use 'labels'.")
 
@@ -490,6 +483,7 @@ class LossFit(_LossFit):
 
     kind: ClassVar[str] = "losses"
     COUNTS: ClassVar[tuple[str, ...]] = (*_LossFit.COUNTS, "validation_points")
+    OPEN: ClassVar[dict[str, int]] = {"steps": 200}
 
     def resolved(self, solver: Solver, kind: str) -> LossFit:
         """The same with numbers for what is left open, of a flow of that kind."""
@@ -576,7 +570,7 @@ class ClockedFit(Fit):
         See `Fit`.
     """
 
-    points: int | None = 100
+    points: int = 100
     label_times: int = 12
     scheme: str = "leapfrog"
     terms: int = 10
@@ -593,13 +587,17 @@ KINDS: dict[str, type[Fit]] = {"primed": PrimedFit, "sympflow": NetworkFit, "mlp
 FITTED: tuple[tuple[type[FlowMap], type[Fit]], ...] = ((PrimedFlow, PrimedFit), (SplitFlow, SplitFit))
 """The fits of given flows by Gauss–Newton; any other flow is trained on losses."""
 
-DEFAULTS: dict[str, Any] = {
-    **{"residual_weight": 1.0, "matching_times": 10, "learning_rate": 5e-3, "schedule": "one-cycle", "clip": 1.0},
-    **{"seed": 0, "validation_points": 2000, "reference_states": 100},
+DEFAULTS: dict[str, Any] = {"residual_weight": 1.0} | {
+    f.name: f.default
+    for cls in (LossFit, Adam)
+    for f in fields(cls)
+    if f.name
+    in ("matching_times", "seed", "validation_points", "reference_states", "learning_rate", "schedule", "clip")
 }
 """Values that mean the same as a keyword that is left out, for every fit and solver."""
 
-OF_NETWORKS, OF_PRIMED = ("pairs", "hidden", "activation"), ("stages", "processor", *PrimedFit.SHAPE)
+OF_NETWORKS = tuple(n for n in NetworkFit.OF_FLOW if n not in (*PrimedFit.OF_FLOW, "baseline"))
+OF_PRIMED = tuple(n for n in PrimedFit.OF_FLOW if n not in NetworkFit.OF_FLOW)
 OF_SEARCHES = ("restarts", "frozen_weight", "energy_weight", "runs")
 
 

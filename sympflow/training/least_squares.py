@@ -39,6 +39,11 @@ STOPPED = "it was stopped"
 Stop = Callable[[], bool]
 
 
+def never() -> bool:
+    """Return False, of work that nothing stops."""
+    return False
+
+
 # one step ---------------------------------------------------------------------------------------------------------
 
 
@@ -150,7 +155,7 @@ def levenberg_marquardt(
     patience: int = 10,
     gain: float = 1e-2,
     damping: float = FIRST_DAMPING,
-    stop: Stop = lambda: False,
+    stop: Stop = never,
 ) -> Minimum:
     """Minimize ‖r(x)‖².
 

@@ -72,8 +72,7 @@ class LossRun(Run):
         solver: Resolved,
         deadline: Deadline | None = None,
     ) -> LossRun:
-        """A run of a flow with fresh points; labels are made where they have a weight and none are handed in."""
-        fit, solver = fit.resolved(solver, flow.kind), solver.but(steps=200)
+        """A run with fresh points, of a fit and a solver in which no choice is left open."""
         method = optimizer(flow, solver)
         _check_memory(flow, fit, solver)
         data: Labelled | None = fit.data

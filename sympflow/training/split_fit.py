@@ -60,7 +60,7 @@ class SplitRun(SearchRun):
     ) -> SplitRun:
         """A run of a flow that is bound to its system."""
         deadline = Session().deadline if deadline is None else deadline
-        solver = solver.but(restarts=8, steps=150)
+        solver = solver.but(**fit.OPEN)
         problem = SplitProblem(flow, system, domain, fit, solver, deadline)
         return cls(flow, system, domain, None, fit, solver, problem)
 
@@ -163,7 +163,7 @@ class SplitProblem:
         return unit
 
     def _joined(self, half: Callable[[Column, int], Any]) -> np.ndarray:
-        """What a function gives of each column and the length of its first half, one after another: (n,)."""
+        """The values of a function of each column and the length of its first half, one after another: (n,)."""
         return np.concatenate([np.broadcast_to(half(c, m := (c.n + 1) // 2), m) for c in self.columns])
 
     def units(self, t: float) -> np.ndarray:

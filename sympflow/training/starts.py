@@ -188,12 +188,11 @@ def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
 def _fastest_met(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
     """The fastest rate that the orbits of a few of the states meet while they cross these several times."""
     y, d = y[:: max(1, len(y) // ORBITS)][:ORBITS], system.ndof
-    time = 0.0
-    speeds = np.abs(system.vector_field(y, *(() if time is None else (np.zeros(len(y)),)))[:, :d])
+    speeds = np.abs(system.vector_field(y, np.zeros(len(y)))[:, :d])
     span = CROSSINGS * float(np.max(np.ptp(y[:, :d], axis=0) / np.maximum(np.median(speeds, axis=0), 1e-300)))
 
     def slope(t: float, x: np.ndarray) -> np.ndarray:
-        return np.asarray(system.vector_field(x) if time is None else system.vector_field(x, t))
+        return np.asarray(system.vector_field(x, t))
 
     met = []
     for start in y:

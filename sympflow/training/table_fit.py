@@ -124,7 +124,7 @@ class TableRun(SearchRun):
         deadline = Session().deadline if deadline is None else deadline
         fractions = FRACTIONAL_TIMES
         options: Resolved = fit.resolved
-        solver = solver.but(restarts=24, steps=1000)
+        solver = solver.but(**fit.OPEN)
         data: Any = options.data
         step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled=True)
         table = Table(flow)

@@ -107,9 +107,8 @@ def train(
         Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled. All counts: trials (at
         most two thirds of it), labels (at most 0.3 of what is left, each set), starts, fits, held-out figures. Where
         labels take longer the flow is returned as it was, and a warning says how far they came. Without a budget a new
-        primed flow has 60 seconds: enough in up to three degrees of freedom of a symbolic system, or there is a
-        warning; for others the search may take fewer starts, which the recipe records. With a budget such a system has
-        as many starts as two fifths of the time allow, up to 1000.
+        primed flow has 60 seconds, and a warning says where these were not enough. With a budget a symbolic system of
+        up to three degrees of freedom has as many starts as two fifths of the time allow, up to 1000.
     checkpoint : path, optional
         Write the state of the run there at intervals, atomically; of a primed flow after each start of the search, and
         first as soon as there is a run: of one that is killed in the trials nothing is kept.
@@ -166,6 +165,8 @@ def train(
     _refuse_unknown(options)
     system = _known_system(system, fit.data if isinstance(fit, LossFit | PrimedFit) else options.get("data"))
     start, budget = None, plain(budget)
+    if solver is not None and not isinstance(solver, Solver):
+        raise TypeError(f"`solver` must be GaussNewton(), Adam(), BFGS() or LBFGS(); got {solver!r}.")
     if budget is not None and "time_budget" in options:
         raise TypeError("`budget` and `time_budget` are the same limit: leave out one of them.")
     if budget is not None and not (real_number(budget) and 0 < budget < math.inf):
@@ -260,7 +261,7 @@ def _fitted(
         if session.resume is not None:
             run.load(session.resume)
         reason = run.go(session)
-    return run.finish(reason, expected=bought and not (by_default and compiled))
+    return run.finish(reason, expected=bought and not by_default)
 
 
 # arguments --------------------------------------------------------------------------------------------------------
@@ -314,13 +315,11 @@ def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     return domain
 
 
-def _solver_for(fit: Fit, solver: Any) -> Solver:
+def _solver_for(fit: Fit, solver: Solver | None) -> Solver:
     """The solver that is given, or the default of a fit."""
     searches = isinstance(fit, PrimedFit | SplitFit)
     if solver is None:
         return GaussNewton() if searches else Adam()
-    if not isinstance(solver, Solver):
-        raise TypeError(f"`solver` must be GaussNewton(), Adam(), BFGS() or LBFGS(); got {solver!r}.")
     if searches and not isinstance(solver, GaussNewton):
         raise TypeError(
             f"`solver` of {type(fit).__name__} is GaussNewton; for {type(solver).__name__} pass LossFit() with a flow, "
@@ -333,14 +332,12 @@ def _solver_for(fit: Fit, solver: Any) -> Solver:
 
 
 def _described(
-    system: HamiltonianSystem, fit: Any, solver: Any, flow: FlowMap | None, options: dict[str, Any]
+    system: HamiltonianSystem, fit: Any, solver: Solver | None, flow: FlowMap | None, options: dict[str, Any]
 ) -> tuple[Fit, Solver, PrimedFit | None]:
     """The fit, the solver and the primed flow to begin with that plain keywords describe."""
     if fit is not None:
         raise TypeError(f"`fit` must be a fit of sympflow.training, such as PrimedFit(); got {fit!r}: or Δt, a number.")
-    dt, by = options.get("dt"), options.pop("optimizer", None) if solver is None else getattr(solver, "name", solver)
-    if dt is not None and not (real_number(dt) and 0 < dt < math.inf):
-        raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
+    dt, by = options.get("dt"), options.pop("optimizer", None) if solver is None else solver.name
     searches = by in (None, GaussNewton.name)
     kind, of_flow = options.pop("kind", None), (*OF_PRIMED, *OF_NETWORKS, "dtype", "device")
     if flow is not None:
@@ -421,7 +418,7 @@ def _checked_kind(system: HamiltonianSystem, flow: FlowMap | None, fit: Fit) -> 
         raise TypeError(
             f"`fit` {type(fit).__name__} is not one of a given {type(flow).__name__}: pass LossFit(), or leave it out."
         )
-    for name in (name for name in fit.given() if name in fit.OF_FLOW and name != "runs"):
+    for name in (name for name in fit.given() if name in fit.OF_FLOW):
         raise ValueError(f"`{name}` describes a new flow, but `flow` is given: leave out one of them.")
     flow.check_system(system)
     if not flow.n_parameters:
@@ -475,17 +472,16 @@ def _run_of(
     runs: MadeRuns | None = None,
 ) -> Run:
     """The run of a copy of a flow, or of a new network if there is none."""
-    dtype = getattr(fit, "dtype", torch.float64) if flow is None else flow.dtype
+    dtype = (fit if flow is None else flow).dtype
     if isinstance(solver, GaussNewton) and dtype != torch.float64:
         raise TypeError("`optimizer` 'gauss-newton' fits flows in float64: leave out `dtype`, or use 'adam'.")
     if flow is not None:
         flow = copy.deepcopy(flow).bound(system)
         flow.certified = None  # of the numbers as they were
     dt = flow.dt if flow is not None else 1.0 if fit.dt is None else float(fit.dt)
-    labels = scaling = None
+    labels, scaling, solver = None, None, solver.but(**fit.OPEN)
     try:
         if isinstance(fit, SplitFit):
-            solver = solver.but(restarts=8, steps=150)
             return SplitRun.start(flow, system, domain, fit, solver, deadline)
         if fit.data is not None:
             labels = handed_in(fit.data, system, dt)
@@ -493,14 +489,14 @@ def _run_of(
             fit = replace(fit, data=labels)
         scaling = scaling_of(domain, dt, fit.seed)
         if isinstance(fit, PrimedFit):
-            fit, solver = fit.resolved, solver.but(restarts=24, steps=1000)
+            fit = fit.resolved
             run: Run = TableRun.start(flow, system, domain, scaling, fit, solver, tried, deadline, runs)
             if labels is not None and fit.losses == "labels":
                 run.unfitted = unlabelled(labels[0], dt)
             return run
         if isinstance(fit, NetworkFit):
             flow = fit.network(system, dt, scaling)
-        fit, solver = fit.resolved(solver, flow.kind), solver.but(steps=200)
+        fit = fit.resolved(solver, flow.kind)
         run = LossRun.start(flow.requires_grad_(True), system, domain, scaling, fit, solver, deadline)
         if not (fit.residual_weight or fit.matching_weight):
             made = dt * np.arange(1, fit.label_times + 1) / fit.label_times

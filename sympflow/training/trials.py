@@ -24,10 +24,7 @@ from sympflow.training.table_fit import TableRun
 PHASES = (PHASE, 1.25, 1.5)  # ω Δt of the flows that are tried
 STARTS, STEPS, FINAL_STEPS, POINTS = 6, 40, 160, 80  # of a trial's search, and what follows the best start
 ORBITS, LENGTH = 20, 256  # held-out orbits of a trial, and their steps
-FEWER, REFERENCE = (
-    32,
-    1e-10,
-)  # steps of orbits of which the energy changes, and the tolerance of the exact ones beside them
+FEWER, REFERENCE = 32, 1e-10  # steps of orbits whose energy changes, and the tolerance of the exact ones beside them
 SHAPES = (
     ("111", 9, 1.0),
     ("010", 6, 1.0),

@@ -187,6 +187,7 @@ def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
         (["train", "pendulum", "--out", "flow.pt"], "`--out` must end in .safetensors"),
         (["train", "pendulum", "--checkpoint", "."], "`--checkpoint` '.' is a folder"),
         (["train", "pendulum", "--resume", "none.pt"], "is not a file: pass the path that was given as `--checkpoint`"),
+        (["learn", "data.csv", "--observed", "p"], "`--observed` must be one of qp, qv, q; got 'p'"),
         (["solve"], "`system` is missing"),
         (["solve", "harmonic-oscillator:omega=1:omega=2"], "`omega` is given twice"),
         (["solve", "harmonic-oscillator", "--omega", "1", "--omega", "2"], "`--omega` is given twice"),
@@ -239,6 +240,25 @@ def test_train_makes_a_primed_flow_unless_told_otherwise(tmp_path):
     refused = run("train", "pendulum", *small, "--pairs", 2, "--out", path)
     assert refused.exit_code == 2
     assert "`--pairs` is not an option of flows of kind 'primed'" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("observed", "columns", "velocities"), [("qp", "q,p", False), ("qv", "q,v", True), ("q", "q", True)]
+)
+def test_learn_reads_what_was_observed(observed, columns, velocities, tmp_path, monkeypatch):
+    read = []
+
+    def learned(data, **options):
+        read.append(data)
+        raise ValueError("`data` was read.")
+
+    monkeypatch.setattr("sympflow.learning.learner.learn", learned)
+    rows = [",".join(map(str, (t, *np.arange(t, t + len(columns.split(",")))))) for t in range(5)]
+    (tmp_path / "data.csv").write_text("\n".join([f"t,{columns}", *rows]))
+    result = run("learn", tmp_path / "data.csv", "--observed", observed, "--out", tmp_path / "flow.safetensors")
+    assert "was read" in result.stderr
+    assert (read[0].velocities, read[0].ndof, read[0].n_points) == (velocities, 1, 5)
+    assert np.isnan(read[0].runs[0].y[1]).all() == (observed == "q")
 
 
 def test_flows_are_listed():

@@ -205,7 +205,7 @@ def pieces(monkeypatch):
 @pytest.mark.parametrize("shape", [270, 271, (40, 9), (9, 40), (9, 8, 5)])
 @pytest.mark.parametrize("boundary", ["periodic", "fixed", "free"])
 def test_pieces_and_threads_change_nothing(method, shape, boundary, pieces):
-    """What is computed of a site is the same in all lanes and pieces, to the bit."""
+    """The state of a site is the same in all lanes and pieces, to the bit."""
     values = np.random.default_rng(5).uniform(0.5, 1.5, shape)
     system = HamiltonianSystem.lattice(
         bond="r**2/2 + r**4/4", kinetic="m*p**2", shape=shape, boundary=boundary, params={"m": values}

@@ -569,14 +569,15 @@ def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatc
     assert all(torch.equal(v, resumed.state_dict()[k]) for k, v in whole.state_dict().items())
 
 
-def test_nothing_said_means_at_most_a_minute(monkeypatch):
+@pytest.mark.parametrize(("symbolic", "starts"), [(True, 72), (False, 24)])
+def test_nothing_said_means_at_most_a_minute(monkeypatch, clock, symbolic, starts):
     """A search that is out of time ends with what it has, says so in the recipe, and warns: it is another flow."""
-    monkeypatch.setattr("sympflow.training.trainer.BUDGET", 4.0)
-    monkeypatch.setattr("sympflow.kernels.table_loops.table_loops", lambda *_: None)  # slower
-    with pytest.warns(RuntimeWarning, match="of 72 starts because the time budget was used up"):
+    clock.costs_seconds(TableRun, "next_minimum", 10.0)
+    monkeypatch.setattr(trainer.trials, "can_try", lambda system: symbolic)
+    with pytest.warns(RuntimeWarning, match=f"after 3 of {starts} starts because the time budget was used up"):
         flow = train(PENDULUM, points=60, reference_states=20, progress=False)
     stage = flow.recipe["stages"][-1]
-    assert stage["restarts_taken"] < stage["restarts"] == 72
+    assert (stage["restarts_taken"], stage["restarts"]) == (3, starts)
     assert stage["ended_early"] == "the time budget was used up"
     assert flow.figures["one_step_error"] < 1e-3
     seen = {}
