@@ -233,9 +233,9 @@ def solve(
         )
     if search is not None:
         check_event_search(search, y_start, abs(t1 - t0))
-    problem = Problem(system, t0, t1, y_start, times, every, bool(dense_output), backend, search)
-    if not diagnose:
-        problem = replace(problem, diagnosed=False)
+    problem = Problem(
+        system, t0, t1, y_start, times, every, bool(dense_output), backend, search, diagnosed=bool(diagnose)
+    )
     if store is not None:
         from sympflow.storage.runs import RunStore
 

@@ -38,14 +38,14 @@ _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary
 class Composition(ABC, ArraySteps):
     """A scheme composed of the exact flows of the parts of one system.
 
+    A subclass may take options of its own: `parts`, `omega` or `corrector` of `Splitting`.
+
     Parameters
     ----------
     method : str
         The name of the method, for messages.
     scheme : Scheme
     system : HamiltonianSystem
-    parts : sequence of str, optional
-        Expressions that add up to H, for `SolvableParts`.
 
     Raises
     ------
@@ -72,9 +72,7 @@ class Composition(ABC, ArraySteps):
     takes_extended: ClassVar[bool] = False
     """True if the parts stay as they are with E, the momentum of the time, as one more momentum."""
 
-    def __init__(
-        self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
-    ) -> None:
+    def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem) -> None:
         self.method, self.scheme = method, scheme
 
     def check_system(self, dt: float) -> None:
@@ -138,9 +136,7 @@ class KineticPotential(Composition):
     takes_driving: ClassVar[bool] = True
     takes_extended: ClassVar[bool] = True
 
-    def __init__(
-        self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
-    ) -> None:
+    def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem) -> None:
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
             raise ValueError(
@@ -159,16 +155,16 @@ class KineticPotential(Composition):
             )
 
     def check_system(self, dt: float) -> None:
-        friction = self.system.friction
-        back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
-        if friction.largest * back * dt > MOST_GROWTH:
-            raise ValueError(
-                f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {friction.largest:.6g}: its "
-                f"drifts of {back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
-                f"exp({friction.largest * back * dt:.3g}). Use a `dt` of at most "
-                f"{MOST_GROWTH / (friction.largest * back):.3g}, or a scheme without such drifts, as 'verlet' or "
-                "'chin4c'."
-            )
+        if self.system.friction:
+            damping = self.system.friction.largest
+            back = -sum(s.one for s in self.scheme.substeps if s.kind == "drift" and s.one < 0)
+            if damping * back * dt > MOST_GROWTH:
+                raise ValueError(
+                    f"`dt` {dt:.6g} is too long for method {self.method!r} with a damping of {damping:.6g}: its "
+                    f"drifts of {back:.3g} of a step go back in time, where friction lets momenta grow by a factor "
+                    f"exp({damping * back * dt:.3g}). Use a `dt` of at most {MOST_GROWTH / (damping * back):.3g}, or "
+                    "a scheme without such drifts, as 'verlet' or 'chin4c'."
+                )
         if self.system.kinetic_timed:
             self.system.drift(np.zeros(self.system.ndof), 0.0, 0.0)
 
@@ -416,9 +412,7 @@ class LinearRest(ExactMaps):
 
     label: ClassVar[str] = "linear"
 
-    def __init__(
-        self, method: str, scheme: Scheme, system: HamiltonianSystem, parts: tuple[str, ...] | None = None
-    ) -> None:
+    def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem) -> None:
         super().__init__(method, scheme, system)
         from sympflow.hamiltonian.parts import linear_and_rest
 
@@ -557,16 +551,9 @@ class TwoCopies(SolvableParts):
     label = "copies"
     keeps = "the second copy of phase space"
 
-    def __init__(
-        self,
-        method: str,
-        scheme: Scheme,
-        system: HamiltonianSystem,
-        parts: tuple[str, ...] | None = None,
-        omega: float | None = None,
-    ) -> None:
+    def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem, omega: float | None = None) -> None:
         self.omega, self.ndof, self.scale = omega, system.ndof, natural_scale(system)
-        super().__init__(method, scheme, system, parts)
+        super().__init__(method, scheme, system)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
         known = _PARTS.setdefault(system, {})
@@ -604,14 +591,7 @@ class KeplerInteraction(Composition):
     doubts: ClassVar[bool] = True
     breakdown: ClassVar[Failure | None] = Failure.ENCOUNTER
 
-    def __init__(
-        self,
-        method: str,
-        scheme: Scheme,
-        system: HamiltonianSystem,
-        parts: tuple[str, ...] | None = None,
-        corrector: int | None = None,
-    ) -> None:
+    def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem, corrector: int | None = None) -> None:
         super().__init__(method, scheme, system)
         if scheme.level:
             raise ValueError(

@@ -53,8 +53,7 @@ _TOLD: WeakSet[Any] = WeakSet()
 
 def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> None:
     """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
-    system, status = problem.system, outcome.status
-    failed = status < 0 if isinstance(status, int) else bool(np.any(np.asarray(status) < 0))
+    system, failed = problem.system, _failed(outcome)
     looked = system.poles is not None or problem.letters is not None
     if not problem.diagnosed or not (failed or looked) or not readable(outcome.y):
         return
@@ -84,9 +83,8 @@ def diagnose(
     system, y0 = problem.system, problem.y0
     if not interrupted:
         diagnose_piece(outcome, integrator, problem, rows)
-    values, between, status = readable(outcome.y), system.between_impulses, outcome.status
-    failed = status < 0 if isinstance(status, int) else bool(np.any(np.asarray(status) < 0))
-    held = values and problem.store is None and not failed
+    values, between = readable(outcome.y), system.between_impulses
+    held = values and problem.store is None and not _failed(outcome)
     told = held and system.leaps and problem.letters is None and warn_of_leap(outcome, system, y0)
     if values and system.functions_given:
         told = system.check_functions_along(outcome.y) or told
@@ -98,6 +96,12 @@ def diagnose(
             warn_of_loss(outcome, integrator, system, y0)
     if held and not told and problem.diagnosed and rows is None:
         warn_of_long_steps(outcome, integrator, problem)
+
+
+def _failed(outcome: Outcome) -> bool:
+    """True if a trajectory has failed."""
+    status = outcome.status
+    return status < 0 if isinstance(status, int) else bool(np.any(np.asarray(status) < 0))
 
 
 class Passage(NamedTuple):
@@ -305,17 +309,15 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     """Warn of what a method doubts, and where the energy of a run with fixed steps is off by `TOO_LONG` of its size.
 
     H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
-    steps, which would take twice the time. Its size is the largest
-    of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
+    steps, which would take twice the time. Its size is the largest of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
     """
-    system, n = problem.system, len(outcome.t)
-    if isinstance(integrator, FixedStep) and (doubt := integrator.doubt(system)):
-        warn(doubt, RuntimeWarning)
-    if not isinstance(integrator, FixedStep) or integrator.trained or not system.keeps_energy:
+    if not isinstance(integrator, FixedStep):
         return
-    n_steps = outcome.stats.get("n_steps", 0)
+    system, n, n_steps = problem.system, len(outcome.t), outcome.stats.get("n_steps", 0)
+    if doubt := integrator.doubt(system):
+        warn(doubt, RuntimeWarning)
     seen = LOOKED_AT * (n_steps >= FEW_STEPS) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
-    if not n or not seen or problem.letters is not None or problem.system.between_impulses is not problem.system:
+    if not n or not seen or integrator.trained or not system.keeps_energy or system.between_impulses is not system:
         return
     width = 2 * system.ndof
     every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
@@ -338,7 +340,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
             size = 0.5 * np.abs(y * np.asarray(system.gradient(y))).sum(-1).max(0)
         except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
             return
-        off = np.max(change / np.maximum(size, system.energy_scale or 0.0), initial=0.0)
+        off = np.fmax.reduce(change / np.maximum(size, system.energy_scale or 0.0), axis=None)  # of a rest 0/0
     if TOO_LONG < off < np.inf:
         warn(
             f"`dt` {integrator.step_length(system):g} is too long for method {integrator.label!r}: the energy of the "
@@ -456,7 +458,7 @@ def _tail_states(
 def _end_of_solution(
     system: HamiltonianSystem, t: np.ndarray, y: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where solutions from y (n, 2d) at t (n,) to `end` become infinite, else NaN; which go on; which are open."""
+    """Times at which solutions from y (n, 2d) at t (n,) become infinite, or NaN; which reach `end`; which are open."""
     from scipy.integrate import DOP853
 
     A, B, E3, E5 = DOP853.A, DOP853.B, DOP853.E3, DOP853.E5

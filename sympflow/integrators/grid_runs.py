@@ -83,7 +83,7 @@ class GridRun:
             y = shorter_steps(stepper, grid, y, save if place is None else save[place], remainder)
         n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
         end = len(save) if n_steps == last else int(save.searchsorted(n_steps, "right"))
-        n_saved = end - int(save.searchsorted(0, "right") if end and save[0] <= 0 else 0)
+        n_saved = end - int(end > 0 and save[0] == 0)
         at_end = int(bool(extra.size) and extra[-1] == len(t) - 1 and t[-1] == grid.t1)
         outcome = Outcome(t, y, 0, finished(problem), self.stats(n_steps + at_end, n_steps, n_saved, int(extra.size)))
         if problem.dense_output:
@@ -151,10 +151,10 @@ class GridRun:
     def _placed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
         """Output times and their remainders, the counts whose states are to be saved, and where among these each is."""
         problem, grid = self.problem, self.grid
-        t = problem.t_eval
-        t, count, remainder = grid.outputs(t, problem.save_every)
-        save, position = (np.arange(grid.n_steps + 1), count) if problem.dense_output else distinct(count)
-        return t, remainder, save, position
+        t, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
+        if problem.dense_output:
+            return t, remainder, np.arange(grid.n_steps + 1), count
+        return t, remainder, *distinct(count)
 
     # events: the run in chunks of steps, each searched before the next is computed ----------------------------------
 
@@ -373,7 +373,7 @@ class StoredRun:
         self.earlier: dict[str, Any] = {}
         self.pieces: Pieces
         self.before: tuple[Any, ...] | None = None
-        """Where the window that is under way began; None between windows."""
+        """The beginning of the window that is under way; None between windows."""
 
     def outcome(self) -> Outcome:
         """Run up to the end, a failure or Ctrl-C."""

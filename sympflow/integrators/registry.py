@@ -91,11 +91,7 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
     if not isinstance(method, str):
         hint = " Make one of it by sympflow.splitting_method(scheme)." if isinstance(method, Scheme) else ""
         raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.{hint}")
-    if method in TRIPLES:
-        from sympflow.integrators.splitting import method_of_row
-
-        return method_of_row(method)
-    if method in CLASSES or method in UNLISTED:
+    if method in TRIPLES or method in CLASSES or method in UNLISTED:
         return _built_in(method)
     if method in TORCHDIFFEQ:
         from sympflow.integrators.torchdiffeq_methods import torchdiffeq_method
@@ -128,6 +124,10 @@ def _kinds() -> str:
 
 @cache
 def _built_in(method: str) -> type[Integrator]:
+    if method in TRIPLES:
+        from sympflow.integrators.splitting import method_of_row
+
+        return method_of_row(method)
     module, _, attribute = (CLASSES | UNLISTED)[method].partition(":")
     return getattr(whole_import(f"sympflow.integrators.{module}"), attribute)
 

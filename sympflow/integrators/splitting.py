@@ -244,8 +244,8 @@ class Splitting(FixedStep):
 
     def composed(self, system: HamiltonianSystem) -> Composition:
         """Return the scheme × the splitting on a system."""
-        more = {n: value for n in ("omega", "corrector") if (value := getattr(self, n)) is not None}
-        return SPLITTINGS[self.splitting](self.name, self.scheme, system, self.parts, **more)
+        options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
+        return SPLITTINGS[self.splitting](self.name, self.scheme, system, **options)
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
         """Return the method on its clock, where that is not the physical one."""

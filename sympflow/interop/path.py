@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -13,6 +12,7 @@ from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sympflow.arguments import warn
 from sympflow.arrays import differentiable, one_lane, readable, to_numpy, unfollowed, values_of_times
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
@@ -97,7 +97,7 @@ class Path:
             self.system.check_times(*span)
             told, _ = landings(self.integrator, self.system, *span, able=False)
             if told:
-                warnings.warn(told, RuntimeWarning, stacklevel=3)
+                warn(told, RuntimeWarning)
         Grid(0.0, math.copysign(far, self.h) or self.h, abs(self.h))  # refuses too many steps
         s = s.to(torch.float64)
         x = s.detach() / self.h

@@ -49,7 +49,7 @@ class Identified(Protocol):
 
 @dataclass
 class Known:
-    """The knowledge of a call.
+    """The identity of a call, by which a store knows it again.
 
     Attributes
     ----------

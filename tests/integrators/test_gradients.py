@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import CubicSpline
 
-from sympflow import HamiltonianSystem, solve
+from sympflow import Box, HamiltonianSystem, solve
 from sympflow.kernels import reverse
 
 CUBIC = HamiltonianSystem.from_sympy(
@@ -76,7 +77,7 @@ def test_gradients_by_parameters(system, method, params, run):
 
     tensors = {name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in params.items()}
     sol = solve(system, method, y0=y0, params=tensors, **run)
-    np.testing.assert_allclose(
+    np.testing.assert_allclose(  # numbers of the run in place of constants round otherwise
         sol.y.detach().numpy(), solve(system, method, y0=y0, params=params, **run).y, rtol=0, atol=1e-14
     )
     for name, gradient in zip(params, torch.autograd.grad(weighted(sol), list(tensors.values())), strict=True):
@@ -159,3 +160,40 @@ def test_parameters_to_which_no_gradient_flows(method, more, remedy):
     k = torch.tensor(1.0, requires_grad=True)
     with pytest.raises(ValueError, match=rf"^`params` has k.*{remedy}"):
         solve(CUBIC, method, (0, 1), start(CUBIC, ()), params={"k": k}, **more)
+
+
+def test_drives_by_samples_are_differentiated_by_arrays():
+    t = np.linspace(0, 2, 21)
+    system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - f*q", params={"f": CubicSpline(t, np.sin(t))})
+    y0, slopes = torch.tensor([1.0, 0.0], dtype=torch.float64, requires_grad=True), []
+    for each in (system, HamiltonianSystem.from_sympy("p**2/2 + q**2/2")):  # linear: the drive moves no derivative
+        sol = solve(each, "verlet", (0, 1), y0, dt=0.05)
+        slopes.append((sol.stats["backend"], torch.autograd.grad(sol.y[0, -1], y0)[0]))
+    (by_arrays, found), (_, expected) = slopes
+    assert by_arrays == "torch"
+    torch.testing.assert_close(found, expected, rtol=1e-13, atol=1e-14)
+    with pytest.raises(ValueError, match=r"without a reverse, which gradients need: use backend='array'"):
+        solve(system, "verlet", (0, 1), y0, dt=0.05, backend="compiled")
+
+
+@pytest.mark.parametrize("asked", [{"events": lambda t, y: y[0] - 0.05}, {"on_domain_exit": "stop"}])
+def test_outputs_have_the_same_gradients_with_events_and_up_to_a_stop(asked):
+    system = HamiltonianSystem.from_sympy("(p**2 + q**2)/2", domain=Box([-1, -0.35], [1, 1]))
+    found = []
+    for more in (asked, {}):
+        y = torch.tensor([0.3, 0.2], dtype=torch.float64, requires_grad=True)
+        sol = solve(system, "verlet", (0, 3), y, dt=0.07, **more)
+        n = len(found[0][0]) if found else len(sol.t)
+        found.append((sol.t[:n], torch.autograd.grad(sol.y[:, n // 2].sum() + sol.y[0, n - 1], y)[0]))
+    assert (n < len(sol.t)) == ("on_domain_exit" in asked)
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-14, atol=0)
+
+
+def test_dense_output_has_the_gradients_of_outputs():
+    found = []
+    for more in ({"dense_output": True}, {"t_eval": [1.234]}):
+        y = torch.tensor(start(CUBIC, ()), requires_grad=True)
+        sol = solve(CUBIC, "srkn6b", (0, 2), y, dt=0.1, **more)
+        state = sol.y[:, 0] if sol.sol is None else sol.sol(1.234)
+        found.append(torch.autograd.grad(state.sum(), y)[0])
+    torch.testing.assert_close(*found, rtol=1e-13, atol=0)

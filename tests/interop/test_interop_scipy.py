@@ -13,6 +13,8 @@ from sympflow.arrays import stack
 from sympflow.integrators.base import FixedStep
 from sympflow.interop.scipy import as_scipy
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long for method .euler.:RuntimeWarning")
+
 HH, OSCILLATOR, PENDULUM = systems.henon_heiles(), systems.harmonic_oscillator(), systems.pendulum()
 EPS = np.finfo(float).eps
 METHODS = [

@@ -10,6 +10,8 @@ from sympflow import SympFlow, available, get, solve, systems  # noqa: E402
 from sympflow.integrators.base import FixedStep  # noqa: E402
 from sympflow.interop.torchode import register, step_method  # noqa: E402
 
+pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long for method .euler.:RuntimeWarning")
+
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 EPS = np.finfo(float).eps
 
