@@ -907,7 +907,7 @@ def counting_view(system: HamiltonianSystem, count: Callable[[str, Array], None]
     """Return a view of the system that tells `count` of each evaluation of a force or a derivative of it."""
     view = copy.copy(system)
     vars(view).pop("between_impulses", None)  # the view itself, where there are none
-    view.__class__ = _counting_class(type(system))  # type: ignore[arg-type]
+    view.__class__ = _counting_class(type(system))
     view._original, view._count, view._inside = system, count, False  # type: ignore[attr-defined]
     return view
 
