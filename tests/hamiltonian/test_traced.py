@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import special
+from scipy.integrate import solve_ivp
 
 from sympflow import HamiltonianSystem, lyapunov, solve
 from sympflow.compiler.program import gradient
@@ -356,3 +357,16 @@ def test_a_given_gradient_is_optional_and_compared():
         backend
         == "numpy: `potential` could not be traced, for `gradient` is not exactly that of `potential`: leave it out"
     )
+
+
+def test_derivatives_that_are_not_in_the_table_are_refused_where_they_are_needed():
+    y0 = np.array([1.3, 0.1])
+    psi = HamiltonianSystem(lambda q: special.psi(q).sum(-1), ndof=1)
+    found = solve(psi, "kahan_li8", (0, 1), y0, dt=0.05)
+    exact = solve_ivp(lambda t, y: [y[1], -special.polygamma(1, y[0])], (0, 1), y0, method="DOP853", rtol=1e-13)
+    np.testing.assert_allclose(found.y[:, -1], exact.y[:, -1], atol=1e-10)
+    with pytest.raises(ValueError, match="`trigamma` has no derivative here: use a method with fewer"):
+        solve(psi, "omelyan4", (0, 1), y0, dt=0.05)
+    order = HamiltonianSystem(lambda q: special.jv(q, q).sum(-1), ndof=1)
+    with pytest.raises(ValueError, match="`jv` has no derivative by its order"):
+        solve(order, "verlet", (0, 1), y0, dt=0.05)

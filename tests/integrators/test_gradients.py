@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.interpolate import CubicSpline
 
 from sympflow import Box, HamiltonianSystem, solve
 from sympflow.kernels import reverse
@@ -159,6 +160,20 @@ def test_parameters_to_which_no_gradient_flows(method, more, remedy):
     k = torch.tensor(1.0, requires_grad=True)
     with pytest.raises(ValueError, match=rf"^`params` has k.*{remedy}"):
         solve(CUBIC, method, (0, 1), start(CUBIC, ()), params={"k": k}, **more)
+
+
+def test_drives_by_samples_are_differentiated_by_arrays():
+    t = np.linspace(0, 2, 21)
+    system = HamiltonianSystem.from_sympy("p**2/2 + q**2/2 - f*q", params={"f": CubicSpline(t, np.sin(t))})
+    y0, slopes = torch.tensor([1.0, 0.0], dtype=torch.float64, requires_grad=True), []
+    for each in (system, HamiltonianSystem.from_sympy("p**2/2 + q**2/2")):  # linear: the drive moves no derivative
+        sol = solve(each, "verlet", (0, 1), y0, dt=0.05)
+        slopes.append((sol.stats["backend"], torch.autograd.grad(sol.y[0, -1], y0)[0]))
+    (by_arrays, found), (_, expected) = slopes
+    assert by_arrays == "torch"
+    torch.testing.assert_close(found, expected, rtol=1e-13, atol=1e-14)
+    with pytest.raises(ValueError, match=r"without a reverse, which gradients need: use backend='array'"):
+        solve(system, "verlet", (0, 1), y0, dt=0.05, backend="compiled")
 
 
 @pytest.mark.parametrize("asked", [{"events": lambda t, y: y[0] - 0.05}, {"on_domain_exit": "stop"}])
