@@ -150,8 +150,8 @@ def solve(
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
         default is "warn" for trained flows, whose figures hold in Ω, and "ignore" for classical methods.
     diagnose : bool
-        Whether to find out, of a run that becomes non-finite, if the solution itself does, and when: a tenth of a
-        second or so.
+        True to look at the run when it is over: for places where H is infinite that it passed, for steps that are too
+        long, and, where it becomes non-finite, if the solution itself does, and when: a tenth of a second or so.
     progress : bool or callable
         True for a bar on stderr; or a function of the time that is done and the whole one, called a few times a second.
         A method that is not run in pieces, such as one of a library, tells its end only.

@@ -143,7 +143,7 @@ class Problem:
     store: RunStore | None = None
     """The store that takes the outputs, and from which the run goes on; the outcome then has none."""
     diagnosed: bool = True
-    """True to find out, after a run that becomes non-finite, if the solution itself does."""
+    """True to look at the run when it is over: see `diagnosis.diagnose`."""
 
 
 @dataclass

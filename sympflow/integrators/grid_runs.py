@@ -154,7 +154,7 @@ class GridRun:
         t, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
         if problem.dense_output:
             return t, remainder, np.arange(grid.n_steps + 1), count
-        return t, remainder, *distinct(count)
+        return t, remainder, *((count, None) if problem.t_eval is None else distinct(count))
 
     # events: the run in chunks of steps, each searched before the next is computed ----------------------------------
 

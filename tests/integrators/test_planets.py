@@ -54,7 +54,7 @@ def test_the_contract_of_integrators():
 @pytest.mark.parametrize("factor", [1, 100])
 @pytest.mark.parametrize(("method", "power"), [("wisdom_holman", 2), ("kepler_aba104", 4), ("kepler_aba864", 4)])
 def test_the_error_grows_with_the_step_and_the_masses(method, power, factor):
-    """Of leading order ε dt² (Wisdom and Holman 1991), ε² dt⁴ with the high powers of dt that ε goes with above."""
+    """The leading error is ε dt² (Wisdom and Holman 1991); of the others ε² dt⁴, beside ε with high powers of dt."""
     masses = [1.0, *(factor * 1e-2 * np.array(MASSES[1:]))]
     system = HamiltonianSystem.planets(masses, elements=ELEMENTS, G=GAUSS)
     errors = []
@@ -155,7 +155,7 @@ def test_a_batch_reports_those_that_met():
 
 @pytest.mark.filterwarnings("ignore:`dt` .* is long")
 def test_long_drifts_and_eccentric_orbits():
-    """Where the few corrections of the compiled drift do not do, the general solver does: as on arrays."""
+    """The few corrections of the compiled drift do not suffice there: the general solver takes over, as on arrays."""
     system = HamiltonianSystem.planets(
         [1.0, 1e-5, 1e-6], elements={"a": [1.0, 40.0], "e": [0.99, 0.9], "M": [3.0, 0.1]}
     )
@@ -185,7 +185,7 @@ def test_any_star_and_bodies_in_pairs_are_planets():
     assert np.abs(sol.energy_error()).max() < 1e-10
 
 
-def test_studies_and_ensembles(tmp_path):
+def test_studies_and_ensembles():
     report = compare(GIANTS, ["wisdom_holman", "srkn11b"], t_span=(0, 20_000.0))
     assert {row.status for row in report.rows} == {"ok"}
     y0 = GIANTS.y0 * np.linspace(1, 1.001, 5)[:, None]
