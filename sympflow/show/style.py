@@ -29,7 +29,7 @@ _STYLES = {
     "rk45": ("#009E73", "D"),
 }
 _OTHER_COLOURS = ("#E69F00", "#000000", "#7F3C8D", "#8C6D31", "#666666", "#A5AA99")
-_OTHER_MARKERS = ("P", "X", "*", "<", ">", "h")
+_OTHER_MARKERS = ("P", "X", "p", "<", ">", "h")
 TEXT = "#333333"
 LETTER_WIDTH = 0.55  # of a mean letter, in units of the font size
 LONGEST_LABEL, TWO_LINES = 2.6, 0.5  # width of a line of a legend, and height of two lines of it, in inches
