@@ -870,7 +870,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
         return Card(self.title, facts, formula=formula)
 
     def __dir__(self) -> list[str]:
-        return [*SHOWN_NAMES]
+        made_of_parts = {"lattice", "pairs", "planets", "schroedinger"}  # constructors, which a system has no use for
+        return [name for name in SHOWN_NAMES if name not in made_of_parts]
 
 
 def parameters_text(
