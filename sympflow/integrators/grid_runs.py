@@ -154,7 +154,8 @@ class GridRun:
         t, count, remainder = grid.outputs(problem.t_eval, problem.save_every)
         if problem.dense_output:
             return t, remainder, np.arange(grid.n_steps + 1), count
-        return t, remainder, *((count, None) if problem.t_eval is None else distinct(count))
+        once = problem.t_eval is None and not grid.remainder  # the step that is shorter begins at an output
+        return t, remainder, *((count, None) if once else distinct(count))
 
     # events: the run in chunks of steps, each searched before the next is computed ----------------------------------
 

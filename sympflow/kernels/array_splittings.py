@@ -208,6 +208,7 @@ class Sizes(NamedTuple):
     ndof: int
     parameters: tuple[Letter, ...]
     values: tuple[()] = ()
+    samples: tuple[()] = ()
 
 
 class Clock:
