@@ -554,7 +554,7 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
     first = int(np.argmin(finite[(slice(None), *np.argwhere(bad)[0])] if bad.ndim else finite))
     index = f" (trajectory {', '.join(map(str, np.argwhere(bad)[0].tolist()))})" if bad.ndim else ""
     outcome.message = (
-        f"The solution became non-finite before t = {outcome.t[first]:.17g}{index}. Start from a smaller state, or end "
+        f"The solution became non-finite before t = {outcome.t[first]:.15g}{index}. Start from a smaller state, or end "
         "`t_span` earlier."
     )
     outcome.status = np.where(bad, -1, outcome.status) if bad.ndim else -1

@@ -220,4 +220,4 @@ class Chunk:
         if not isinstance(self.integrator, FixedStep) or math.isnan(t):
             return message or Failure.NON_FINITE.value[0] + "."
         what, remedy = self.integrator.breakdown.value
-        return f"{what} after t = {t:.17g}. {remedy}, or end `t_span` earlier."
+        return f"{what} after t = {t:.15g}. {remedy}, or end `t_span` earlier."

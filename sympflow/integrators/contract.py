@@ -64,7 +64,7 @@ FINISHED = "The solver successfully reached the end of the integration interval.
 ENDED = "A termination event occurred."
 
 
-INTERRUPTED = "The run was interrupted after t = {t:.17g}; what was computed until then is kept."
+INTERRUPTED = "The run was interrupted after t = {t:.15g}; what was computed until then is kept."
 
 
 def interrupted(outcome: Outcome, t: float) -> Interrupted:
@@ -85,8 +85,8 @@ def finished(problem: Problem) -> str:
     if abs(last - problem.t1) <= 8 * math.ulp(problem.t1):
         return FINISHED
     return (
-        f"The run ended at t = {last:.17g}, the last time of `t_eval`, before the end of `t_span`, t = "
-        f"{problem.t1:.17g}: nothing later was asked for. To go on, add the end to `t_eval`."
+        f"The run ended at t = {last:.15g}, the last time of `t_eval`, before the end of `t_span`, t = "
+        f"{problem.t1:.15g}: nothing later was asked for. To go on, add the end to `t_eval`."
     )
 
 

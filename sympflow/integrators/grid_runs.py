@@ -43,7 +43,7 @@ COUNTED = ("force_evaluations", "hessian_evaluations", "curvature_evaluations", 
 """Statistics of which those of a run that goes on are added to the earlier ones, where it counts them itself."""
 DONE = ("saved", "within", "counted", "last")
 """Counts of a stored run: states that were saved, outputs within steps, the step of the last, and whether within it."""
-UNDER_WAY = "The run had reached t = {t:.17g}: make the same call with resume=True to go on."
+UNDER_WAY = "The run had reached t = {t:.15g}: make the same call with resume=True to go on."
 
 
 class GridRun:
@@ -273,7 +273,7 @@ class GridRun:
 
     def _failure(self, t: float, step: int) -> str:
         what, remedy = self.integrator.breakdown.value
-        return f"{what} after t = {t:.17g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
+        return f"{what} after t = {t:.15g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
 
     def report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
         """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there."""
@@ -298,7 +298,7 @@ class GridRun:
                 outcome.stats["failed_at"] = np.where(outcome.status < 0, times, np.nan)
                 outcome.message = (
                     f"{len(failed)} of {finite.size} trajectories failed, the first of them (index "
-                    f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. {what}. {remedy}."
+                    f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.15g}. {what}. {remedy}."
                 )
         elif finite < n_run or not ok.all():
             last = int(finite) if finite < n_run else int(grid.locate(outcome.t[~ok][:1])[0][0])
@@ -316,7 +316,7 @@ def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
     outcome.status = np.where(bad, -1, 0) if bad.ndim else -1
     outcome.stats["failed_at"] = float(outcome.t[int(np.argmin(ok.reshape(len(ok), -1).all(1)))])
     outcome.message = (
-        f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.17g}. {remedy}, or pass the "
+        f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.15g}. {remedy}, or pass the "
         "states as a batch, whose trajectories are told apart."
     )
 
