@@ -143,21 +143,10 @@ def run_states(
     start: np.ndarray | None = None,
     counts: bool = False,
 ) -> Run:
-    """A run of every row of a task by `rollout`, which is compiled, on as many threads as pay.
+    """A run of every row of a task by `rollout(batch)`, which is compiled, on as many threads as pay.
 
-    Parameters
-    ----------
-    rollout : callable
-        Fills some rows of a batch.
-    task : Task
-    width : int
-        K, the size of the running state.
-    work : float
-        About how many nanoseconds a step takes.
-    start : ndarray of shape (N, 2d + n), optional
-        The states with values of their own behind them.
-    counts : bool
-        True if stages count iterations.
+    The running state has `width` numbers, a step takes about `work` nanoseconds; `start` has the states with values of
+    their own behind them; `counts` if stages count iterations.
     """
     y0, save, carry, first = given(task.y0), given(task.save, np.int64), task.carry, 0
     N, before = len(y0), None
