@@ -300,17 +300,37 @@ class SplittingLoops:
         """
         y, x, h = given(y), given(x), given(h)
         functions = self.functions(table.level, False, monomials, varied, ranges)
-        if self.friction:  # whose numbers are no polynomials
-            own = table.valued(x, h).damped(self.friction)
-            values = [*np.tile(y[:, 2 * self.ndof :].T, len(table.drifts))] if varied else self.values
-            times = (np.tile(x, len(table.drifts)) for x in (h, np.broadcast_to(t, h.shape)))
-            takes = varied or self.takes_values(table.level, ranges)
-            rows = own.timed_rows(values, *times) if self.driven else own.with_constants(values if takes else ())
-            return functions.own_steps(rows, y[:, : 2 * self.ndof])
+        if self.friction:
+            return self._damped_rows(functions, table, x, h, y, np.broadcast_to(t, h.shape), varied)
         out = np.empty((len(y), 2 * self.ndof))
         t = given(np.broadcast_to(t, h.shape)) if self.driven else h
         rows = self.rows(table, varied=varied, ranges=ranges) if rows is None else rows
         functions.step_rows(rows, x, h, t, y, out)
+        return out
+
+    def _damped_rows(
+        self,
+        functions: SplittingRollouts,
+        table: StageTable,
+        x: np.ndarray,
+        h: np.ndarray,
+        y: np.ndarray,
+        t: np.ndarray,
+        varied: bool,
+    ) -> np.ndarray:
+        """`step_rows` with friction, whose numbers are no polynomials: by one table, or one of its own for each row."""
+        alike = not varied and (h == h[:1]).all() and (t == t[:1]).all()
+        rows = slice(0, 1 if alike else len(y))
+        own, m = table.valued(x[rows], h[rows]).damped(self.friction), len(table.drifts)
+        values: Sequence[Any] = [*np.tile(y[:, 2 * self.ndof :].T, m)] if varied else self.values
+        if self.driven:
+            numbers = own.timed_rows(values, np.tile(h[rows], m), np.tile(t[rows], m))
+        else:
+            numbers = own.with_constants(values if varied or self.takes_values(table.level) else ())
+        if not alike:
+            return functions.own_steps(numbers, y[:, : 2 * self.ndof])
+        out = np.empty_like(y)
+        functions.mapped(numbers, y, out)
         return out
 
 
