@@ -32,7 +32,7 @@ from sympflow.integrators.grid import Grid, Outputs, distinct
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper, shorter_steps
 from sympflow.integrators.windows import ARRAY_STEPS, MOST_SAVED, ONE, Pace, Pieces, Saved, first_window
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 if TYPE_CHECKING:
     from sympflow.storage.runs import Place, RunStore
@@ -98,7 +98,11 @@ class GridRun:
     def _in_windows(self, first: int, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, int]:
         """`Stepper.rollout` in windows: also the step that was reached, less than n_steps where Ctrl-C ended it."""
         problem, h = self.problem, self.grid.h
-        pieces, pace, saved = Pieces(self.stepper, problem, h, Carry()), Pace(first), Saved(len(save), problem.y0)
+        pieces, pace, saved = (
+            Pieces(self.stepper, problem, h, RunCheckpoint()),
+            Pace(first),
+            Saved(len(save), problem.y0),
+        )
         most = max(2, MOST_SAVED // math.prod(problem.y0.shape))
         k = row = 0
         try:
@@ -337,13 +341,20 @@ class GridSolution(DenseOutput):
             "grid": self.grid,
             "states": self.kept,
             "backend": stepper.backend,
-            "letters": stepper.problem.letters,
+            "parameter_values": stepper.problem.parameter_values,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         integrator, grid, states = state["integrator"], state["grid"], state["states"]
         backend = "auto" if state["backend"] == "compiled" else "array"
-        problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend, letters=state.get("letters"))
+        problem = Problem(
+            state["system"],
+            grid.t0,
+            grid.t1,
+            states[0],
+            backend=backend,
+            parameter_values=state.get("parameter_values"),
+        )
         GridSolution.__init__(self, integrator.stepper(problem), grid, states)
 
     def states(self, times: np.ndarray) -> Array:
@@ -415,12 +426,12 @@ class StoredRun:
 
     def _begin(self, place: Place | None, cut: bool) -> None:
         """Take up the run at a place; `cut` if the last output of the store was left out."""
-        carry, finite = Carry(), None
+        carry, finite = RunCheckpoint(), None
         if place is not None:
             self.state, self.failed = place.state, place.failed
             self.done = {name: place.counts[name] for name in DONE}
             if place.steps:
-                carry, finite = Carry(place.steps, place.running), place.finite
+                carry, finite = RunCheckpoint(place.steps, place.running), place.finite
             if cut:  # it was within a step
                 self.done["within"] -= self.done["last"]
             if self.stepper.counts_itself:

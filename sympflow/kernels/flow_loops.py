@@ -14,7 +14,7 @@ from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, Task, both_ways, run_states
+from sympflow.kernels.protocol import Kernel, Run, RunCheckpoint, Steps, Task, both_ways, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
 from sympflow.schemes import CURVATURE, Scheme
@@ -277,7 +277,7 @@ class CollocatedFlowKernel(Kernel):
     def runs(self, task: Task) -> Run:
         """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
         m, carry = self._steps, task.carry
-        inner = None if carry is None else Carry(m * carry.steps, carry.running, carry.spare)
+        inner = None if carry is None else RunCheckpoint(m * carry.steps, carry.running, carry.spare)
         asked = task._replace(h=task.h / m, n_steps=m * task.n_steps, save=m * np.asarray(task.save), carry=inner)
         states, n_finite, iterations = self._kernel.runs(asked)
         if carry is not None and inner is not None:

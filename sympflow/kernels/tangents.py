@@ -21,7 +21,7 @@ from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Carry, Task, run_states
+from sympflow.kernels.protocol import RunCheckpoint, Task, run_states
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import Shape, Splitting, SplittingCode, shared
@@ -270,7 +270,7 @@ class TangentKernel:
         table = self._loops.rows(run_table(self._scheme, h), h)
         width = self._width
 
-        def follow(looks: np.ndarray, rows: np.ndarray, carry: Carry) -> np.ndarray:
+        def follow(looks: np.ndarray, rows: np.ndarray, carry: RunCheckpoint) -> np.ndarray:
             """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
             work = table.shape[1] * self._code.n_out / 2
             task = Task(0.0, start[rows], int(looks[-1]), looks, carry, threads=threads)
@@ -300,7 +300,7 @@ class TangentKernel:
 
         size = max(64, AT_ONCE // (n * some))
         for first in range(0, N, size):
-            rows, carry = np.arange(first, min(first + size, N)), Carry()
+            rows, carry = np.arange(first, min(first + size, N)), RunCheckpoint()
             for i in range(0, len(looks), some):
                 ended = follow(looks[i : i + some], rows, carry)
                 if ended.any():
