@@ -644,14 +644,14 @@ class NumbaFunction:
     def _slope(self, *x: Array) -> Array:
         return NumbaFunction(self.functions, self.order + 1)(*self.times, *x)
 
-    def pulled(self, x: Sequence[Array], w: Array, wanted: Sequence[bool]) -> tuple[Array | None, ...]:
+    def vjp(self, x: Sequence[Array], w: Array, wanted: Sequence[bool]) -> tuple[Array | None, ...]:
         if self.order == 2:
             if wanted[0]:
                 raise _third_derivative()
             return None, self(*self.times, x[0], w)
         return (self._slope(x[0], w) if self.order else w[..., None] * self._slope(x[0]),)
 
-    def pushed(self, x: Sequence[Array], v: Sequence[Array | None]) -> Array:
+    def jvp(self, x: Sequence[Array], v: Sequence[Array | None]) -> Array:
         if self.order == 2:
             if v[0] is not None or v[1] is None:
                 raise _third_derivative()
