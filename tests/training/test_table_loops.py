@@ -26,6 +26,16 @@ CASES = {
         1,
         (),
     ),
+    "a traced function": (
+        HamiltonianSystem(lambda q: (q**4).sum(-1) / 4 + np.cos(q[..., 0]) * q[..., 1], ndof=2),
+        1,
+        (),
+    ),
+    "a traced function of t": (
+        HamiltonianSystem(lambda t, q: (1 + 0.3 * np.cos(t)) * np.cos(q[..., 0]), ndof=1, time="t"),
+        0,
+        (),
+    ),
 }
 
 
@@ -54,7 +64,8 @@ def test_errors_and_their_derivatives_are_those_of_arrays(fits):
     for arrays, compiled in (fits[:2], fits[2:]):
         (r, J), (r_compiled, J_compiled) = arrays.linearized(theta), compiled.linearized(theta)
         np.testing.assert_allclose(r_compiled, r, atol=1e-12 * np.abs(r).max(), rtol=0)
-        np.testing.assert_allclose(J_compiled, J, atol=1e-12 * np.abs(J).max(), rtol=0)
+        by_differences = 1e-7 * np.abs(J).max(0)
+        assert (np.abs(J_compiled - J) <= by_differences).all()
         assert not J[:, 2].any()
         assert not J_compiled[:, 2].any()
         np.testing.assert_allclose(compiled.residuals(theta), r_compiled, atol=1e-12)
