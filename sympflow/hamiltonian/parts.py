@@ -205,7 +205,7 @@ class ExactParts:
                 Y = Y + each_mode(m.gradient) * self.force_gradient(m.part, X, m.filters, *time)
         return X, Y
 
-    def pushed(
+    def jvp(
         self, maps: Sequence[SubFlow], x: tuple[Array, Array], w: tuple[Array, Array], t: Any = 0.0, h: Any = 0.0
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]] | None:
         """The modes (..., d) after the maps, and vectors (..., k, d) moved by the derivative of these.

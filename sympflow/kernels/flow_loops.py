@@ -14,7 +14,7 @@ from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, Task, run_states
+from sympflow.kernels.protocol import Kernel, Run, RunCheckpoint, Steps, Task, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
 from sympflow.schemes import CURVATURE, Scheme
@@ -36,17 +36,7 @@ ArrayStep = Callable[..., np.ndarray]
 
 
 class TableSource(Protocol):
-    """The numbers of a primed flow ψ̄ = χ ∘ K ∘ χ⁻¹, which do not change.
-
-    Attributes
-    ----------
-    level : int
-        The terms of its kicks: see `sympflow.schemes.Scheme.level`.
-    monomials
-        Of the polynomials of kicks, where they have them.
-    processed : bool
-        False if χ is the identity.
-    """
+    """The numbers of a primed flow ψ̄ = χ ∘ K ∘ χ⁻¹, which do not change; not `processed` if χ is the identity."""
 
     level: int
     monomials: Monomials
@@ -77,18 +67,7 @@ class PrimedFlowKernel(Kernel):
     """Compiled loops of a primed flow on its system, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
 
     A flow with a processor, ψ̄ = χ ∘ K ∘ χ⁻¹, starts a run by χ⁻¹, makes its steps by K, and applies χ to each output.
-
-    Parameters
-    ----------
-    tables : TableSource
-        The numbers of the flow.
-    system : HamiltonianSystem
-        The flow's, one that can be compiled.
-    compensated : bool
-        Sum with Kahan's compensation in runs.
-    step : callable, optional
-        ψ̄_h of rows y (N, 2d) by array operations, ``step(h, y, t)`` with h and the times t (N,): of a system with
-        friction, where the numbers of a step are no polynomials in h.
+    Where there is friction, `step(h, y, t)` is ψ̄_h of rows by array operations: its numbers are no polynomials in h.
     """
 
     def __init__(
@@ -232,16 +211,7 @@ class MapSource(Protocol):
 
 
 class SplitFlowKernel(Kernel):
-    """Compiled loops of a flow made of exact flows of parts, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
-
-    Parameters
-    ----------
-    maps : MapSource
-    parts : ExactParts
-        Of a system that can be compiled.
-    dt : float
-        Δt.
-    """
+    """Compiled loops of a flow made of exact flows of parts, for Δt = `dt`; a step h < 0 is the inverse of ψ̄_|h|."""
 
     def __init__(self, maps: MapSource, parts: ExactParts, dt: float) -> None:
         from sympflow.kernels.parts_loops import parts_loops
@@ -268,19 +238,10 @@ class SplitFlowKernel(Kernel):
 
 
 class ClockedFlowKernel(Kernel):
-    """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B].
+    """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B], of the transformed system.
 
-    B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept.
-
-    Parameters
-    ----------
-    scheme : Scheme
-    system : HamiltonianSystem
-        The transformed one, one that can be compiled.
-    advance : callable
-        By how much the clock puts the time forward in steps s at B, ``advance(s, B)``, numbers or arrays.
-    numbers : callable
-        The numbers of the clock, those that it has now: see `reach_times`.
+    B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept:
+    ``advance(s, B)`` of steps s. The `numbers` are those that the clock has now: see `reach_times`.
     """
 
     saves_finite = False
@@ -333,16 +294,7 @@ class ClockedFlowKernel(Kernel):
 
 
 class CollocatedFlowKernel(Kernel):
-    """Compiled loops of a flow of equal steps of a Gauss method, a `Kernel`.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        Symbolic.
-    tableau : Tableau
-    steps : int
-        Steps of the method in one of the flow.
-    """
+    """Compiled loops of a flow of so many equal `steps` of a Gauss method, a `Kernel`."""
 
     saves_finite = False
 
@@ -354,7 +306,7 @@ class CollocatedFlowKernel(Kernel):
     def runs(self, task: Task) -> Run:
         """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
         m, carry = self._steps, task.carry
-        inner = None if carry is None else Carry(m * carry.steps, carry.running, carry.spare)
+        inner = None if carry is None else RunCheckpoint(m * carry.steps, carry.running, carry.spare)
         asked = task._replace(h=task.h / m, n_steps=m * task.n_steps, save=m * np.asarray(task.save), carry=inner)
         states, n_finite, iterations = self._kernel.runs(asked)
         if carry is not None and inner is not None:

@@ -68,17 +68,7 @@ class NetworkLayer:
 class MLPFlowKernel(Kernel):
     """Compiled loops of one SympFlow with the weights given, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
 
-    Parameters
-    ----------
-    ndof : int
-        d.
-    layers : sequence of NetworkLayer
-        In their order, with potentials of one depth and one activation; steps |h| are at most Δt.
-
-    Raises
-    ------
-    ValueError
-        If depths or activations differ, or there is no compiled form of the activation.
+    Layers are in their order, with potentials of one depth and one activation, else there is a ValueError; |h| ≤ Δt.
     """
 
     saves_finite = False

@@ -32,12 +32,7 @@ if TYPE_CHECKING:
 def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> SplittingLoops:
     """The compiled loops of splitting schemes on a separable system, made once per system.
 
-    With `names` the values of `SplittingLoops` are those of these parameters.
-
-    Raises
-    ------
-    ValueError
-        If the system cannot be compiled, with the reason.
+    With `names` the values of `SplittingLoops` are those of these parameters. A ValueError says why there are none.
     """
     known = _LOOPS.get(system)
     if known is None:
@@ -170,21 +165,7 @@ class SplittingLoops:
         return vars(self) | {"_ranges": self._ranges, "_system": None}
 
     def kernel(self, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None) -> SplittingKernel:
-        """The loops of one scheme.
-
-        Parameters
-        ----------
-        scheme : Scheme
-        compensated : bool
-            Sum with Kahan's compensation, which lowers the growth of round-off, in runs.
-        ranges
-            Of positions: see `functions`.
-
-        Raises
-        ------
-        ValueError
-            If a function in H has no compiled form.
-        """
+        """The loops of one scheme, with Kahan's `compensated` sums; for `ranges` of positions see `functions`."""
         kernel = SplittingKernel(self, scheme, compensated, ranges)
         kernel._functions()  # so that what has no compiled form is refused here, and not by a run
         return kernel
@@ -210,11 +191,6 @@ class SplittingLoops:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
         Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
-
-        Raises
-        ------
-        ValueError
-            If the system has no such kicks.
         """
         variant = (level, compensated, monomials, varied, ranges)
         if variant not in self._variants:
@@ -324,24 +300,9 @@ class SplittingLoops:
     ) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
-        Parameters
-        ----------
-        table : StageTable
-            For h = 1, as coefficients (m, K) of polynomials: the kicks of row i are Σ_k kicks[:, k] x[i]^k. In a batch
-            K is 1 or at least 3.
-        x : ndarray of shape (N,)
-        h : ndarray of shape (N,)
-        y : ndarray of shape (N, 2d)
-        monomials
-            Of the polynomials, where kicks have them.
-        t : float or ndarray of shape (N,)
-            When the steps of a driven system begin.
-        varied : bool
-            True if the values of its parameters follow each state in its row.
-        ranges
-            Of positions: see `functions`.
-        rows : ndarray, optional
-            `rows` of the table, where the caller keeps them.
+        These are, for h = 1, polynomials Σ_k table[:, k] x[i]^k; in a batch K is 1 or at least 3. The steps of a driven
+        system begin at t. If `varied`, the values of its parameters follow each state in its row. `rows` are those of
+        the table, where the caller keeps them.
         """
         y = given(y)
         out = np.empty((len(y), 2 * self.ndof))

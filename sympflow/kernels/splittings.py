@@ -42,22 +42,11 @@ EARLY = -4  # when momenta are known before the positions, in cycles
 
 @dataclass(frozen=True)
 class Splitting:
-    """The kicks and drifts of one system, of a level, with what else they have.
+    """The kicks and drifts of one separable system, of a level, with what else they have.
 
-    Attributes
-    ----------
-    symbols : SymbolicHamiltonian
-        Separable; its parameters are numbers of a table.
-    level, monomials
-        Of the kicks: see `sympflow.schemes.Scheme`.
-    compensated : bool
-        True if states have the errors of compensated sums.
-    friction : int, optional
-        Dimensions of Γ.
-    driving : Driving, optional
-        Of `symbols` with letters for what depends on the time.
-    ranges
-        Intervals of one position in which kicks are polynomials, equal but for rounding; its values are then in V.
+    States may have the errors of compensated sums; `friction` are the dimensions of Γ; of a driven system `symbols`
+    have letters for what depends on the time. In `ranges` of one position kicks are polynomials, equal but for
+    rounding; the values of parameters are then in V, else numbers of a table.
     """
 
     symbols: SymbolicHamiltonian | TracedHamiltonian
@@ -281,14 +270,7 @@ class NearShape(Shape):
 
 
 class WithinRange:
-    """A stage in two ways: as a polynomial for positions in a range, exact for others; the same for all lanes.
-
-    Attributes
-    ----------
-    near : Stage
-    table : callable
-        From the constants of a run to the numbers that both read.
-    """
+    """A stage in two ways: as a polynomial for positions in a range, exact for others; the same for all lanes."""
 
     def __init__(self, near: Stage, exact: Stage, low: float, high: float) -> None:
         self.near, self._exact, self._low, self._high = near, exact, low, high
@@ -373,14 +355,7 @@ def shared(key: Any, make: Callable[[], Any]) -> Any:
 
 
 class SplittingCode(SplittingRollouts):
-    """The compiled functions of splitting schemes on one symbolic system.
-
-    Parameters
-    ----------
-    splitting : Splitting
-    chunked : bool, optional
-        See `Rollouts`; by default where stages are not polynomials.
-    """
+    """The compiled functions of splitting schemes on one system; `chunked` by default if no polynomials."""
 
     def __init__(self, splitting: Splitting, chunked: bool | None = None) -> None:
         self._splitting = splitting

@@ -163,14 +163,9 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
 
 @dataclass(frozen=True)
 class Kick:
-    """A kind of kick.
+    """A kind of kick: its `numbers`, the rows 1, 2, … of a table, and the `powers` of the step with which they grow.
 
-    Attributes
-    ----------
-    numbers : tuple of str
-        Its numbers, the rows 1, 2, … of a table. A kick applies where the last one is not 0, else one with fewer.
-    powers : tuple of int
-        The powers of the step length with which they grow.
+    A kick applies where the last one is not 0, else one with fewer.
     """
 
     numbers: tuple[str, ...]
@@ -194,12 +189,7 @@ MOST_COUPLED = 6
 
 
 def check_damping(system: HamiltonianSystem, in_memory: bool) -> None:
-    """Refuse a damping matrix that compiled loops do not take.
-
-    Raises
-    ------
-    ValueError
-    """
+    """Refuse a damping matrix that compiled loops do not take, by a ValueError."""
     if system.damping is not None and system.damping.ndim == 2 and (in_memory or system.ndof > MOST_COUPLED):
         raise ValueError(
             f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "

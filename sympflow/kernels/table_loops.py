@@ -40,27 +40,10 @@ BLOCKS = 2048  # of lanes, some milliseconds, between two looks at the clock
 
 
 class TableLoops:
-    """The compiled errors of labels for one system, one sequence of maps and one kind of kicks.
+    """The compiled errors of labels for one system, a sequence of `kicks` (True) and drifts, and one kind of kicks.
 
-    Parameters
-    ----------
-    symbols : SymbolicHamiltonian or TracedHamiltonian
-        Separable, with T = ½ pᵀM⁻¹p; its values of parameters are those of the loops.
-    kicks : sequence of bool
-        The sequence: True for a kick, False for a drift.
-    level, monomials
-        Of the kicks: see `sympflow.schemes.Scheme.level`.
-    friction : Friction, optional
-
-    Attributes
-    ----------
-    drifts : ndarray of int
-        Where the numbers of drifts stand among those of all stages.
-
-    Raises
-    ------
-    ValueError
-        If a function in H has no counterpart in compiled code, or the code would be too long.
+    The system is separable, with T = ½ pᵀM⁻¹p. `drifts` tells where their numbers stand among those of all stages. A
+    ValueError if a function in H has no counterpart in compiled code, or the code would be too long.
     """
 
     def __init__(

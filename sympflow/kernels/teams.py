@@ -33,13 +33,7 @@ _I32 = Type("i32")
 
 
 class Team:
-    """So many threads.
-
-    Parameters
-    ----------
-    threads : int
-        One, where threads cannot leave a core.
-    """
+    """So many threads; one, where threads cannot leave a core."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads if os.name == "posix" else 1
@@ -117,16 +111,9 @@ class Member:
 
 
 class SharedRollouts(SplittingRollouts):
-    """The compiled functions of systems of any size, whose states are in memory and which threads may share.
+    """Rollouts of systems of any size, whose states are in memory and which threads may share.
 
-    Attributes
-    ----------
-    work : int
-        About how many nanoseconds a stage takes.
-    pieces : int
-        Most threads that it is worth to share.
-    terms : int
-        Numbers of a kick.
+    A stage takes about `work` nanoseconds, it is worth `pieces` threads at most, a kick has so many `terms`.
     """
 
     lanes = 1

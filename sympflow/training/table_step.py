@@ -179,7 +179,7 @@ class TableStep:
         return self._closed(q, p), self._closed(by_q, by_p)
 
     def _changes(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        """The terms of a kick and their derivatives along directions v (k, D, P), by Jacobians where D is less than k."""
+        """The terms of a kick and their derivatives along directions v (k, D, P), by Jacobians if k > D."""
         if len(v) <= len(q):
             return self._forces.along(q, v)
         forces, slopes = self._forces.along(q, np.broadcast_to(np.eye(len(q))[..., None], (len(q), *q.shape)))

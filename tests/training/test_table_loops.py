@@ -32,7 +32,7 @@ CASES = {
         (),
     ),
     "a traced function of t": (
-        HamiltonianSystem(lambda t, q: (1 + 0.3 * np.cos(t)) * np.cos(q[..., 0]), ndof=1, time="t"),
+        HamiltonianSystem(lambda t, q: (1 + 0.3 * np.cos(t)) * np.cos(q[..., 0]), ndof=1, time=True),
         0,
         (),
     ),
