@@ -16,6 +16,16 @@ PLAIN = HamiltonianSystem.from_sympy(
     "p1**2/2 + p2**2 + p1*p2/5 + exp(q1)*cos(q2) + a*q1**2*q2**2 + tanh(q2)", params={"a": 0.7}
 )
 DRIVEN = "p**2/2 - cos(q)*(1 + a*cos(w*t))", {"time": "t", "params": {"a": 0.3, "w": 1.7}, "period": 2 * np.pi / 1.7}
+
+
+def by_arrays(q):
+    return (q**4).sum(-1) / 4 + np.cos(q[..., 0]) * q[..., 1]
+
+
+def in_time(t, q):
+    return (1 + 0.3 * np.cos(t)) * np.cos(q[..., 0])
+
+
 CASES = {
     "curvature": (PLAIN, 2, ()),
     "polynomial": (PLAIN, 3, ((2, 0), (1, 1), (0, 4))),
@@ -26,16 +36,8 @@ CASES = {
         1,
         (),
     ),
-    "a traced function": (
-        HamiltonianSystem(lambda q: (q**4).sum(-1) / 4 + np.cos(q[..., 0]) * q[..., 1], ndof=2),
-        1,
-        (),
-    ),
-    "a traced function of t": (
-        HamiltonianSystem(lambda t, q: (1 + 0.3 * np.cos(t)) * np.cos(q[..., 0]), ndof=1, time=True),
-        0,
-        (),
-    ),
+    "a traced function": (HamiltonianSystem(by_arrays, ndof=2), 1, ()),
+    "a traced function of t": (HamiltonianSystem(in_time, ndof=1, time=True), 0, ()),
 }
 
 
