@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import inf
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ class Definition:
 
     ndof: int
     separable: bool
+    symbols: Any = None  # the definition itself, if it is a SymbolicHamiltonian
     numba_functions: tuple[Any, Any, Any] | None = None  # V, gradient, hessian_vector
     differentiates_itself: bool = False  # by torch alone, in which the functions are written
     has_hessian_vector: bool = True  # of arrays: not where a gradient was given without it
@@ -65,7 +67,7 @@ class Definition:
     def check_unchanged(self) -> None:
         """Raise a ValueError if a function has another value than when it was traced."""
 
-    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
+    def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
 
     def learns(self, y: Array) -> bool:

@@ -244,9 +244,7 @@ def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
             continue
     if symbols is None:
         return None
-    system = Hamiltonian("", symbols, None, False)
-    system.symbols = symbols
-    return system if system.ndof == ndof else None
+    return Hamiltonian("", symbols, None, False) if symbols.ndof == ndof else None
 
 
 def _spread_states(system: Hamiltonian, domain: Domain, seed: int) -> np.ndarray:

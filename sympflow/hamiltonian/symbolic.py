@@ -226,6 +226,10 @@ class SymbolicHamiltonian(Definition):
         return [*letters.found, *letters.numbers], letters.replaced
 
     @property
+    def symbols(self) -> SymbolicHamiltonian:
+        return self
+
+    @property
     def timed(self) -> bool:  # type: ignore[override]
         return self.time is not None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -171,7 +172,7 @@ class _Logarithmic(Definition):
         self.ndof, self._system, self._c = system.ndof + 1, system, c
         self.given = system.functions_given
 
-    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
+    def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
         self._system.check_functions(projected(as_like(states[:n_given], like)) if n_given else None)
 
     def kinetic(self, P: Array) -> Array:

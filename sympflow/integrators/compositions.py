@@ -141,7 +141,7 @@ class KineticPotential(Composition):
         if not system.separable:
             raise ValueError(
                 f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
-                f"{system.instead}."
+                f"{system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
