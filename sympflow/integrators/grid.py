@@ -147,12 +147,11 @@ class Outputs:
         if self.t_eval is not None:
             return self.t_eval[first:end], self.count[first:end], self.remainder[first:end]
         grid = self.grid
-        count = np.arange(first, end, dtype=np.int64) * self.every
-        if end == self.n and end > first:
-            count[-1] = grid.n_steps
-        t, remainder = grid.t0 + count * grid.h, np.zeros(len(count))
-        if end == self.n and end > first and grid.n_steps + bool(grid.remainder):
-            t[-1], remainder[-1] = grid.t1, grid.remainder
+        count = np.arange(first * self.every, end * self.every, self.every)
+        t, remainder = grid.t0 + count * grid.h, np.zeros(end - first)
+        if first < end == self.n:
+            count[-1], remainder[-1] = grid.n_steps, grid.remainder
+            t[-1] = grid.t1 if grid.n_steps or grid.remainder else grid.t0
         return t, count, remainder
 
     def counts(self, n: int, last: int) -> tuple[int, int]:

@@ -356,7 +356,7 @@ class MemoryRun(GridRun):
             t, remainder, place = t[:n], remainder[:n], None if place is None else place[:n]
         saved = self.saved if last == self.last else self.saved[: len(save)]
         y = saved if place is None else saved[place]
-        within = bool(remainder.any())
+        within = (problem.t_eval is not None or grid.remainder) and bool(remainder.any())
         if within:
             y = shorter_steps(stepper, grid, y, save if place is None else save[place], remainder)
         n_steps = min(last, int(finite.max() if finite.ndim else finite) + 1)
