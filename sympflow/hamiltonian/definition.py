@@ -53,6 +53,8 @@ class Definition:
         True if bodies may meet, over which a step may leap: then there is `leapt`.
     form : TracedHamiltonian or None
         The program of functions that could be traced: see `sympflow.hamiltonian.formulas`.
+    layered : LayeredPotential or None
+        V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`.
     given_functions : bool
         True if H is given by functions of Python, which are traced where that is possible.
     untraced : str
@@ -77,6 +79,7 @@ class Definition:
     impulses: tuple[Any, ...] = ()
     poles: Poles | None = None
     form: Any = None
+    layered: Any = None
     untraced: str = ""
     given_functions: bool = False
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"

@@ -99,8 +99,8 @@ class Recorded:
         if self._n_steps == 0:
             self.states[i] = self._y0[i, None, : code.n_out]
 
-    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The cotangents of the states and, of use with `slopes` only, of the numbers of the table.
+    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The cotangents of the states and, of use with `slopes` only, of the numbers of the table, and of weights.
 
         Parameters
         ----------
@@ -110,35 +110,41 @@ class Recorded:
         -------
         of_states : ndarray of shape (N, 2d)
         of_table : ndarray of shape (n, m), with tables of their own (n, m, N)
+        of_weights : ndarray
+            See `SplittingRollouts.summed`.
         """
         code, table = self._code, self._table
         of_states = np.zeros((len(self._y0), code.n_values))
         good = self.n_finite >= self._n_steps
         found = np.zeros((table.shape[1], code.size, len(good) if slopes else 0))
 
+        sums: dict[int, np.ndarray] = {}
+
         def piece(i: slice, stop: np.ndarray) -> None:
-            of_states[i], lanes = self._pulled(i, cotangents[i], slopes, stop)
+            of_states[i], lanes, sums[i.start] = self._pulled(i, cotangents[i], slopes, stop)
             found[..., i] = lanes
 
         if self._n_steps and good.any():
             self._each(piece)
+        of_weights = np.sum([sums[k] for k in sorted(sums)], axis=0) if sums else code.summed(code.prepared(table)[1])
         of_states = of_states[:, : code.n_out]
         if n := int(self._save.searchsorted(0, "right")):
             of_states += cotangents[:, :n].sum(1)
         of_table = np.zeros((len(table), table.shape[1], *[len(good)] * self._own))
-        if slopes:
+        if slopes and not of_weights.size:
             found[..., ~good] = 0.0
             of_table += code.pulled(self._full_table(), found if self._own else found.sum(-1))
         for k in () if good.all() else np.flatnonzero(~good).tolist():  # up to the last output that is finite
             m = int(self._save.searchsorted(self.n_finite[k], "right"))
             end = int(self._save[m - 1]) if m else 0
             alone = Recorded(code, table, self._y0[k : k + 1], end, self._save[:m], self._work)
-            of_states[k : k + 1], more = alone.pulled(cotangents[k : k + 1, :m], slopes)
+            of_states[k : k + 1], more, of_alone = alone.pulled(cotangents[k : k + 1, :m], slopes)
+            of_weights = of_weights + of_alone
             if self._own:
                 of_table[..., k] += more[..., 0]
             else:
                 of_table += more
-        return of_states, of_table
+        return of_states, of_table, of_weights
 
     def _full_table(self) -> np.ndarray:
         """The table, with the own values of all rows (n, m, N)."""
@@ -149,8 +155,8 @@ class Recorded:
         table[len(table) - len(values) :] = values[:, None]
         return table
 
-    def _pulled(self, i: slice, given: np.ndarray, slopes: bool, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pull cotangents of the outputs of some rows back to their first states, and those of columns (m, size, n)."""
+    def _pulled(self, i: slice, given: np.ndarray, slopes: bool, stop: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Pull cotangents of the outputs of some rows back to their first states, columns (m, size, n), and weights."""
         code, table, n = self._code, self._table, i.stop - i.start
         width, y0 = self._width(n), self._y0[i]
         own = " own" if self._own else ""
@@ -178,6 +184,7 @@ class Recorded:
             arguments = entries, kinds, len(kinds) - 2, kept, rows, n, first, to, later, count, outputs, found
             code.call(name, width, *arguments)
         if not slopes:
-            return rows, np.zeros(0)
+            return rows, np.zeros(0), code.summed(kinds)
         lanes = found.reshape(groups, len(kinds), code.size, width)
-        return rows, lanes.transpose(1, 2, 0, 3).reshape(len(kinds), code.size, groups * width)[..., :n]
+        of_columns = lanes.transpose(1, 2, 0, 3).reshape(len(kinds), code.size, groups * width)[..., :n]
+        return rows, of_columns, code.summed(kinds)

@@ -262,6 +262,10 @@ class SplittingRollouts(Rollouts):
     ) -> None:
         """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
 
+    def summed(self, kinds: np.ndarray) -> np.ndarray:
+        """The sums over trajectories that a reverse of columns of these kinds left, such as derivatives by weights."""
+        return np.zeros(0)
+
     def check_reverse(self) -> None:
         """Raise a ValueError, with the reason, where stages have no compiled reverse: see `SplittingCode.adjoint`."""
         raise ValueError("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
