@@ -121,12 +121,15 @@ def _pulled(
     function: Callable[..., Tensor], inputs: Sequence[Tensor], wanted: Sequence[bool], cotangents: Tensor
 ) -> list[Tensor | None]:
     """The cotangents of those inputs that are wanted, with a graph of their own where one is asked for."""
-    gate = _Gate()
+    gate, again = _Gate(), torch.is_grad_enabled()
     with torch.enable_grad():
-        inputs = [x if x.is_leaf else _Gated.apply(x, gate) for x in inputs]
+        if again:
+            inputs = [x if x.is_leaf else _Gated.apply(x, gate) for x in inputs]
+        else:
+            inputs = [x if x.is_leaf else x.detach().requires_grad_() for x in inputs]
         y = function(*inputs)
     some = [x for x, asked in zip(inputs, wanted, strict=True) if asked]
-    found = iter(torch.autograd.grad(y, some, cotangents, create_graph=torch.is_grad_enabled(), allow_unused=True))
+    found = iter(torch.autograd.grad(y, some, cotangents, create_graph=again, allow_unused=True))
     gate.open = True
     return [next(found) if asked else None for asked in wanted]
 

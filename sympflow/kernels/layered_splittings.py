@@ -29,7 +29,7 @@ from sympflow.kernels.runs import Numbers, reverse_function, step_function
 __all__ = ["LayeredCode"]
 
 SIDE = 4  # lanes of a sum over trajectories
-AT_ONCE = 4  # sums that are made together, with so many columns the fewer
+AT_ONCE = 4  # sums that are made together, of one column
 
 
 class LayeredCode(SplittingRollouts):
@@ -40,7 +40,7 @@ class LayeredCode(SplittingRollouts):
     potential : LayeredPotential
     """
 
-    lanes = 8
+    lanes = 16
     size = 2
 
     def __init__(self, potential: LayeredPotential) -> None:
