@@ -662,9 +662,13 @@ class _Layer(NamedTuple):
 def _linear_layer(x: Any, weight: Any, bias: Any = None) -> np.ndarray:
     numbers = _raw(x) if isinstance(x, TracedArray) else _objects(x)
     recording = next((n.recording for n in numbers.flat if isinstance(n, Traced)), None)
-    layers = getattr(recording, "layers", None)
+    layers = recording.layers if isinstance(recording, _Recorded) else None
     tensors = [w for w in (weight, bias) if w is not None]
-    if layers is None or not all(is_tensor(w) and w.is_leaf and w.device.type == "cpu" for w in tensors):
+    if (
+        recording is None
+        or layers is None
+        or not all(is_tensor(w) and w.is_leaf and w.device.type == "cpu" for w in tensors)
+    ):
         raise Untraceable(WEIGHTS)
     if numbers.ndim != 1:
         raise Untraceable("a linear layer of a matrix has no rule")
@@ -697,7 +701,8 @@ class Chain(NamedTuple):
 def trace_chain(function: Callable[..., Any], names: Sequence[str]) -> Chain:
     """Record a function of a tensor with linear layers, whose weights may change: see `trace`."""
     recording = _Recorded()
-    recording.layers = layers = []
+    layers: list[_Layer] = []
+    recording.layers = layers
     inputs, value = _recorded(recording, function, [names], True)
     if not layers:
         raise Untraceable(WEIGHTS)

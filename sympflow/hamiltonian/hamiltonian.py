@@ -589,8 +589,7 @@ class Hamiltonian:
 
     @property
     def layered(self) -> LayeredPotential | None:
-        """The potential as a chain of linear layers whose weights torch follows, of functions that are one; else None.
-        """
+        """V as a chain of linear layers whose weights torch follows, of functions that are one; else None."""
         return self._definition.layered
 
     @property

@@ -117,7 +117,7 @@ class Stepper:
     @property
     def followed(self) -> Sequence[Any]:
         """The tensors besides y0 to which gradients of compiled loops flow: parameters, or weights in H."""
-        return [*self.problem.followed.values()] or self.kernel.tensors
+        return [*self.problem.followed.values()] or (() if self.kernel is None else self.kernel.tensors)
 
     @property
     def counts_itself(self) -> bool:

@@ -146,10 +146,10 @@ class _Layers:
             yield self.code.constant(n - n % size, INT), n % size
 
     def _products(
-        self, l: int, columns: Sequence[Value], then: Callable[[Any, list[Value]], None], back: bool = False
+        self, k: int, columns: Sequence[Value], then: Callable[[Any, list[Value]], None], back: bool = False
     ) -> None:
         """`then(i, totals)` of W x, or Wᵀ x, of each column; with b in the first one of W x."""
-        (come, go), (start, bias) = self.sizes[l], self.potential.starts[l]
+        (come, go), (start, bias) = self.sizes[k], self.potential.starts[k]
         n, m = (go, come) if back else (come, go)
         zero = self.code.constant(0.0, self.type)
         for first, count in self._blocks(m, AT_ONCE // len(columns)):
@@ -161,7 +161,7 @@ class _Layers:
                 x = [self._get(column, j) for column in columns]
                 places = [j * come + first + r if back else (first + r) * come + j for r in range(count)]
                 W = [self._weight(i + start) for i in places]
-                return [fma(W[k % count], x[k // count], total) for k, total in enumerate(totals)]
+                return [fma(W[i % count], x[i // count], total) for i, total in enumerate(totals)]
 
             totals = self.code.loop(n, totals, more)
             for r in range(count):
@@ -176,29 +176,29 @@ class _Layers:
         x = self._room(self.sizes[0][0])
         self._put(potential.first(*q), x)
         slopes = []
-        for l, (_, go) in enumerate(self.sizes):
-            places = x, after, slope = x, self._room(go), self._room(go)
-            slopes.append(slope)
+        for k, (_, go) in enumerate(self.sizes):
+            places = self._room(go), self._room(go)
+            slopes.append(places[1])
 
-            def activated(i: Any, totals: list[Value], l: int = l, places: Sequence[Value] = places) -> None:
-                found = totals if l == last else self._run(potential.activations[l], *totals)
-                for place, y in zip(places[1:], found, strict=False):
+            def activated(i: Any, totals: list[Value], k: int = k, places: Sequence[Value] = places) -> None:
+                found = totals if k == last else self._run(potential.activations[k], *totals)
+                for place, y in zip(places, found, strict=False):
                     self.code.store(y, place, i * self.width)
 
-            self._products(l, [x], activated)
-            x = after
+            self._products(k, [x], activated)
+            x = places[0]
         ends = [self._get(x, i) for i in range(self.sizes[-1][1])]
         found = self._run(potential.slopes, *q, *ends)
         r = self._room(len(ends))
         self._put(found[len(q) :], r)
-        for l in range(last, -1, -1):
-            below = self._room(self.sizes[l][0])
+        for k in range(last, -1, -1):
+            below = self._room(self.sizes[k][0])
 
-            def pulled(i: Any, totals: list[Value], l: int = l, below: Value = below) -> None:
-                factor = self._get(slopes[l - 1], i) if l else 1.0
+            def pulled(i: Any, totals: list[Value], k: int = k, below: Value = below) -> None:
+                factor = self._get(slopes[k - 1], i) if k else 1.0
                 self.code.store(totals[0] * factor, below, i * self.width)
 
-            self._products(l, [r], pulled, back=True)
+            self._products(k, [r], pulled, back=True)
             r = below
         of_x = [self._get(r, i) for i in range(self.sizes[0][0])]
         more = self._run(potential.first_reversed, *q, *of_x)
@@ -213,20 +213,20 @@ class _Layers:
         self._put(both[:n], x)
         self._put(both[n:], moved)
         taken, slopes = [], []
-        for l, (_, go) in enumerate(self.sizes):
+        for k, (_, go) in enumerate(self.sizes):
             places = [self._room(go) for _ in range(4)]
             taken.append((x, moved))
             slopes.append(places[2:])
 
-            def activated(i: Any, totals: list[Value], l: int = l, places: Sequence[Value] = places) -> None:
+            def activated(i: Any, totals: list[Value], k: int = k, places: Sequence[Value] = places) -> None:
                 found = totals
-                if l < last:
-                    y, slope, bent = self._run(potential.activations[l], totals[0])
+                if k < last:
+                    y, slope, bent = self._run(potential.activations[k], totals[0])
                     found = [y, slope * totals[1], slope, bent * totals[1]]
                 for place, z in zip(places, found, strict=False):
                     self.code.store(z, place, i * self.width)
 
-            self._products(l, [x, moved], activated)
+            self._products(k, [x, moved], activated)
             x, moved = places[:2]
         m = self.sizes[-1][1]
         ends = [self._get(place, i) for place in (x, moved) for i in range(m)]
@@ -234,48 +234,48 @@ class _Layers:
         r, s = self._room(m), self._room(m)
         self._put(found[d : d + m], s)
         self._put(found[2 * d + m :], r)
-        for l in range(last, -1, -1):
+        for k in range(last, -1, -1):
             if self._sums:
-                self._add(l, r, s, *taken[l])
-            below = [self._room(self.sizes[l][0]) for _ in range(2)]
+                self._add(k, r, s, *taken[k])
+            below = [self._room(self.sizes[k][0]) for _ in range(2)]
 
-            def pulled(i: Any, totals: list[Value], l: int = l, below: Sequence[Value] = below) -> None:
+            def pulled(i: Any, totals: list[Value], k: int = k, below: Sequence[Value] = below) -> None:
                 R, S = totals
-                if l:
-                    slope, bent = (self._get(place, i) for place in slopes[l - 1])
+                if k:
+                    slope, bent = (self._get(place, i) for place in slopes[k - 1])
                     R, S = slope * R, fma(slope, S, bent * R)
                 for place, y in zip(below, (R, S), strict=True):
                     self.code.store(y, place, i * self.width)
 
-            self._products(l, [r, s], pulled, back=True)
+            self._products(k, [r, s], pulled, back=True)
             r, s = below
         of_x = [self._get(place, i) for place in (s, r) for i in range(n)]
         more = self._run(potential.first_moved_reversed, *q, *v, *of_x)
         return [x + y for x, y in zip(found[:d], more, strict=False)]
 
-    def _add(self, l: int, r: Value, s: Value, x: Value, moved: Value) -> None:
+    def _add(self, k: int, r: Value, s: Value, x: Value, moved: Value) -> None:
         """Add the derivatives by a layer to their sums over trajectories."""
-        code, (come, go), (start, bias) = self.code, self.sizes[l], self.potential.starts[l]
+        code, (come, go), (start, bias) = self.code, self.sizes[k], self.potential.starts[k]
         side = min(SIDE, self.width)
         type, parts = Type("double", side), range(0, self.width, side)
         sums = code.at(self.weights, self.potential.n_weights)
 
         def loaded(place: Value, i: Any) -> list[Value]:
-            return [code.load(place, i * self.width + k, type) for k in parts]
+            return [code.load(place, i * self.width + lane, type) for lane in parts]
 
         def add(place: Any, products: Sequence[Sequence[Value]]) -> None:
             total = code.load(sums, place * SIDE, type)
             for factors in products:
-                total = fma(*factors, total) if len(factors) == 2 else total + factors[0]
+                total = fma(factors[0], factors[1], total) if len(factors) == 2 else total + factors[0]
             code.store(total, sums, place * SIDE)
 
         for first, count in self._blocks(go, 2):
-            R, S = ([loaded(place, first + k) for k in range(count)] for place in (r, s))
+            R, S = ([loaded(place, first + row) for row in range(count)] for place in (r, s))
             with code.over(come) as j:
                 X, Y = loaded(x, j), loaded(moved, j)
-                for k in range(count):
-                    pairs = [*zip(R[k], Y, strict=True), *zip(S[k], X, strict=True)]
-                    add((first + k) * come + j + start, pairs)
+                for row in range(count):
+                    pairs = [*zip(R[row], Y, strict=True), *zip(S[row], X, strict=True)]
+                    add((first + row) * come + j + start, pairs)
             if bias is not None:
-                for k in range(count):
-                    add(first + (k + bias), [(part,) for part in S[k]])
+                for row in range(count):
+                    add(first + (row + bias), [(part,) for part in S[row]])

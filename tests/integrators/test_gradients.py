@@ -254,7 +254,7 @@ def test_weights_are_arguments():
     again = solve(system, "verlet", (0, 1), y0, dt=0.1)
     np.testing.assert_array_equal(again.y, solve(HamiltonianSystem(V, ndof=2), "verlet", (0, 1), y0, dt=0.1).y)
     net[2] = torch.nn.Linear(9, 8).double()
-    with pytest.raises(ValueError, match="^`potential` has another value than when it was traced"):
+    with pytest.raises(ValueError, match=r"^`potential` has another value than when it was traced"):
         solve(system, "verlet", (0, 1), y0, dt=0.1)
 
 
@@ -271,7 +271,9 @@ def test_second_derivatives_by_weights_through_two_runs():
     net, V = network("two layers")
     system, found = HamiltonianSystem(V, ndof=2), []
     for backend in ("compiled", "array"):
-        middle = solve(system, "verlet", (0, 0.5), torch.tensor(start(system, (2,))), dt=0.1, backend=backend).y[..., -1]
+        middle = solve(system, "verlet", (0, 0.5), torch.tensor(start(system, (2,))), dt=0.1, backend=backend).y[
+            ..., -1
+        ]
         end = solve(system, "verlet", (0, 0.5), middle, dt=0.1, t_eval=[0.5], backend=backend).y
         first = torch.autograd.grad((end**2).sum(), [p for p in net.parameters() if p.numel() > 1], create_graph=True)
         found.append(torch.autograd.grad(sum((g**2).sum() for g in first), net[2].weight)[0])
