@@ -173,29 +173,14 @@ class LatticeStates:
 
 @dataclass(frozen=True)
 class Rest:
-    """A lattice at rest, all sites in one of the wells, and what is drawn about it.
-
-    Attributes
-    ----------
-    system : Hamiltonian
-    parts : int
-        Sites.
-    positions : ndarray (n, d)
-        Positions at rest, n of them that are as good.
-    moves : bool
-        True if nothing holds the lattice at its place, so that the sum of the momenta is left out.
-    energy : ndarray
-        Of each site, that of its bonds among it.
-    block : tuple of int
-        Sites along each axis of which densities are taken together.
-    """
+    """A lattice at rest, all sites in one of the wells, and what is drawn about it."""
 
     system: Hamiltonian
-    parts: int
-    positions: np.ndarray
-    moves: bool
-    energy: np.ndarray
-    block: tuple[int, ...]
+    parts: int  # sites
+    positions: np.ndarray  # (n, d), at rest, n of them that are as good
+    moves: bool  # nothing holds the lattice at its place, so that the sum of the momenta is left out
+    energy: np.ndarray  # of each site, that of its bonds among it
+    block: tuple[int, ...]  # sites along each axis of which densities are taken together
 
     @property
     def state(self) -> np.ndarray:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.kernels.threads import NEVER, given, run_rows
 
-__all__ = ["Batch", "Kernel", "Run", "RunCheckpoint", "Steps", "Task", "run_states"]
+__all__ = ["Batch", "Kernel", "Run", "RunCheckpoint", "Steps", "Task", "both_ways", "run_states"]
 
 NOTHING: Any = np.empty(0)
 
@@ -188,6 +188,18 @@ class Steps(NamedTuple):
 
     states: np.ndarray
     iterations: int = 0
+
+
+def both_ways(step: Callable[[Any, bool], np.ndarray], h: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Rows of `y` (N, 2d) after steps of lengths h (N,): ``step(rows, back)`` is of those that go one way."""
+    out = None
+    for back, rows in ((False, h > 0), (True, h < 0)):
+        if rows.all():
+            return step(slice(None), back)
+        if rows.any():
+            out = np.array(y, dtype=np.float64) if out is None else out
+            out[rows] = step(rows, back)
+    return np.array(y, dtype=np.float64) if out is None else out
 
 
 class Kernel(ABC):
