@@ -152,13 +152,7 @@ class Rows:
 
 
 class Module:
-    """The functions of one piece of machine code, and what they need.
-
-    Parameters
-    ----------
-    fused : bool
-        True if the machine multiplies and adds in one instruction; else the two are rounded apart.
-    """
+    """The functions of one piece of machine code, and what they need; `fused` where a product and sum are one."""
 
     def __init__(self, fused: bool = True) -> None:
         self.fused = fused
@@ -219,12 +213,7 @@ _INTRINSIC = {"sqrt": "llvm.sqrt", "abs": "llvm.fabs", "floor": "llvm.floor"}
 
 
 class Code:
-    """One function, written line by line.
-
-    Attributes
-    ----------
-    arguments : list of Value
-    """
+    """One function, written line by line; its `arguments` are values."""
 
     def __init__(
         self,
@@ -637,12 +626,7 @@ class Code:
 
 
 class Sweep:
-    """Turns k of a loop over places, in which values of places further on stay in registers until their turn comes.
-
-    Attributes
-    ----------
-    k : Value
-    """
+    """Turns k of a loop over places, in which values of places further on stay in registers until their turn comes."""
 
     def __init__(self, code: Code, first: Value, read: Callable[[Any, Value], Value]) -> None:
         self.code, self.k = code, code._name(INT)

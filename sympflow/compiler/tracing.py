@@ -730,20 +730,9 @@ def _check_inputs(program: Program, inputs: Sequence[Traced]) -> None:
 
 
 def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
-    """Record a function of arrays, which returns one number.
+    """Record a function of arrays, which returns one number; an `Untraceable` has the reason why not.
 
-    Parameters
-    ----------
-    function : callable
-    names : sequence
-        Of each argument: the names of the elements of an array, or that of a number.
-    torch : bool
-        True of a function that takes tensors.
-
-    Raises
-    ------
-    Untraceable
-        With the reason.
+    Of each argument `names` has those of the elements of an array, or that of a number; `torch` if it takes tensors.
     """
     inputs, value = _recorded(_Recorded(), function, names, torch)
     return Program(inputs, [value])

@@ -287,15 +287,6 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         for placement in {(column.free.dtype, column.free.device) for _, column in self.columns()}:
             check_compilable(*placement)
 
-    @torch.no_grad()
-    def step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
-        """ψ̄_h of rows y (N, 2d) at times t, for h < 0 the inverse of ψ̄_|h|, each with its own h (N,)."""
-        out = self.lift(torch.from_numpy(np.array(y)), torch.from_numpy(np.array(t, dtype=float)))
-        for rows, back in ((h > 0, False), (h < 0, True)):
-            if rows.any():
-                out[rows] = self._psi(torch.from_numpy(np.abs(h[rows])), out[rows], back)
-        return self.project(out).numpy()
-
     # kernel and processor as maps ---------------------------------------------------------------------------
 
     def prepare(self, t: float | Tensor, x: Tensor) -> Tensor:

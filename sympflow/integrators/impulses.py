@@ -137,12 +137,12 @@ def _merged(found: list[Outcome], problem: Problem, pieces: list[Any], impulses:
     outcome = Outcome(t, concatenate([each.y for each in found], 0), status, message, stats)
     if problem.dense_output:
         solutions = tuple(each.sol for each in found if each.sol is not None)
-        outcome.sol = Pieces(solutions, np.array(pieces)[: len(found), :2])
+        outcome.sol = PiecewiseSolution(solutions, np.array(pieces)[: len(found), :2])
     return outcome
 
 
 @dataclass(frozen=True)
-class Pieces:
+class PiecewiseSolution:
     """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one.
 
     `spans` (n, 2) are their ends, which decrease in a run back in time.

@@ -20,7 +20,7 @@ from sympflow.arrays import (
 )
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
@@ -45,7 +45,7 @@ class ArraySteps:
         raise NotImplementedError
 
     def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
     ) -> tuple[Array, np.ndarray]:
         """See `Stepper.rollout`."""
         return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
@@ -125,7 +125,7 @@ class Stepper:
         return self.arrays.counts is not None or self.arrays.stages > 0
 
     def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
     ) -> tuple[Array, np.ndarray]:
         """Return the states (len(save), ..., 2d) after the steps `save` (sorted counts in 0 … n_steps) of length h.
 
@@ -232,7 +232,7 @@ def rollout(
     n_steps: int,
     save: np.ndarray,
     block: int = 64,
-    carry: Carry | None = None,
+    carry: RunCheckpoint | None = None,
 ) -> tuple[Array, np.ndarray]:
     """States at the counts `save` of n_steps times `step(k, y)`, and the last finite count of each trajectory."""
     k = 0

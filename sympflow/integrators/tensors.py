@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import differentiable, to_numpy, transformed
-from sympflow.kernels.protocol import Carry, Task
+from sympflow.kernels.protocol import RunCheckpoint, Task
 
 __all__ = ["rolled_out", "stepped"]
 
 
 def rolled_out(
-    stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: Carry | None
+    stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: RunCheckpoint | None
 ) -> tuple[Tensor, np.ndarray]:
     """`Stepper.rollout` of a tensor on the CPU: float32 is computed in double, and rounded at the outputs."""
     if y0.dtype != torch.float64:

@@ -30,15 +30,7 @@ ARRAYS = 4  # of d numbers that a kick needs: slopes, velocities, products with 
 
 
 class Forces(Protocol):
-    """The derivatives of T and V as code, of positions and momenta at places in memory into other places.
-
-    Attributes
-    ----------
-    data : sequence of ndarray
-        Arrays that the code reads.
-    lanes : int
-        Trajectories side by side.
-    """
+    """The derivatives of T and V as code, of q and p at places in memory into others; it reads arrays `data`."""
 
     data: list[np.ndarray]
     lanes: int
@@ -57,14 +49,7 @@ class Forces(Protocol):
 
 
 class TermForces:
-    """Forces by loops over the terms of each kind.
-
-    Parameters
-    ----------
-    V : Terms
-    T : Terms or ndarray, optional
-        Of a kinetic energy; its inverse masses (d,); None where all are 1.
-    """
+    """Forces by loops over the terms of each kind; T may be inverse masses (d,), or None where all are 1."""
 
     lanes = 8
 
@@ -113,14 +98,7 @@ class TermForces:
 class Functions:
     """Forces by a user's Numba functions, called at their addresses; one trajectory after the other.
 
-    Parameters
-    ----------
-    gradient, hessian_vector : functions
-        The latter may be None.
-    inverse_mass : ndarray, optional
-        (d,) or (d, d).
-    driven : bool
-        True if functions take the time first.
+    The inverse mass is (d,), (d, d) or None; functions of a driven system take the time first.
     """
 
     lanes = 1
@@ -244,14 +222,7 @@ def addressed(function: Any, along: bool, timed: bool) -> Any:
 
 
 class ArrayCode(SplittingCode):
-    """The compiled functions of splitting schemes of states in memory.
-
-    Parameters
-    ----------
-    splitting : Splitting
-        Of which the symbols say no more than how many there are, where forces are functions.
-    forces : Forces
-    """
+    """The compiled functions of splitting schemes of states in memory; see `Splitting` and `Forces`."""
 
     def __init__(self, splitting: Splitting, forces: Forces) -> None:
         super().__init__(splitting, chunked=False)

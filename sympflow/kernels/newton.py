@@ -40,10 +40,7 @@ LONG = 4e6  # operations between two looks for a stop
 def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
 
-    Raises
-    ------
-    ValueError
-        If the system cannot be compiled, with the reason.
+    A ValueError says why there are none.
     """
     kernels = _KERNELS.setdefault(system, {})
     if (tableau, compensated) not in kernels:

@@ -46,20 +46,7 @@ Maps = Callable[[np.ndarray], Sequence[SubFlow]]
 
 
 class PartMaps:
-    """The maps of the parts of a system as code.
-
-    Parameters
-    ----------
-    parts : ExactParts
-        Of symbols.
-    filters : bool
-        True if the maps have some.
-
-    Raises
-    ------
-    ValueError
-        If H holds a function that has no compiled form.
-    """
+    """The maps of the parts of a symbolic system as code, with `filters` if they have some."""
 
     def __init__(self, parts: ExactParts, filters: bool) -> None:
         self.parts, self.ndof, self.filters = parts, parts.ndof, filters
@@ -189,14 +176,7 @@ class PartMaps:
 
 
 class PartsCode(Rollouts):
-    """Groups of maps as stages: a column has the numbers of one map after the other.
-
-    Parameters
-    ----------
-    maps : PartMaps
-    groups : sequence of tuple of int
-        The codes of the maps of each kind of column.
-    """
+    """Groups of maps, by their codes, as stages: a column has the numbers of one map after the other."""
 
     lanes = 16
 
@@ -248,13 +228,7 @@ def _combined(weights: Sequence[Any], values: Sequence[Any]) -> Any:
 
 
 def parts_loops(parts: ExactParts) -> PartsLoops:
-    """The compiled loops of the parts of a system, made once.
-
-    Raises
-    ------
-    ValueError
-        If the parts cannot be compiled, with the reason.
-    """
+    """The compiled loops of the parts of a system, made once; a ValueError says why there are none."""
     loops = _LOOPS.get(parts)
     if loops is None:
         loops = _LOOPS[parts] = PartsLoops(parts)
@@ -265,22 +239,12 @@ _LOOPS: WeakKeyDictionary[ExactParts, PartsLoops] = WeakKeyDictionary()
 
 
 class PartsLoops:
-    """Compiled loops over the maps of any splitting of one system; states are [q, p], float64.
+    """Compiled loops over the maps of any splitting of one symbolic system; states are [q, p], float64.
 
     The linear part's modes rotate by three shears, each with determinant 1 whatever its number, by at most an eighth of
     a turn, after exact quarter turns; the run stays in the modes. So rounding is none at whole quarter turns, and a
     random walk elsewhere, but at some simple fractions of a turn, such as a sixth: the state comes back to nearly
     the same numbers, whose rounding repeats, and the energy drifts by up to 5e-17 of it with each step.
-
-    Parameters
-    ----------
-    parts : ExactParts
-        Of a symbolic system.
-
-    Raises
-    ------
-    ValueError
-        If the parts are plain functions, or H holds a function that has no compiled form.
     """
 
     def __init__(self, parts: ExactParts) -> None:
@@ -300,20 +264,14 @@ class PartsLoops:
         self._tables: dict[int, tuple[Sequence[SubFlow], _Table]] = {}
 
     def kernel(self, maps: Maps) -> PartsKernel:
-        """The loops of one splitting, whose step of length h is `maps(h)`.
-
-        The tables of runs are kept by the identity of what `maps` returns.
-        """
+        """The loops of one splitting, whose step of length h is `maps(h)`; tables are kept by the identity of that."""
         return PartsKernel(self, maps)
 
     def step_by_coefficients(self, sequence: Sequence[SubFlow], dt: float, t: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from each row of y (N, 2d), each of its own length t (N,) > 0, by maps that are functions of t.
 
-        Parameters
-        ----------
-        sequence : sequence of SubFlow
-            With coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
-            are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
+        Maps have coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
+        are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
         """
         square = (t / dt) ** 2
         terms = max(len(sequence[0].length), 3)

@@ -23,26 +23,10 @@ ROWS = 256  # that run together, whatever the threads
 
 
 class Recorded:
-    """A run of rows whose cotangents can be pulled back.
+    """A run of rows y0 (N, 2d), or with own values behind each, whose cotangents can be pulled back.
 
-    Parameters
-    ----------
-    code : SplittingCode
-        With a reverse of its stages.
-    table
-        Its rows are numbers.
-    y0 : ndarray of shape (N, 2d), or (N, 2d + n)
-        With own values of each row.
-    n_steps : int
-    save : ndarray of int64, sorted, in 0 … n_steps
-    work : float
-        About how many nanoseconds a step of a row takes.
-
-    Attributes
-    ----------
-    states : ndarray of shape (N, len(save), 2d)
-    n_finite : ndarray of int64 of shape (N,)
-        The last step of each row that ends in a finite state.
+    A step of a row takes about `work` nanoseconds. The results are `states` (N, len(save), 2d), and `n_finite` (N,),
+    the last step of each row that ends in a finite state.
     """
 
     def __init__(
@@ -100,18 +84,10 @@ class Recorded:
             self.states[i] = self._y0[i, None, : code.n_out]
 
     def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The cotangents of the states and, of use with `slopes` only, of the numbers of the table, and of weights.
+        """The cotangents of the states (N, 2d), for those of the outputs (N, len(save), 2d).
 
-        Parameters
-        ----------
-        cotangents : ndarray of shape (N, len(save), 2d)
-
-        Returns
-        -------
-        of_states : ndarray of shape (N, 2d)
-        of_table : ndarray of shape (n, m), with tables of their own (n, m, N)
-        of_weights : ndarray
-            See `SplittingRollouts.summed`.
+        With `slopes` those of the numbers of the table too, (n, m), with tables of their own (n, m, N), and the sums
+        of `SplittingRollouts.summed`.
         """
         if (self.n_finite < self._n_steps).any():
             return self._pulled_apart(cotangents, slopes)

@@ -56,16 +56,7 @@ def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
 
 
 class Family(NamedTuple):
-    """Terms Σ_n f(x = q[coordinates[n]], c = constants[n]).
-
-    Attributes
-    ----------
-    f : Expr
-        In the symbols x and c.
-    x, c : tuple of Symbol
-    coordinates : ndarray of int, shape (N, k)
-    constants : ndarray of shape (N, m)
-    """
+    """Terms Σ_n f(x = q[coordinates[n]], c = constants[n]), f in the symbols x and c."""
 
     f: sp.Expr
     x: tuple[sp.Symbol, ...]
@@ -179,17 +170,8 @@ def _constant(f: sp.Basic) -> _Tree | None:
 class Terms:
     """A function as the terms of each kind, whose derivatives are added up by loops over these.
 
-    Parameters
-    ----------
-    f : Expr
-    variables : sequence of Symbol
-    letters : sequence of Symbol
-        What else is in f, numbers of a stage.
-
-    Attributes
-    ----------
-    data : list of ndarray
-        How many terms each kind has, then the coordinates and the constants of each kind.
+    The `letters` are what else is in f, numbers of a stage. `data` has how many terms each kind has, then the
+    coordinates and the constants of each kind.
     """
 
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
@@ -259,16 +241,9 @@ class Terms:
         letters: Sequence[Any],
         targets: Callable[[list[Value]], list[tuple[Rows, Value]]],
     ) -> None:
-        """Add derivatives of the terms of each kind to numbers in memory.
+        """Add derivatives of the terms of each kind to numbers in memory: from the addresses of the arrays in `data`.
 
-        Parameters
-        ----------
-        data : sequence of Value
-            Addresses of the arrays in `data`.
-        given : sequence of Rows
-            What the coordinates of a term are numbers of.
-        targets : callable
-            From the places of a term's coordinates to where its derivatives go.
+        The coordinates of a term are numbers of `given`; ``targets(places)`` are where its derivatives go.
         """
         code, type = given[0].code, given[0].type
         for k, (family, program) in enumerate(zip(self._families, derivatives, strict=True)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,9 +16,12 @@ from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
-from sympflow.metrics.orbits import Orbits, checked_orbits
-from sympflow.show.cards import Card, Shown, numbers
+from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
+from sympflow.show.cards import Card, numbers
 from sympflow.systems.given import given_system
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WINDOW = 256  # steps between which orbits that have left are put aside
 MOST_VALUES = 1 << 21  # numbers of states that are held at a time
@@ -28,7 +31,7 @@ Outside = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, repr=False)
-class Escapes(Shown):
+class Escapes(OfOrbits):
     """When and where orbits left a region.
 
     Attributes
@@ -52,10 +55,8 @@ class Escapes(Shown):
         facts = {"time": numbers(self.time), "state": numbers(self.state), "status": numbers(self.status)}
         return Card("Escapes", facts, self.message)
 
-    @property
-    def success(self) -> bool:
-        """True if no orbit failed."""
-        return bool(np.all(np.asarray(self.status) >= 0))
+    def drawn(self) -> Figure:
+        return of_many("time of escape", self.time, "it is `time`")
 
 
 def escape_times(

@@ -491,6 +491,7 @@ SPLINE = CubicSpline(np.linspace(0, 2, 21), np.cos(np.linspace(0, 2 * PI, 21)), 
         (q * sp.Heaviside(sp.sin(2 * sp.pi * t)), 1.0, 0.5),  # an edge at t = 0
         (q * sp.Piecewise((1, sp.Mod(t, 2) < 1), (0, True)), 2.0, 1.0),
         (q * (t - sp.floor(t)), 1.0, 0.5),
+        (q * t - q * sp.floor(t), 1.0, 0.5),
         (q * sp.DiracDelta(sp.sin(t)), PI, PI / 2),
         (sp.Max(q - 1e9, 0) * sp.cos(t) ** 2, PI, 2.0),  # far states
         (q**2 + 1e-12 * q * sp.cos(t), 2 * PI, 2.0),  # a small drive
