@@ -13,7 +13,7 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.fits import PrimedFit
 from sympflow.training.points import Stream, box_without, start_times, states
-from sympflow.training.table_step import DENSE, forces_of
+from sympflow.training.table_step import forces_of
 
 SCALING_SAMPLES = 4096
 SAMPLES, SEED = 1000, 0
@@ -27,7 +27,8 @@ NARROWED = 10  # times at most
 ORBITS, ORBIT_STEPS, ORBIT_TOLERANCE = 12, 150, 1e-5  # by which is seen where orbits of a part of the domain come
 CROSSINGS = 4.0  # of the domain, by such an orbit
 ENERGIES = (0.9, 0.75, 0.5)  # shares of the states, with less energy than the others
-ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method, for many degrees of freedom
+DENSE = 16  # degrees of freedom up to which eigenvalues of ∇²V are taken
+ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method, beyond them
 
 
 def default_primed(
@@ -75,8 +76,9 @@ def potential_hessian(system: HamiltonianSystem, q: np.ndarray, t: np.ndarray | 
     """∇²V (n, d, d), of a driven system at times t (n,), from differences of ∇V where it is not known."""
     if system.has_hessian_vector:
         return system.potential_hessian(q, t)
-    d = system.ndof
-    return np.moveaxis(-forces_of(system, 0).all(_with_times(q, t).T)[1][0][:d, :d], -1, 0)
+    d, x = system.ndof, _with_times(q, t).T
+    basis = np.broadcast_to(np.eye(len(x))[..., None], (len(x), *x.shape))
+    return np.moveaxis(-forces_of(system, 0).along(x, basis)[1][0][:d, :d], -1, 0)
 
 
 def _with_times(q: np.ndarray, t: np.ndarray | None) -> np.ndarray:
