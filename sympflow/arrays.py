@@ -350,7 +350,7 @@ def opaque(function: Any, *x: Array) -> Array:
     Parameters
     ----------
     function : object
-        `value(*arrays)`; `pushed(x, v)`, its derivative along v, of which entries may be None; `pulled(x, w, wanted)`,
+        `value(*arrays)`; `jvp(x, v)`, its derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
         the derivatives of Σ w·value by those of x that are wanted.
     """
     return _opaque_function().apply(function, *x)
@@ -375,11 +375,11 @@ def _opaque_function() -> Any:
         @staticmethod
         def backward(ctx: Any, w: torch.Tensor | None) -> tuple[Any, ...]:
             x, wanted = ctx.saved_tensors, ctx.needs_input_grad[1:]
-            return None, *((None,) * len(x) if w is None else ctx.function.pulled(x, w, wanted))
+            return None, *((None,) * len(x) if w is None else ctx.function.vjp(x, w, wanted))
 
         @staticmethod
         def jvp(ctx: Any, _: None, *v: torch.Tensor | None) -> torch.Tensor:
-            return ctx.function.pushed(ctx.saved_tensors, v)
+            return ctx.function.jvp(ctx.saved_tensors, v)
 
         @staticmethod
         def vmap(info: Any, in_dims: tuple[Any, ...], function: Any, *x: torch.Tensor) -> tuple[torch.Tensor, int]:

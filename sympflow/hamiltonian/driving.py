@@ -170,10 +170,10 @@ class _Derivative(NamedTuple):
     def value(self, t: np.ndarray) -> np.ndarray:
         return self.samples(np.asarray(t), self.order)
 
-    def pulled(self, x: Sequence[Array], w: Array, wanted: Sequence[bool]) -> tuple[Array]:
+    def vjp(self, x: Sequence[Array], w: Array, wanted: Sequence[bool]) -> tuple[Array]:
         return (w * self.samples(x[0], self.order + 1),)
 
-    def pushed(self, x: Sequence[Array], v: Sequence[Array]) -> Array:
+    def jvp(self, x: Sequence[Array], v: Sequence[Array]) -> Array:
         return v[0] * self.samples(x[0], self.order + 1)
 
 

@@ -145,13 +145,7 @@ def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
 
 
 def in_symbols(program: Program) -> sp.Expr:
-    """The one output of a program as an expression, in real symbols of the names of its inputs.
-
-    Raises
-    ------
-    NotRecorded
-        If an operation has no SymPy form.
-    """
+    """The one output of a program as an expression in real symbols; NotRecorded where an operation has no such form."""
     known: dict[int, Any] = {x.order: sp.Symbol(repr(x), real=True) for x in program.inputs}
 
     def given(x: Any) -> sp.Expr:
