@@ -261,10 +261,7 @@ class KineticPotential(Composition):
         return kernel
 
     def kernel(self, compensated: bool) -> Kernel:
-        loops = _splitting_loops()(self.system)
-        if not self.system.friction:
-            return loops.kernel(self.scheme, compensated)
-        return loops.damped_kernel(self.scheme, self.step)
+        return _splitting_loops()(self.system).kernel(self.scheme, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)

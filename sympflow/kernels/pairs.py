@@ -663,7 +663,7 @@ DIRECTIONS = 16
 class PairForces:
     """F = −∇V and G = ∇²V M⁻¹∇V of bodies at many states, and their derivatives, for the fits of tables.
 
-    States q are (d, P), side by side in registers, directions (K, d, P), Jacobians (d, d, P). No curvature terms.
+    States q are (d, P), side by side in registers, directions (K, d, P). No curvature terms.
     """
 
     def __init__(self, local: PairsHamiltonian, level: int) -> None:
@@ -691,12 +691,6 @@ class PairForces:
         self._products(*self._given_arrays(q, F, v, DF, DG), len(v))
         values, changes = ([x[..., :P] for x in pair][: 1 + self._has_gradient] for pair in ((F, G), (DF, DG)))
         return values, changes
-
-    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        """These, and their Jacobians."""
-        d, P = q.shape
-        values, changes = self.along(q, np.broadcast_to(np.eye(d)[..., None], (d, d, P)))
-        return values, [change.swapaxes(0, 1) for change in changes]
 
     def _given_arrays(self, *arrays: np.ndarray) -> tuple[int, ...]:
         return self._sites.shape[1], arrays[0].shape[1], *map(address, (self._sites, self._numbers, *arrays))

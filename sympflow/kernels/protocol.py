@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.kernels.threads import NEVER, given, run_rows
 
-__all__ = ["Batch", "Kernel", "Run", "RunCheckpoint", "Steps", "Task", "run_states"]
+__all__ = ["Batch", "Kernel", "Run", "RunCheckpoint", "Steps", "Task", "both_ways", "run_states"]
 
 NOTHING: Any = np.empty(0)
 
@@ -190,6 +190,18 @@ class Steps(NamedTuple):
     iterations: int = 0
 
 
+def both_ways(step: Callable[[Any, bool], np.ndarray], h: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Rows of `y` (N, 2d) after steps of lengths h (N,): ``step(rows, back)`` is of those that go one way."""
+    out = None
+    for back, rows in ((False, h > 0), (True, h < 0)):
+        if rows.all():
+            return step(slice(None), back)
+        if rows.any():
+            out = np.array(y, dtype=np.float64) if out is None else out
+            out[rows] = step(rows, back)
+    return np.array(y, dtype=np.float64) if out is None else out
+
+
 class Kernel(ABC):
     """Compiled loops of a method on one system; states are [q, p], float64. A subclass says `runs` and `step`.
 
@@ -199,12 +211,15 @@ class Kernel(ABC):
         True if all states that a run saves up to its last finite step are finite numbers.
     backend : str
         The name of what runs, of `stats["backend"]`.
+    tensors : sequence of Tensor
+        Weights in H that torch follows, whose numbers are read in each run.
     remark : str
         A sentence on the end of the last run of a single state that could not go on.
     """
 
     saves_finite = True
     backend = "compiled"
+    tensors: Sequence[Any] = ()
     remark = ""
 
     def run(

@@ -547,15 +547,18 @@ class SplittingCode(SplittingRollouts):
     def prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The numbers (m, size) that the code reads, of a table (n, m) of given ones, and the kinds (m,) of columns."""
         if self.timed:
-            return np.ascontiguousarray(table.T), self._kinds_of(table)
+            return self.columns(table)
         key = table.tobytes()
         found = self._tables.get(key)
         if found is None:
             if len(self._tables) >= MOST_TABLES:
                 self._tables.clear()
-            kinds = self._kinds_of(table)
-            found = self._tables[key] = self._entries(table, kinds), kinds
+            found = self._tables[key] = self.columns(table)
         return found
+
+    def columns(self, table: np.ndarray) -> Columns:
+        kinds = self._kinds_of(table)
+        return np.ascontiguousarray(self._entries(table, kinds)), kinds
 
     def _kinds_of(self, table: np.ndarray) -> np.ndarray:
         kinds = np.zeros(table.shape[1], dtype=np.int64)
@@ -575,8 +578,10 @@ class SplittingCode(SplittingRollouts):
                 entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
         return entries
 
-    def own_entries(self, table: np.ndarray, values: np.ndarray) -> Columns:
+    def own_entries(self, table: Any, values: np.ndarray) -> Columns:
         """The numbers of the columns of trajectories with their own values of the parameters."""
+        if isinstance(table, tuple):
+            return super().own_entries(table, values)
         kinds, n = self._kinds_of(table), len(table) - self._own
         rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
         return np.moveaxis(self._entries(rows, kinds, (len(values),)), -1, 0), kinds
