@@ -34,7 +34,7 @@ def landings(
         times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
     else:
         said, times = jumps_met(system, t0, t1, dt, label)
-    able = able and len(times) <= MOST_LANDINGS and not integrator.keeps and not integrator.forces_beyond(system)
+    able = able and len(times) <= MOST_LANDINGS and not integrator.forces_beyond(system)
     # all times are known, of which the first ones may be listed
     if able and times and not len(system.jump_times(max(times), max(t0, t1), step)):
         return "", times
