@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from functools import cached_property
 from math import inf
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +14,14 @@ from sympflow.arrays import Array
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.poles import Poles
+
+
+def bare_copy(x: Any) -> Any:
+    """Return a copy of an object without what was found out of it, its cached properties."""
+    other = copy.copy(x)
+    for name in [name for name in vars(other) if isinstance(getattr(type(x), name, None), cached_property)]:
+        del vars(other)[name]
+    return other
 
 
 class Definition:
@@ -44,6 +54,11 @@ class Definition:
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
+
+    _generated: tuple[str, ...] = ("_functions",)  # what cannot be pickled, and is made again
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in self._generated}
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
         """The times (n,) between two others at which H is known to jump; `step` as of `Hamiltonian.jump_times`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, largest, library, like, of_library, per_state
+from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
 from sympflow.hamiltonian.times import checked_time
@@ -213,16 +213,9 @@ class Hamiltonian:
 
     def with_force(self, force: ExternalForce) -> Self:
         """Return the system with p' = −∂H/∂q − Γp + F(q, p), which its vector field, and no H, holds."""
-        forced = self._copied()
+        forced = bare_copy(self)
         forced.name, forced.external_force = f"{self.name}_forced", force
         return forced
-
-    def _copied(self) -> Self:
-        """A copy without what was found out of the original, which is to be another system."""
-        other = copy.copy(self)
-        for name in [name for name in vars(other) if isinstance(getattr(type(other), name, None), cached_property)]:
-            del vars(other)[name]
-        return other
 
     def as_doubled(self) -> Doubled:
         """Return the system itself if it is a doubled one.
@@ -329,7 +322,7 @@ class Hamiltonian:
         form = self.definition.between_impulses
         if form is self.definition:
             return self
-        between = self._copied()
+        between = bare_copy(self)
         Hamiltonian.__init__(between, self.name, form, self.inverse_mass, self.quadratic_kinetic)
         return between
 

@@ -156,11 +156,12 @@ def projected(x: Array) -> Array:
 def _expression(system: HamiltonianSystem, c: float) -> Any:
     import sympy as sp
 
+    from sympflow.hamiltonian.symbolic import exact
+
     symbols = system.written
     assert symbols is not None
     B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
-    numbered = sp.nsimplify(c) if c.is_integer() else sp.Float(c)
-    return sp.log(symbols.T + B) - sp.log(numbered - symbols.V)
+    return sp.log(symbols.T + B) - sp.log(exact(c) - symbols.V)
 
 
 class _Logarithmic(Definition):
