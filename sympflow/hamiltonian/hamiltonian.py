@@ -549,7 +549,7 @@ class Hamiltonian:
     @property
     def layered(self) -> LayeredPotential | None:
         """V as a chain of linear layers whose weights torch follows, of functions that are one; else None."""
-        return self._definition.layered
+        return self.definition.layered
 
     @property
     def untraced(self) -> str:
