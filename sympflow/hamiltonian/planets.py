@@ -330,6 +330,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
     """
 
     noun = "system of planets"
+    extra: sp.Expr | None = None
 
     def __init__(
         self,
@@ -357,7 +358,6 @@ class PlanetsHamiltonian(PairsHamiltonian):
         if extra is None:
             if more:
                 raise ValueError("`params` are those of `extra`, which is not given: leave them out.")
-            self.extra = None
             return
         self._letters = dict(zip(("G", "m", *more), letters("c", ("G", "m", *more)), strict=True))
         names = {**{name: sp.Symbol(name, real=True) for name in PLACE}, **self._letters}
@@ -372,9 +372,14 @@ class PlanetsHamiltonian(PairsHamiltonian):
         if not self.extra.free_symbols & {*self._places}:
             raise ValueError(f"`extra` must depend on {', '.join(PLACE)}, the place of a body; got {self.extra}.")
         self.params = {**self.params, **more}
-        values = dict(zip(self._letters.values(), self.extra_values, strict=True))
-        check_continuous("extra", self.extra, self._places, values, {s: n for n, s in names.items()})
+        self._check_continuous()
         self.extra_program(2)  # refuses functions that are in no table
+
+    def _check_continuous(self) -> None:
+        if self.extra is not None:
+            values = dict(zip(self._letters.values(), self.extra_values, strict=True))
+            names = {letter: name for name, letter in self._letters.items()}
+            check_continuous("extra", self.extra, self._places, values, names)
 
     @property
     def extra_values(self) -> list[float]:
@@ -444,7 +449,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return None if (self.masses > 0).all() else np.repeat(np.where(self.masses > 0, 1.0, 0.0), 3)
 
     @property
-    def arrays_only(self) -> str:
+    def arrays_only(self) -> str:  # type: ignore[override]
         """The reason why methods of other splittings have no compiled kicks; "" if they have."""
         if self.felt is not None:
             return "bodies without mass"
@@ -467,8 +472,8 @@ class PlanetsHamiltonian(PairsHamiltonian):
         yield heavy[i], heavy[j]
         size = max(1, most // len(heavy))
         for k in range(0, len(light), size):
-            i, j = np.meshgrid(light[k : k + size], heavy)
-            yield i.ravel(), j.ravel()
+            some = light[k : k + size]
+            yield np.tile(some, len(heavy)), np.repeat(heavy, len(some))
 
     def _both_ends(self, f: Array, pairs: Pairs) -> tuple[Array, Array]:
         return f, f * like(1.0 * (self.masses[pairs.i] > 0)[:, None], f)

@@ -123,8 +123,8 @@ class Composition(ABC, ArraySteps):
     def tangent_kernel(self, vectors: int) -> TangentKernel:
         """The compiled loops with k deviation vectors; a ValueError says why there are none."""
         raise ValueError(
-            f"`method` {self.method!r} has compiled deviation vectors on the splittings 'kinetic' and 'kepler' only: use "
-            "backend='auto'."
+            f"`method` {self.method!r} has compiled deviation vectors on the splittings 'kinetic' and 'kepler' only: "
+            "use backend='auto'."
         )
 
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
@@ -630,8 +630,8 @@ class KeplerInteraction(Composition):
         self.frame: Frame = known["kepler"]
         if scheme.level and not self.frame.jacobi:
             raise ValueError(
-                f"`method` {method!r} has force gradients, which the interaction has in Jacobi's coordinates only: make "
-                "the system with coordinates='jacobi'."
+                f"`method` {method!r} has force gradients, which the interaction has in Jacobi's coordinates only: "
+                "make the system with coordinates='jacobi'."
             )
         self.substeps = _paired([(s.kind, s.one, s.three) for s in scheme.substeps])
         self.before: list[tuple[float, float, float]] = []
@@ -642,7 +642,9 @@ class KeplerInteraction(Composition):
                     f"`corrector` goes with the steps of 'wisdom_holman', and method {method!r} makes other ones: "
                     "leave it out."
                 )
-            self.before, self.after = (_paired([(*m, 0.0) for m in corrector_maps(corrector, sign)]) for sign in (1, -1))
+            self.before, self.after = (
+                _paired([(*m, 0.0) for m in corrector_maps(corrector, sign)]) for sign in (1, -1)
+            )
 
     def force_times(self) -> list[float]:
         return []

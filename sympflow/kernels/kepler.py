@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler.control import INT, POINTER, Code, Type, Value
+from sympflow.compiler.control import INT, Type, Value
 from sympflow.compiler.dual import Dual
 from sympflow.compiler.functions import where
 from sympflow.hamiltonian.kepler import coefficients, dot, kepler_changes, moved, series, varied
@@ -291,7 +291,9 @@ class KeplerCode(Rollouts):
             weighted = [c[g]["mass"] * p for p in a[g]]
             outer = [of_lanes(_suffix, p) + q for p, q in zip(weighted, behind, strict=True)]
             behind = [q + of_lanes(_whole, p) for p, q in zip(weighted, behind, strict=True)] if g else behind
-            new.append([c[g]["ratio"] * p + c[g]["over"] * q + own * y for p, q, y in zip(a[g], outer, x[g], strict=True)])
+            new.append(
+                [c[g]["ratio"] * p + c[g]["over"] * q + own * y for p, q, y in zip(a[g], outer, x[g], strict=True)]
+            )
             if len(self.light):
                 before = [y - z for y, z in zip(h[g], x[g], strict=True)]
                 all_behind = [p + q for p, q in zip(weighted, outer, strict=True)]
@@ -324,7 +326,7 @@ class KeplerCode(Rollouts):
             for group in state:
                 group[k].add(jump)
 
-    def look(self, room: Room) -> None:  # type: ignore[override]
+    def look(self, room: Room) -> None:
         """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
         code, count = room.code, self.form.vectors
         with code.over(count) as k:
@@ -626,7 +628,10 @@ class KeplerKernel(Kernel):
     def pushed(self, h: ArrayLike, y: np.ndarray, W: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The steps from rows of `y` (N, 2d), and vectors W (N, 2d, k) moved by their derivatives."""
         vectors = y[..., None, :][:, :0] if W is None else W.swapaxes(-1, -2)
-        code, N, k = self.loops.code(self.form._replace(vectors=vectors.shape[1], compensated=False)), *vectors.shape[:2]
+        code, N, k = (
+            self.loops.code(self.form._replace(vectors=vectors.shape[1], compensated=False)),
+            *vectors.shape[:2],
+        )
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), (N,))
         nothing = (0.0, 0.0, 0.0)
         rows = np.concatenate([self.loops.rows(y), self.loops.rows(vectors, 0.0).reshape(N, k * code.whole)], axis=1)
@@ -640,6 +645,8 @@ class KeplerKernel(Kernel):
 
 class KeplerTangents(TangentKernel):
     """The same with k deviation vectors, whose lengths are those of inertial states."""
+
+    _code: KeplerCode
 
     def __init__(self, kernel: KeplerKernel, vectors: int) -> None:
         self.vectors, self._kernel = vectors, kernel

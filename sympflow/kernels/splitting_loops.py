@@ -144,7 +144,9 @@ class SplittingLoops:
                     "backend='array'."
                 )
             if system.local.arrays_only:
-                raise ValueError(f"`system` has {system.local.arrays_only}, whose kicks are array operations: use 'array'.")
+                raise ValueError(
+                    f"`system` has {system.local.arrays_only}, whose kicks are array operations: use 'array'."
+                )
             if system.local.loops == "pairs":
                 from sympflow.kernels.pairs import few, pair_code
 

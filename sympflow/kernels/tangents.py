@@ -22,6 +22,7 @@ from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Batch, Carry, Task, run_states
+from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import Shape, Splitting, SplittingCode, shared
@@ -250,6 +251,8 @@ def exponent_of(length: Value) -> tuple[Value, Value]:
 class TangentKernel:
     """Compiled loops of one scheme on one system with k deviation vectors: see `tangent_kernel`."""
 
+    _code: Rollouts
+
     def __init__(self, system: HamiltonianSystem, scheme: Scheme, vectors: int) -> None:
         self.vectors, self._width = vectors, 2 * system.ndof
         self._loops, self._scheme = splitting_loops(system), scheme
@@ -267,7 +270,7 @@ class TangentKernel:
         return partial(self._code.run, table), table.shape[1] * self._code.n_out / 2
 
     def _vectors(self, states: np.ndarray, times: np.ndarray, w0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Vectors (N, m, k, 2d) of rows (N, m, ·) after times, and the powers of two by which they are to be multiplied."""
+        """Vectors (N, m, k, 2d) of rows (N, m, ·) after times, and the exponents of two in their lengths."""
         k = self.vectors
         return states[..., self._width : -k].reshape(*states.shape[:2], k, self._width), states[..., -k:]
 
