@@ -15,7 +15,7 @@ from sympflow.integrators.contract import Failure, Integrator, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
 from sympflow.integrators.steppers import Stepper
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.solver import solve
 
 BLOCK = 64
@@ -126,7 +126,7 @@ class Chunk:
                 f"`t_eval` is needed: each orbit has steps of its own with method {self.integrator.name!r}. Give the "
                 "times to report."
             )
-        return Grid(*self.t_span, length).outputs(None, 1)[0]
+        return Grid(*self.t_span, length).outputs(None, 1)
 
     def windows(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), one window after another.
@@ -142,7 +142,7 @@ class Chunk:
             yield times, self.states(times)
             return
         grid = Grid(*self.t_span, stepper.integrator.step_length(self.system))
-        carry, last = Carry(), np.full(len(self), grid.n_steps)
+        carry, last = RunCheckpoint(), np.full(len(self), grid.n_steps)
         for start in range(0, grid.n_steps + 1, most):
             save = np.arange(start, min(start + most, grid.n_steps + 1))
             y, last, _ = kernel.run(grid.h, self.y0, int(save[-1]), save, carry=carry)

@@ -620,12 +620,12 @@ class KeplerKernel(Kernel):
         return f" Bodies {first} and {second} were {distance[k]:.4g} apart, {radii[k]:.3g} Hill radii."
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        return Steps(self.pushed(h, y)[0])
+        return Steps(self.jvp(h, y)[0])
 
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self.pushed(h, y, np.broadcast_to(np.eye(y.shape[-1]), (*y.shape, y.shape[-1])))
+        return self.jvp(h, y, np.broadcast_to(np.eye(y.shape[-1]), (*y.shape, y.shape[-1])))
 
-    def pushed(self, h: ArrayLike, y: np.ndarray, W: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def jvp(self, h: ArrayLike, y: np.ndarray, W: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The steps from rows of `y` (N, 2d), and vectors W (N, 2d, k) moved by their derivatives."""
         vectors = y[..., None, :][:, :0] if W is None else W.swapaxes(-1, -2)
         code, N, k = (

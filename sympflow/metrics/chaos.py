@@ -403,7 +403,7 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndar
         run.spread[rows, column] = _spread(scaled(W[rows]), kind)
         run.elapsed[rows, column] = elapsed[rows]
 
-    for t, h, move in orbits.integrator.pushing(orbits.system, orbits.t_span, orbits.rows):
+    for t, h, move in orbits.integrator.jvp_steps(orbits.system, orbits.t_span, orbits.rows):
         ends = t + h - t0
         if n:
             due = running & (position < n)

@@ -169,7 +169,7 @@ def test_vectors_are_moved_by_the_derivative_of_a_step(system, method, options):
     method = sympflow.get(method)(dt=system.dt, **options)
     composition, n = method.composed(system), 2 * system.ndof
     W = np.random.default_rng(0).normal(size=(n, 3))
-    end, moved = composition.pushed(system.y0, 5 * system.dt, W)
+    end, moved = composition.jvp(system.y0, 5 * system.dt, W)
     y0, h = torch.as_tensor(system.y0), torch.tensor(5 * system.dt, dtype=torch.float64)
     for k in range(3):
         right = jvp(lambda y: composition.step(y, h), y0, torch.as_tensor(W[:, k]))

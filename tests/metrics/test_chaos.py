@@ -240,7 +240,7 @@ def test_vectors_of_large_systems_are_moved_by_the_derivative_of_the_step(name, 
     rng = np.random.default_rng(3)
     y, W = rng.normal(size=(2, 2 * system.ndof)), rng.normal(size=(2, 2 * system.ndof, 3))
     h = np.array([0.1, -0.2])
-    moved = integrator.pushed(system, 0.0, y, h, W)
+    moved = integrator.jvp(system, 0.0, y, h, W)
     expected = forward_tangent(lambda x, s: integrator.step(system, 0.0, x, s), y, h)[1] @ W
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-12)
 
