@@ -348,8 +348,13 @@ class PairsHamiltonian(LocalHamiltonian):
                 sums = f.swapaxes(-1, -2).reshape(-1, len(pairs.i)) @ like(_incidence(self.n_bodies), f)
                 out = out + sums.reshape(*lead, dim, self.n_bodies).swapaxes(-1, -2)
                 continue
-            out = _added(_added(out, pairs.i, f), pairs.j, -f)
+            f, g = self._both_ends(f, pairs)
+            out = _added(_added(out, pairs.i, f), pairs.j, -g)
         return out.reshape(*out.shape[:-2], self.ndof)
+
+    def _both_ends(self, f: Array, pairs: Pairs) -> tuple[Array, Array]:
+        """What the first and the second bodies of pairs feel of these values (..., P, dim)."""
+        return f, f
 
     def _pairs(self, *arrays: Array) -> Iterator[Pairs]:
         """The pairs that interact, in pieces that fit into memory; with a cut-off those of any state of a batch."""
