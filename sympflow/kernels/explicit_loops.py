@@ -130,7 +130,8 @@ class Field:
             code.store(code.constant(0.0), g, m)
         slope = Rows(g, DOUBLE)
         assert self._terms is not None
-        self._terms.add(data, self._terms.slopes, [Rows(y, DOUBLE)], given, lambda places: [(slope, m) for m in places])
+        slopes = self._terms.derivatives(0)
+        self._terms.add(data, slopes, [Rows(y, DOUBLE)], given, lambda places: [(slope, m) for m in places])
         with code.over(d) as m:
             code.store(code.load(g, m + d), out, m)
             force = -code.load(g, m)

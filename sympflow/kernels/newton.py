@@ -386,7 +386,7 @@ class _InMemory(NewtonCode):
             def targets(places: list[Value]) -> list[tuple[Rows, Value]]:
                 return [(slope, m) for m in places] + [(rows, i * n + j) for i in places for j in places]
 
-            self._terms.add(data, self._terms.hessians, [Rows(Y, DOUBLE)], given, targets)
+            self._terms.add(data, self._terms.derivatives(0, True), [Rows(Y, DOUBLE)], given, targets)
             return
         slopes, hessian = self._square(self.slopes(*(code.load(Y, m) for m in range(n)), *given))
         for m, x in enumerate(slopes):

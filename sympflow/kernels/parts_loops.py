@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
-from sympflow.compiler.functions import fma, is_zero, times
-from sympflow.compiler.program import Program, gradient
-from sympflow.hamiltonian.formulas import recorded
+from sympflow.compiler.functions import fma, summed, times
+from sympflow.compiler.program import Program, gradient, tangent, traced
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlow, shears
 from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
@@ -63,48 +63,36 @@ class PartMaps:
 
     def _part(self, number: int, bends: bool, expand: bool) -> tuple[int, Arranged]:
         """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y; its cost before it."""
-        parts, d, lettered = self.parts, self.ndof, self.lettered[number - 1]
-        filtered = [f"phi_{j}" for j in range(d) if self.filters]
+        d, letters = self.ndof, self.lettered[number - 1].letters
+        filters = [f"phi_{j}" for j in range(d) if self.filters]
         states = [*((f"x_{j}", 0) for j in range(d)), *((f"y_{j}", EARLY) for j in range(d))]
-        made = Arrangement([*states, *((s.name, EARLY) for s in lettered.letters)], ["b", "g", *filtered], expand)
-        x, y, letters = made.states[:d], made.states[d : 2 * d], made.states[2 * d :]
-        b, g, *phi = made.constants
-        C, inverse = parts.C.tolist(), parts.inverse_C.tolist()
-        by_phi = [f * v for f, v in zip(phi, x, strict=True)] if phi else x
-        q = [_combined(C[i], by_phi) + float(parts.center[i]) for i in range(d)]
-        p = [_combined([row[i] for row in inverse], y) for i in range(d)]
-        slope, velocity, hessian = self._slopes(number, bends)
-        force, *rest = ([made.number(v) for v in program(*q, *p, *letters)] for program in (slope, velocity))
-        forces = [_combined([row[j] for row in C], force) for j in range(d)]
-        moved = [_combined(inverse[j], rest[0]) for j in range(d)]
-        if phi:
-            forces = [f * v for f, v in zip(phi, forces, strict=True)]
-        changes = [-times(b, v) for v in forces]
-        if bends:
-            rates = parts.inverse_masses(np.zeros(d))
-            direction = [float(rate) * v for rate, v in zip(rates, forces, strict=True)]
-            if phi:
-                direction = [f * v for f, v in zip(phi, direction, strict=True)]
-            z = [_combined(C[i], direction) for i in range(d)]
-            rows = [made.number(v) for v in hessian(*q, *p, *letters)]
-            bent = [_combined(z, rows[d * i : d * (i + 1)]) for i in range(d)]
-            added = [_combined([row[j] for row in C], bent) for j in range(d)]
-            if phi:
-                added = [f * v for f, v in zip(phi, added, strict=True)]
-            changes = [v + times(g, w) for v, w in zip(changes, added, strict=True)]
-        new_x = [made.written(v + times(b, w)) for v, w in zip(x, moved, strict=True)]
-        new_y = [made.written(v + w) for v, w in zip(y, changes, strict=True)]
-        arranged = made.finish([*new_x, *new_y])
-        return 2 * max(made.depth(v) for v in (*new_x, *new_y)) + 3 * len(arranged.body), arranged
+        made = Arrangement([*states, *((s.name, EARLY) for s in letters)], ["b", "g", *filters], expand)
+        (b, g, *phi), program = made.constants, self._slopes(number, bends)
+        slopes = program(*made.states, *(phi or [made.number(1.0)] * d))
+        changes = [times(b, v) for v in slopes[d : 2 * d]]
+        changes += [times(g, w) - times(b, v) for v, w in zip(slopes[:d], slopes[2 * d :] or [0.0] * d, strict=True)]
+        new = [made.written(x + made.number(change)) for x, change in zip(made.states, changes, strict=False)]
+        arranged = made.finish(new)
+        return 2 * max(map(made.depth, new)) + 3 * len(arranged.body), arranged
 
-    def _slopes(self, number: int, bends: bool) -> tuple[Program, Program, Program]:
-        """∂H_k/∂q, ∂H_k/∂p and, where it is needed, ∂²H_k/∂q², from q, p and the letters."""
-        part, lettered, d = self.parts.rest[number - 1], self.lettered[number - 1], self.ndof
-        program = recorded(lettered.expressions, (*part.q, *part.p, *lettered.letters))
-        q = program.inputs[:d]
-        slope = gradient(program.outputs[0], program.inputs[: 2 * d])
-        hessian = [x for s in slope[:d] for x in gradient(s, q)] if bends else []
-        return tuple(Program(program.inputs, x) for x in (slope[:d], slope[d:], hessian))  # type: ignore[return-value]
+    def _slopes(self, number: int, bends: bool) -> Program:
+        """∂H_k/∂x, ∂H_k/∂y and, where it is needed, ∂²H_k/∂x² M⁻¹∂H_k/∂x, from modes, letters and filters."""
+        parts, lettered, d = self.parts, self.lettered[number - 1], self.ndof
+        part, C, inverse = parts.rest[number - 1], parts.C.tolist(), parts.inverse_C.tolist()
+
+        def slopes(*numbers: Any) -> list[Any]:
+            x, y, (letters, phi) = numbers[:d], numbers[d : 2 * d], (numbers[2 * d : -d], numbers[-d:])
+            filtered = [f * v for f, v in zip(phi, x, strict=True)]
+            q = [summed(float(center), row, filtered) for center, row in zip(parts.center, C, strict=True)]
+            p = [summed(0.0, [row[i] for row in inverse], y) for i in range(d)]
+            known = evaluator(dict(zip((*part.q, *part.p, *lettered.letters), (*q, *p, *letters), strict=True)))
+            slope = gradient(known(lettered.expressions[0]), [*x, *y])
+            rates = parts.inverse_masses(np.zeros(d)).tolist() if bends else []
+            along = tangent(slope[:d], x, [rate * v for rate, v in zip(rates, slope, strict=False)]) if bends else []
+            return [*slope, *along]
+
+        names = [f"{name}_{j}" for name in ("x", "y") for j in range(d)] + [s.name for s in lettered.letters]
+        return traced(slopes, *names, *(f"phi_{j}" for j in range(d)))
 
     @cached_property
     def size(self) -> int:
@@ -214,17 +202,6 @@ class PartsCode(Rollouts):
         for i, code in enumerate(self.groups[k]):
             values = self.maps.apply(code, values, lambda j, i=i: numbers(i * self.maps.size + j), step)
         return values
-
-
-def _combined(weights: Sequence[Any], values: Sequence[Any]) -> Any:
-    """Σ weights_i values_i, without those that are 0."""
-    total: Any = 0.0
-    for w, x in zip(weights, values, strict=True):
-        if is_zero(w):
-            continue
-        term = x if isinstance(w, float) and w == 1 else times(w, x)
-        total = term if isinstance(total, float) else total + term
-    return total
 
 
 def parts_loops(parts: ExactParts) -> PartsLoops:

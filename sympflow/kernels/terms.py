@@ -8,7 +8,6 @@ however many there are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -177,6 +176,7 @@ class Terms:
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
         self._given = f, tuple(variables), tuple(letters)
         self._families, self._letters = families(f, variables), tuple(letters)
+        self._programs: dict[tuple[int, bool], list[Program]] = {}
         self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
         for family in self._families:
             self.data += [family.coordinates.astype(np.int64), family.constants]
@@ -195,20 +195,12 @@ class Terms:
             )
         return self
 
-    @cached_property
-    def slopes(self) -> list[Program]:
-        """∇f of a term of each kind."""
-        return [self._derived(family, 0) for family in self._families]
-
-    @cached_property
-    def products(self) -> list[Program]:
-        """∇²f v."""
-        return [self._derived(family, 1) for family in self._families]
-
-    @cached_property
-    def bends(self) -> list[Program]:
-        """½ ∇³f(v, v)."""
-        return [self._derived(family, 2) for family in self._families]
+    def derivatives(self, times: int, bends: bool = False) -> list[Program]:
+        """Of a term of each kind ∇f, ∇²f v or ½ ∇³f(v, v), by the times along v; their own derivatives behind."""
+        key = times, bends
+        if key not in self._programs:
+            self._programs[key] = [self._derived(family, *key) for family in self._families]
+        return self._programs[key]
 
     def _derived(self, family: Family, times: int, bends: bool = False) -> Program:
         """∇f, that often differentiated along v, and divided by the factorial; with its own derivatives."""
@@ -227,11 +219,6 @@ class Terms:
         made = Arrangement([(name, 0) for name in names])
         found = traced(slopes, *names)(*made.states)
         return made.finish([made.written(made.number(y)) for y in found]).body
-
-    @cached_property
-    def hessians(self) -> list[Program]:
-        """∇f, and ∇²f row by row."""
-        return [self._derived(family, 0, True) for family in self._families]
 
     def add(
         self,
