@@ -27,10 +27,11 @@ from sympflow.arrays import (
     unfollowed,
     values,
 )
-from sympflow.compiler.tracing import Untraceable, trace
+from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.formulas import TracedHamiltonian
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
+from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.times import probe_times
 
 MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays
@@ -122,6 +123,26 @@ class CallableHamiltonian(Definition):
             except Untraceable as reason:
                 self.untraced = str(reason)
                 return None
+
+    @cached_property
+    def layered(self) -> LayeredPotential | None:
+        *_, gradient, product = self._functions
+        given = self.timed or gradient is not None or product is not None or not self.separable
+        if self.form is not None or self.untraced != WEIGHTS or given:
+            return None
+        y0, domain, inverse_mass, _ = self._scene
+        try:
+            chain = trace_chain(self._given_function, [f"q{i + 1}" for i in range(self.ndof)])
+            found = LayeredPotential(self.ndof, chain, inverse_mass)
+        except Untraceable as reason:
+            if str(reason) != WEIGHTS:
+                self.untraced = f"{WEIGHTS}, and {reason}"
+            return None
+        states = probe_states(y0, domain, 2 * self.ndof)[:TRIED]
+        if not _alike(found.value(states[:, : self.ndof]), self._values(states, [0.0] * len(states))):
+            return None
+        self._known = states[0], 0.0, np.nan
+        return found
 
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]
@@ -224,9 +245,13 @@ class CallableHamiltonian(Definition):
 
     def check_unchanged(self) -> None:
         """Raise a ValueError if the function has another value than when it was traced."""
-        if self.form is None:
+        if self.layered is not None:
+            state, t, _ = self._known
+            expected = float(self.layered.value(state[None, : self.ndof])[0])
+        elif self.form is not None:
+            state, t, expected = self._known
+        else:
             return
-        state, t, expected = self._known
         with np.errstate(all="ignore"):
             value = float(self._single(self._given_function, state, t))
         if not abs(value - expected) <= CLOSE * abs(expected):

@@ -38,6 +38,7 @@ class Definition:
     impulses: tuple[Any, ...] = ()  # DiracDelta in t: then there are `between_impulses` and `kicks`
     poles: Poles | None = None  # the places at which H is infinite or no number, which a step may leap over
     form: Any = None  # the program of functions that could be traced: see `sympflow.hamiltonian.formulas`
+    layered: Any = None  # V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"

@@ -112,7 +112,12 @@ class Stepper:
         if self.kernel is None:
             return self.arrays.takes_carry
         y0 = self.problem.y0  # where torch follows the run, it cannot from piece to piece
-        return not is_tensor(y0) or not differentiable(y0, *self.problem.followed.values())
+        return not is_tensor(y0) or not differentiable(y0, *self.followed)
+
+    @property
+    def followed(self) -> Sequence[Any]:
+        """The tensors besides y0 to which gradients of compiled loops flow: parameters, or weights in H."""
+        return [*self.problem.followed.values()] or (() if self.kernel is None else self.kernel.tensors)
 
     @property
     def counts_itself(self) -> bool:
@@ -216,7 +221,7 @@ def _no_loops_for(y0: Array, system: Any) -> str | None:
         return f"`y0` is on {y0.device}: move it to the CPU, or use backend='array'."
     if transformed(y0):
         return "`y0` is followed by torch.func, forward mode or torch.compile: use backend='array'."
-    if system.learns(y0):
+    if system.layered is None and system.learns(y0):
         return "`system` has numbers that torch follows: use backend='array'."
     return None
 

@@ -211,12 +211,15 @@ class Kernel(ABC):
         True if all states that a run saves up to its last finite step are finite numbers.
     backend : str
         The name of what runs, of `stats["backend"]`.
+    tensors : sequence of Tensor
+        Weights in H that torch follows, whose numbers are read in each run.
     remark : str
         A sentence on the end of the last run of a single state that could not go on.
     """
 
     saves_finite = True
     backend = "compiled"
+    tensors: Sequence[Any] = ()
     remark = ""
 
     def run(

@@ -22,6 +22,7 @@ from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
+    from sympflow.hamiltonian.layered import LayeredPotential
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
@@ -70,6 +71,8 @@ class SplittingLoops:
         By how much less it takes in a batch, whose lanes run side by side.
     driven : bool
         True if H depends on t.
+    tensors : sequence of Tensor
+        Weights that torch follows, whose numbers are read in each run.
     """
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
@@ -83,6 +86,7 @@ class SplittingLoops:
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., SplittingRollouts]
         self._longs: dict[int, bool] = {}
+        self.tensors: Sequence[Any] = ()
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not (system.separable if symbols is None else symbols.separable):
@@ -138,8 +142,10 @@ class SplittingLoops:
                     f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
                     "backend='array'."
                 )
-            if system.local.felt is not None:
-                raise ValueError("`system` has bodies without mass, whose kicks are array operations: use 'array'.")
+            if system.local.arrays_only:
+                raise ValueError(
+                    f"`system` has {system.local.arrays_only}, whose kicks are array operations: use 'array'."
+                )
             if system.local.loops == "pairs":
                 from sympflow.kernels.pairs import few, pair_code
 
@@ -151,6 +157,14 @@ class SplittingLoops:
                 self._compile = partial(lattice_code, system.local, bool(system.friction))
             self._has_force_gradient = system.quadratic_kinetic
             self.traced = self._written is not None
+        elif system.layered is not None:
+            if system.friction:
+                raise ValueError(
+                    f"`system` {system.name!r} has friction, and weights that torch follows: use backend='array'."
+                )
+            self._has_force_gradient, self.tensors = False, system.layered.tensors
+            self.work = system.layered.n_weights
+            self._compile = partial(_layered_code, system.layered)
         else:
             raise ValueError(
                 f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change them, "
@@ -334,6 +348,14 @@ class SplittingLoops:
         return out
 
 
+def _layered_code(layered: LayeredPotential, level: int, compensated: bool, monomials: Monomials) -> Any:
+    if compensated:
+        raise ValueError("`compensated` sums are not compiled for weights that torch follows: leave it out.")
+    from sympflow.kernels.layered_splittings import LayeredCode
+
+    return LayeredCode(layered)
+
+
 class SplittingKernel(Kernel):
     """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`."""
 
@@ -341,7 +363,7 @@ class SplittingKernel(Kernel):
         self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None
     ) -> None:
         self.loops, self.scheme, self.compensated, self._ranges = loops, scheme, compensated, ranges
-        self._width = 2 * loops.ndof * (1 + compensated)
+        self._width, self.tensors = 2 * loops.ndof * (1 + compensated), loops.tensors
 
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         """The numbers of a run whose steps are h, as the loops read them; of a driven system from a time t0 on."""
