@@ -429,7 +429,7 @@ T = np.linspace(0, 10, 51)
 CLOCKS = {
     "drive": (lambda t, q, p: [p, -q - q**3 + 0.3 * np.cos(1.7 * t)], r"drive=1\.(69|70)", {"drive": True}),
     "stiffness": (lambda t, q, p: [p, -(1 + 0.3 * np.cos(2.3 * t)) * q], r"drive=2\.(29|30)", {"drive": 2.3}),
-    "drag": (lambda t, q, p: [p, -q - q**3 - 0.1 * abs(p) * p], 'damping="quadratic"', {"damping": "quadratic"}),
+    "drag": (lambda t, q, p: [p, -q - q**3 - 0.3 * abs(p) * p], 'damping="quadratic"', {"damping": "quadratic"}),
 }
 
 
