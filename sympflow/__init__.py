@@ -161,7 +161,11 @@ def __getattr__(name: str) -> Any:
     if name in (*_MODULES, *_ROOMS):
         return import_module(f"sympflow.{name}")
     if name not in _HOME:
-        raise AttributeError(f"module 'sympflow' has no attribute {name!r}")
+        from difflib import get_close_matches
+
+        close = [] if name.startswith("_") else get_close_matches(name, (*_HOME, *_MODULES, *_ROOMS), 1)
+        hint = f". Did you mean {close[0]!r}?" if close else ""
+        raise AttributeError(f"module 'sympflow' has no attribute {name!r}{hint}")
     value = getattr(whole_import(f"sympflow.{_HOME[name]}"), name)
     globals()[name] = value
     return value

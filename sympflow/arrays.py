@@ -342,3 +342,49 @@ def like(values: Any, x: Array) -> Array:
 
         return torch.as_tensor(values if is_tensor(values) else np.array(values), dtype=x.dtype, device=x.device)
     return np.asarray(values, dtype=x.dtype)
+
+
+def opaque(function: Any, *x: Array) -> Array:
+    """Return a function of NumPy arrays of the tensors x, which torch differentiates by the function's own rules.
+
+    Parameters
+    ----------
+    function : object
+        `value(*arrays)`; `jvp(x, v)`, its derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
+        the derivatives of Σ w·value by those of x that are wanted.
+    """
+    return _opaque_function().apply(function, *x)
+
+
+@cache
+def _opaque_function() -> Any:
+    import torch
+
+    class Opaque(torch.autograd.Function):
+        @staticmethod
+        def forward(function: Any, *x: torch.Tensor) -> torch.Tensor:
+            return torch.as_tensor(function.value(*map(to_numpy, x)), dtype=x[0].dtype, device=x[0].device)
+
+        @staticmethod
+        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+            ctx.function, *x = inputs
+            ctx.save_for_backward(*x)
+            ctx.save_for_forward(*x)
+            ctx.set_materialize_grads(False)  # so that what does not vary is told from what does
+
+        @staticmethod
+        def backward(ctx: Any, w: torch.Tensor | None) -> tuple[Any, ...]:
+            x, wanted = ctx.saved_tensors, ctx.needs_input_grad[1:]
+            return None, *((None,) * len(x) if w is None else ctx.function.vjp(x, w, wanted))
+
+        @staticmethod
+        def jvp(ctx: Any, _: None, *v: torch.Tensor | None) -> torch.Tensor:
+            return ctx.function.jvp(ctx.saved_tensors, v)
+
+        @staticmethod
+        def vmap(info: Any, in_dims: tuple[Any, ...], function: Any, *x: torch.Tensor) -> tuple[torch.Tensor, int]:
+            n, dims = info.batch_size, in_dims[1:]
+            moved = [y.expand(n, *y.shape) if i is None else y.movedim(i, 0) for y, i in zip(x, dims, strict=True)]
+            return Opaque.apply(function, *moved), 0
+
+    return Opaque

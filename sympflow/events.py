@@ -51,7 +51,7 @@ class Event:
                 "Return a scalar, e.g. y[0]."
             ) from error
         if math.isnan(number) and np.isfinite(to_numpy(y)).all():
-            raise ValueError(f"{self.label} returned NaN at t = {t:.17g}: return a number for every finite state.")
+            raise ValueError(f"{self.label} returned NaN at t = {t:.15g}: return a number for every finite state.")
         return number
 
     def crossed(self, before: float, after: float) -> bool:

@@ -310,7 +310,7 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     check_applies(integrator, between, y_start)
     integrator.check_library(y_start)
     run: Callable[[Integrator, Problem], tuple[Outcome, Problem]] = _run
-    able = problem.store is None and problem.letters is None
+    able = problem.store is None and problem.parameter_values is None
     told, jumps = landings(integrator, between, problem.t0, problem.t1, able)
     if told:
         warn(told, RuntimeWarning)
@@ -360,8 +360,8 @@ def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows
     """The solution of trajectories to whose parameters gradients flow: one run, whatever the values."""
     columns = {name: np.ravel(value) for name, value in rows.values.items()}
     followed = {name: rows.followed.get(name, as_tensor(column.copy())) for name, column in columns.items()}
-    letters = np.stack([*columns.values()])
-    together = replace(problem, letters=letters, followed=followed, diagnosed=False)
+    parameter_values = np.stack([*columns.values()])
+    together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)
     if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
         raise ValueError(
             f"`params` has {', '.join(rows.followed)} that require gradients, which flow through no `events`, "
@@ -379,8 +379,10 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
     groups = []
     alike = action == "ignore" and problem.system.between_impulses is problem.system
     for group in rows.by_form() if alike else rows.distinct():
-        together = replace(problem, system=group.system, y0=states[group.places], letters=group.letters)
-        if group.letters is None or integrator.takes_letters(together):
+        together = replace(
+            problem, system=group.system, y0=states[group.places], parameter_values=group.parameter_values
+        )
+        if group.parameter_values is None or integrator.takes_parameter_values(together):
             groups.append((group.places, together))
             continue
         for few, system, _ in rows.taken(group.places).distinct():
@@ -391,7 +393,7 @@ def _solved_rows(integrator: Integrator, problem: Problem, action: str, rows: Pa
         for index, part in groups:
             sol = _solved(integrator, part, action, rows.taken(index))
             pieces.append((index, sol))
-            if problem.diagnosed and part.letters is not None and not sol.success:
+            if problem.diagnosed and part.parameter_values is not None and not sol.success:
                 note_singularities_of_rows(sol, integrator, part, rows.taken(index))
     except Interrupted as stop:
         pieces.append((index, stop.solution))
@@ -554,7 +556,7 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
     first = int(np.argmin(finite[(slice(None), *np.argwhere(bad)[0])] if bad.ndim else finite))
     index = f" (trajectory {', '.join(map(str, np.argwhere(bad)[0].tolist()))})" if bad.ndim else ""
     outcome.message = (
-        f"The solution became non-finite before t = {outcome.t[first]:.17g}{index}. Start from a smaller state, or end "
+        f"The solution became non-finite before t = {outcome.t[first]:.15g}{index}. Start from a smaller state, or end "
         "`t_span` earlier."
     )
     outcome.status = np.where(bad, -1, outcome.status) if bad.ndim else -1

@@ -8,6 +8,7 @@ import pytest
 
 import sympflow
 from sympflow import HamiltonianSystem, solve
+from sympflow.hamiltonian.fingerprint import fingerprint, same_system
 from sympflow.hamiltonian.scales import natural_scale, smallest_size
 from sympflow.metrics.reference import reference
 
@@ -306,3 +307,31 @@ def test_a_default_tolerance_hides_no_errors(method, units):
         warnings.simplefilter("error")
         np.testing.assert_allclose(end(units), end((1.0, 1.0, 1.0)), atol=5e-3)
         solve(scaled("well", units), method, y0=[0.0, 0.0])
+
+
+@pytest.mark.parametrize("units", UNITS[:2])
+@pytest.mark.parametrize("well", ["((u/a)**2 - 1)**2/4", "(1 - cos(u/a))", "cos(u/a)", "(u/a - 2)**2/2"])
+def test_states_of_lattices(well, units):
+    def drawn(a, b, c):
+        lattice = HamiltonianSystem.lattice(
+            shape=6,
+            onsite=f"E*{well}",
+            bond="E*(r/a)**2/2",
+            kinetic="E*(p/b)**2/2",
+            params={"a": a, "b": b, "E": a * b / c},
+            domain=sympflow.LatticeStates(0.1 * a * b / c),
+            fields="u",
+        )
+        return lattice.domain.sample(8, 0) / np.repeat([a, b], 6)
+
+    np.testing.assert_allclose(drawn(*units), drawn(1.0, 1.0, 1.0), atol=1e-5)
+
+
+@pytest.mark.parametrize("a", [1e-10, 1.0, 1e11])
+def test_identities_of_bodies(a):
+    def identity(k):
+        V = "(r/a)**-12 - k*(r/a)**-6"
+        return fingerprint(HamiltonianSystem.pairs(V, masses=np.ones(3), params={"a": a, "k": k}))
+
+    assert same_system(identity(1.0), identity(1.0))
+    assert not same_system(identity(1.0), identity(1.001))

@@ -30,15 +30,7 @@ Terms = dict[Monomial, Any]
 
 
 class Arranged(NamedTuple):
-    """A program in two parts.
-
-    Attributes
-    ----------
-    table : Program
-        From the constants of a run to the numbers that `body` reads.
-    body : Program
-        From the states and the outputs of `table` to the results.
-    """
+    """A program in two parts: `table`, of the constants of a run, and `body`, of states and what the table gives."""
 
     table: Program
     body: Program
@@ -79,19 +71,8 @@ class Plan(NamedTuple):
 class Arrangement:
     """States, constants, and what is made of them.
 
-    Parameters
-    ----------
-    states : sequence of (str, int)
-        Names, and when each is known, in cycles.
-    constants : sequence of str
-        Names of what does not change in a run.
-    expand : bool
-        False leaves products of sums (`times`) as they are.
-
-    Attributes
-    ----------
-    states, constants : list
-        The numbers, to be calculated with.
+    Of `states` names are given, and when each is known, in cycles; of `constants`, which do not change in a run, names.
+    Both are attributes then, as numbers to be calculated with. Without `expand`, products of sums (`times`) stay so.
     """
 
     def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = (), expand: bool = True) -> None:

@@ -152,13 +152,7 @@ class Rows:
 
 
 class Module:
-    """The functions of one piece of machine code, and what they need.
-
-    Parameters
-    ----------
-    fused : bool
-        True if the machine multiplies and adds in one instruction; else the two are rounded apart.
-    """
+    """The functions of one piece of machine code, and what they need; `fused` where a product and sum are one."""
 
     def __init__(self, fused: bool = True) -> None:
         self.fused = fused
@@ -219,12 +213,7 @@ _INTRINSIC = {"sqrt": "llvm.sqrt", "abs": "llvm.fabs", "floor": "llvm.floor"}
 
 
 class Code:
-    """One function, written line by line.
-
-    Attributes
-    ----------
-    arguments : list of Value
-    """
+    """One function, written line by line; its `arguments` are values."""
 
     def __init__(
         self,
@@ -509,28 +498,15 @@ class Code:
 
         Returns the values after the last one.
         """
-        count = self.operand(count, INT)
-        head, inside, after = self._label(), self._label(), self._label()
-        before = self._block
-        self._branch(head)
-        self._begin(head, before)
-        place = len(self._lines)
-        k = self._name(INT)
-        values = [self._name(v.type) for v in carried]
-        condition = k < count
-        self._lines.append(f"  br i1 {condition.name}, label %{inside}, label %{after}")
-        self._begin(inside, head)
-        new = list(body(k, values))
-        following = k + 1
-        end = self._block
-        self._branch(head)
-        phis = [
-            f"  {v.name} = phi {v.type} [ {first.name}, %{before} ], [ {last.name}, %{end} ]"
-            for v, first, last in zip([k, *values], [self.constant(0, INT), *carried], [following, *new], strict=True)
-        ]
-        self._lines[place:place] = phis
-        self._begin(after, head)
-        return values
+        variables = [self.variable(x) for x in carried]
+        with self.over(count) as k:
+            for variable, x in zip(variables, body(k, [x.value for x in variables]), strict=True):
+                variable.value = x
+        return [x.value for x in variables]
+
+    def fold(self, count: Any, x: Value, body: Callable[[Value, Value], Value]) -> Value:
+        """Return what `body(k, x)` makes of a value, one turn after the other, for k = 0 … count − 1."""
+        return self.loop(count, [x], lambda k, values: [body(k, values[0])])[0]
 
     @contextmanager
     def sweep(self, first: Value, last: Value, read: Callable[[Any, Value], Value]) -> Iterator[Sweep]:
@@ -563,20 +539,12 @@ class Code:
 
     def repeat(self, carried: Sequence[Value], body: Callable[..., tuple[Value, Sequence[Value]]]) -> list[Value]:
         """Execute `body(values)`, which returns whether to go on and the new values, at least once."""
-        head, after, before = self._label(), self._label(), self._block
-        self._branch(head)
-        self._begin(head, before)
-        place = len(self._lines)
-        values = [self._name(v.type) for v in carried]
-        again, new = body(values)
-        end = self._block
-        self._lines.append(f"  br i1 {again.name}, label %{head}, label %{after}")
-        self._lines[place:place] = [
-            f"  {v.name} = phi {v.type} [ {first.name}, %{before} ], [ {last.name}, %{end} ]"
-            for v, first, last in zip(values, carried, new, strict=True)
-        ]
-        self._begin(after, end)
-        return list(new)
+        variables, going = [self.variable(x) for x in carried], self.variable(self.constant(1, BOOL))
+        with self.during(lambda: going.value):
+            going.value, new = body([x.value for x in variables])
+            for variable, x in zip(variables, new, strict=True):
+                variable.value = x
+        return [x.value for x in variables]
 
     def when(
         self,
@@ -637,12 +605,7 @@ class Code:
 
 
 class Sweep:
-    """Turns k of a loop over places, in which values of places further on stay in registers until their turn comes.
-
-    Attributes
-    ----------
-    k : Value
-    """
+    """Turns k of a loop over places, in which values of places further on stay in registers until their turn comes."""
 
     def __init__(self, code: Code, first: Value, read: Callable[[Any, Value], Value]) -> None:
         self.code, self.k = code, code._name(INT)

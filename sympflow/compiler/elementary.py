@@ -7,7 +7,7 @@ branch that others never take. float32 is computed in double precision.
 Errors in units in the last place, for all arguments: below 1 for exp and log, 3 for tanh, 2 for expm1, log1p, atan and
 powers; up to `FAR` 2 for sin, cos and tan, 3 on machines without fused operations. Angles beyond `FAR` have the errors
 of the C library, and so have the functions that are its own: with glibc below 1 for angles, up to 16 where a sine or
-cosine is below 1e-18, and below 4 for the functions. digamma and trigamma are right to 16 units of their largest term.
+cosine is below 1e-18, and below 4 for the functions. digamma, trigamma: 16 units of their largest term.
 Constant powers differ from those of C in this: a half power of −∞ is NaN, x^(−3/2) is 0 where it would be subnormal.
 
 Polynomials of sin, cos and log are those of fdlibm (Sun Microsystems, 1993, free to use with this notice); the others
@@ -22,8 +22,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+from numpy.polynomial import Polynomial
+
 from sympflow.compiler.control import DOUBLE, LOWERED, Type, Value
-from sympflow.compiler.functions import OF_SCIPY, SPECIAL, fma, where
+from sympflow.compiler.functions import MOST_DERIVATIVES, OF_SCIPY, SPECIAL, fma, where
 
 __all__ = ["LOWERED"]
 
@@ -511,11 +513,11 @@ for _name in OF_SCIPY:
     _lowered(_name, inline=0)(partial(_by_scipy, name=_name))
 
 
-# the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.12 from 16 on, below by
+# the derivatives of ln Γ, which C has not: Abramowitz and Stegun (1964), 6.3.18 and 6.4.11 from 16 on, below by
 # recurrence, below 1/2 by reflection --------------------------------------------------------------------------------
 
 DIGAMMA = (1 / 12, -1 / 120, 1 / 252, -1 / 240, 1 / 132, -691 / 32760, 1 / 12)
-TRIGAMMA = (1 / 6, -1 / 30, 1 / 42, -1 / 30, 5 / 66, -691 / 2730, 7 / 6)
+BERNOULLI = (1 / 6, -1 / 30, 1 / 42, -1 / 30, 5 / 66, -691 / 2730, 7 / 6)
 
 
 def _raised(x: Value, term: Callable[[Value], Value]) -> tuple[Value, Value, Value, Value]:
@@ -539,10 +541,17 @@ def _digamma(x: Value) -> Value:
     return where(below, y - math.pi / LOWERED["tan"](angle), y)
 
 
-@_lowered("trigamma", inline=0)
-def _trigamma(x: Value) -> Value:
-    below, w, total, angle = _raised(x, lambda w: w * w)
-    z = w * w
-    y = total + (w + (0.5 * z + w * z * _estrin(TRIGAMMA, z)))
-    sine = math.pi / LOWERED["sin"](angle)
-    return where(below, sine * sine - y, y)
+def _polygamma(x: Value, n: int) -> Value:
+    """The n-th derivative of digamma, (−1)ⁿ⁺¹ n! Σ (x + k)⁻ⁿ⁻¹; by reflection with that of π cot πx."""
+    below, w, total, angle = _raised(x, lambda w: math.prod([w] * n, start=w))
+    series = [b * math.comb(2 * k + n - 1, n - 1) / n for k, b in enumerate(BERNOULLI, 1)]
+    y = total + math.prod([w] * n, start=1 / n + w * (0.5 + w * _estrin(series, w * w)))
+    slope = Polynomial([0.0, 1.0])
+    for k in range(1, n + 1):
+        slope = Polynomial([-1.0, 0.0, -1.0]) * slope.deriv() * (math.pi / k)
+    reflected = y + math.pi * _estrin(slope.coef.tolist(), 1.0 / LOWERED["tan"](angle))
+    return where(below, -math.factorial(n) * reflected, (-1.0) ** (n + 1) * math.factorial(n) * y)
+
+
+for _n in range(1, MOST_DERIVATIVES + 1):
+    _lowered(f"polygamma{_n}", inline=0)(partial(_polygamma, n=_n))

@@ -6,6 +6,7 @@ be traced. Derivatives are written with numbers of any kind.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -78,22 +79,29 @@ def _sign(x: Any) -> Any:
     return x.sign().where(~x.isnan(), x)
 
 
-def _trigamma(x: Any) -> Any:
-    return _special("polygamma")(1, x)
+def _polygamma(n: int) -> Function:
+    """The n-th derivative of the digamma function."""
 
+    def of_tensors(x: Any) -> Any:
+        import torch
 
-def _trigamma_of_tensors(x: Any) -> Any:
-    import torch
+        return (-1.0) ** (n + 1) * math.factorial(n) * torch.special.zeta(n + 1.0, x)  # torch.polygamma has few digits
 
-    return torch.special.zeta(2.0, x)  # torch.polygamma(1, x) has errors of 4e-10
+    def partials(y: Any, x: Any) -> tuple[Any]:
+        if n == MOST_DERIVATIVES:
+            raise ValueError(
+                f"`polygamma` of the order {n} has no derivative here: use a method with fewer derivatives of H, such "
+                "as 'kahan_li8'."
+            )
+        return (apply(f"polygamma{n + 1}", x),)
 
-
-def _no_further(y: Any, x: Any) -> tuple[Any]:
-    raise ValueError("`trigamma` has no derivative here: use a method with fewer derivatives of H, or backend='array'.")
+    return Function(lambda x: _special("polygamma")(n, x), of_tensors, partials, 160)
 
 
 def _choice(y: Any, c: Any, a: Any, b: Any) -> tuple[Any, Any, Any]:
-    return 0.0, apply("where", c, 1.0, 0.0), apply("where", c, 0.0, 1.0)
+    """Derivatives of a choice; of one between a function and no number these are none either."""
+    none_a, none_b = (x if isinstance(x, float) and math.isnan(x) else 0.0 for x in (a, b))
+    return 0.0, apply("where", c, 1.0, none_b), apply("where", c, none_a, 1.0)
 
 
 def _power_rule(y: Any, x: Any, n: Any) -> tuple[Any, Any]:
@@ -140,6 +148,8 @@ def _bessel(name: str, before: float, after: float) -> Callable[..., Any]:
     return lambda y, n, x: 0.5 * (before * apply(name, n - 1.0, x) + after * apply(name, n + 1.0, x))
 
 
+MOST_DERIVATIVES = 6
+"""The highest order of `polygamma`: third derivatives of the third of ln Γ."""
 _TWO_OVER_ROOT_PI = 2.0 / np.sqrt(np.pi)
 
 # fmt: off
@@ -186,8 +196,8 @@ FUNCTIONS: dict[str, Function] = {
     "erf": Function(_special("erf"), "erf", lambda y, x: (_TWO_OVER_ROOT_PI * apply("exp", -(x * x)),), 160),
     "erfc": Function(_special("erfc"), "erfc", lambda y, x: (-_TWO_OVER_ROOT_PI * apply("exp", -(x * x)),), 160),
     "lgamma": Function(_special("gammaln"), "lgamma", lambda y, x: (apply("digamma", x),), 160),
-    "digamma": Function(_special("psi"), "digamma", lambda y, x: (apply("trigamma", x),), 160),
-    "trigamma": Function(_trigamma, _trigamma_of_tensors, _no_further, 160),
+    "digamma": Function(_special("psi"), "digamma", lambda y, x: (apply("polygamma1", x),), 160),
+    **{f"polygamma{n}": _polygamma(n) for n in range(1, MOST_DERIVATIVES + 1)},
     "gamma": Function(_special("gamma"), _no_tensors("gamma"), lambda y, x: (y * apply("digamma", x),), 160),
     "gammainc": Function(_special("gammainc"), _no_tensors("gammainc"), _by_last(
         "gammainc", lambda y, s, x: apply("pow", x, s - 1.0) * apply("exp", -x) / apply("gamma", s)), 200),

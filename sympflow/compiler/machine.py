@@ -20,16 +20,9 @@ __all__ = ["Host", "address", "compiled", "host"]
 
 
 class Host(NamedTuple):
-    """The processor that code is made for.
+    """The processor that code is made for: `cpu` and `features` as LLVM names them.
 
-    Attributes
-    ----------
-    cpu, features : str
-        As LLVM names them.
-    fused : bool
-        True if it multiplies and adds in one instruction.
-    register : int
-        Doubles in one of its registers.
+    It is `fused` if it multiplies and adds in one instruction; a `register` holds so many doubles.
     """
 
     cpu: str

@@ -184,13 +184,7 @@ def reached(outputs: Sequence[Any]) -> list[Traced]:
 
 
 class Program:
-    """Inputs, the operations on them, and outputs. To be called with numbers of any kind, and printed.
-
-    Parameters
-    ----------
-    inputs : sequence of Traced
-    outputs : sequence of Traced or float
-    """
+    """Inputs, the operations on them, and outputs. To be called with numbers of any kind, and printed."""
 
     def __init__(self, inputs: Sequence[Traced], outputs: Sequence[Any]) -> None:
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
@@ -272,14 +266,7 @@ def fused(program: Program) -> Program:
 
 
 def traced(function: Callable[..., Sequence[Any]], *names: str) -> Program:
-    """Record a function of as many numbers as there are names.
-
-    Parameters
-    ----------
-    function : callable
-        Of numbers, positional; returns a sequence of numbers.
-    names : str
-    """
+    """Record a function of as many numbers as there are names; it returns a sequence of numbers."""
     recording = Recording()
     inputs = [recording.input(name) for name in names]
     return Program(inputs, list(function(*inputs)))

@@ -12,15 +12,16 @@ import operator
 import warnings
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sympflow.arrays import is_tensor
 from sympflow.compiler.functions import OF_SCIPY, apply
-from sympflow.compiler.program import Program, Recording, Traced
+from sympflow.compiler.program import Program, Recording, Traced, reached, traced
 
-__all__ = ["TracedArray", "Untraceable", "trace"]
+__all__ = ["WEIGHTS", "Chain", "TracedArray", "Untraceable", "trace", "trace_chain"]
 
 MOST_OPERATIONS, MOST_VARIABLES = 50_000, 300  # of one function; larger systems run as array operations
 LARGEST_COFACTORS = 3  # of matrices; larger ones are eliminated
@@ -32,6 +33,7 @@ class Untraceable(TypeError):
 
 BRANCH = "it branches on a value: write np.where(condition, a, b) in place of `if`, `min` and `max`"
 VALUE = "it asks for the value of a coordinate, by float(), item() or a function of `math`: write np.cos for math.cos"
+WEIGHTS = "it has a tensor that requires gradients, such as weights of a network"
 BY_CONDITION = "it indexes by a condition: write np.where(condition, a, b)"
 
 
@@ -170,6 +172,8 @@ _OF_NUMPY = {"dim": "axis", "keepdim": "keepdims", "input": "x", "other": "y"}
 
 def _by_rule(rule: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any]) -> Any:
     """The result of a function of torch."""
+    if rule is TORCH["linear"] and is_tensor(args[1]) and args[1].requires_grad:
+        return _array(_linear_layer(*args, **options), TracedTensor)
     given = {_OF_NUMPY.get(key, key): _plain(x) for key, x in options.items() if key != "dtype"}
     return _wrapped(rule(*_plain(args), **given), TracedTensor)
 
@@ -209,7 +213,7 @@ def _plain(x: Any) -> Any:
         return {key: _plain(y) for key, y in x.items()}
     if is_tensor(x):
         if x.requires_grad:
-            raise Untraceable("it has a tensor that requires gradients, such as weights of a network")
+            raise Untraceable(WEIGHTS)
         return x.cpu().numpy()
     return x
 
@@ -619,6 +623,8 @@ class _Recorded(Recording):
     """Recorded operations of a function, in which roots are powers, as they are in formulas."""
 
     _inside = False
+    layers: list[_Layer] | None = None
+    """Linear layers whose weights require gradients, where these are taken."""
 
     def record(self, name: str, args: Sequence[Any]) -> Any:
         if len(self) > MOST_OPERATIONS:
@@ -644,27 +650,102 @@ class _Recorded(Recording):
         return (a.args[0], b / 2, None) if root and b % 2 == 1 else None
 
 
-def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
-    """Record a function of arrays, which returns one number.
+class _Layer(NamedTuple):
+    """A linear layer as it was called: from numbers to new ones."""
 
-    Parameters
+    weight: Any
+    bias: Any
+    given: np.ndarray
+    results: list[Traced]
+
+
+def _linear_layer(x: Any, weight: Any, bias: Any = None) -> np.ndarray:
+    numbers = _raw(x) if isinstance(x, TracedArray) else _objects(x)
+    recording = next((n.recording for n in numbers.flat if isinstance(n, Traced)), None)
+    layers = recording.layers if isinstance(recording, _Recorded) else None
+    tensors = [w for w in (weight, bias) if w is not None]
+    if (
+        recording is None
+        or layers is None
+        or not all(is_tensor(w) and w.is_leaf and w.device.type == "cpu" for w in tensors)
+    ):
+        raise Untraceable(WEIGHTS)
+    if numbers.ndim != 1:
+        raise Untraceable("a linear layer of a matrix has no rule")
+    results = [recording.input(f"layer{len(layers)}_{i}") for i in range(len(weight))]
+    layers.append(_Layer(weight, bias, numbers, results))
+    return np.array(results, dtype=object)
+
+
+class Chain(NamedTuple):
+    """A function of x (n,): linear layers one after the other, with a function of each number between two of them.
+
+    Attributes
     ----------
-    function : callable
-    names : sequence
-        Of each argument: the names of the elements of an array, or that of a number.
-    torch : bool
-        True of a function that takes tensors.
-
-    Raises
-    ------
-    Untraceable
-        With the reason.
+    first : Program
+        From x to what the first layer takes.
+    between : list of Program
+        From one number to one, behind each layer but the last.
+    last : Program
+        From x and what the last layer returns to the value.
+    layers : list of (weight, bias)
+        Tensors (to, from) and (to,), or None.
     """
+
+    first: Program
+    between: list[Program]
+    last: Program
+    layers: list[tuple[Any, Any]]
+
+
+def trace_chain(function: Callable[..., Any], names: Sequence[str]) -> Chain:
+    """Record a function of a tensor with linear layers, whose weights may change: see `trace`."""
+    recording = _Recorded()
+    layers: list[_Layer] = []
+    recording.layers = layers
+    inputs, value = _recorded(recording, function, [names], True)
+    if not layers:
+        raise Untraceable(WEIGHTS)
+    first, between = Program(inputs, list(layers[0].given)), []
+    _check_inputs(first, inputs)
+    for before, layer in pairwise(layers):
+        if len(layer.given) != len(before.results):
+            raise Untraceable("its layers are no chain")
+        each = [Program([z], [x]) for z, x in zip(before.results, layer.given, strict=True)]
+        for program, z in zip(each, before.results, strict=True):
+            _check_inputs(program, [z])
+        between.append(traced(each[0], "a"))
+        if len({str(traced(program, "a")) for program in each}) > 1:
+            raise Untraceable("its layers are no chain")
+    last = Program([*inputs, *layers[-1].results], [value])
+    _check_inputs(last, last.inputs)
+    return Chain(first, between, last, [(layer.weight, layer.bias) for layer in layers])
+
+
+def _check_inputs(program: Program, inputs: Sequence[Traced]) -> None:
+    """Refuse a program that depends on other numbers than these."""
+    known = {x.order for x in inputs}
+    if any(x.name == "input" and x.order not in known for x in reached(program.outputs)):
+        raise Untraceable("its layers are no chain")
+
+
+def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
+    """Record a function of arrays, which returns one number; an `Untraceable` has the reason why not.
+
+    Of each argument `names` has those of the elements of an array, or that of a number; `torch` if it takes tensors.
+    """
+    inputs, value = _recorded(_Recorded(), function, names, torch)
+    return Program(inputs, [value])
+
+
+def _recorded(
+    recording: _Recorded, function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool
+) -> tuple[list[Traced], Any]:
+    """The inputs and the value of a function."""
     if sum(1 if isinstance(each, str) else len(each) for each in names) > MOST_VARIABLES:
         raise Untraceable(
             f"it has more than {MOST_VARIABLES} variables: give one site or pair, to HamiltonianSystem.lattice or pairs"
         )
-    recording = _Recorded()
     kind = TracedTensor if torch else TracedArray
     inputs, args = [], []
     for each in names:
@@ -690,4 +771,4 @@ def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], to
         raise Untraceable(reason) from error
     if value.shape != () or not isinstance(value[()], Traced | float | int | np.number):
         raise Untraceable(f"it returns an array of shape {value.shape} for one state")
-    return Program(inputs, [value[()]])
+    return inputs, value[()]

@@ -15,7 +15,7 @@ from sympflow.integrators.contract import Failure, Integrator, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
 from sympflow.integrators.steppers import Stepper
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.solver import solve
 
 BLOCK = 64
@@ -142,7 +142,7 @@ class Chunk:
             yield times, self.states(times)
             return
         grid = Grid(*self.t_span, stepper.integrator.step_length(self.system))
-        carry, last = Carry(), np.full(len(self), grid.n_steps)
+        carry, last = RunCheckpoint(), np.full(len(self), grid.n_steps)
         for start in range(0, grid.n_steps + 1, most):
             save = np.arange(start, min(start + most, grid.n_steps + 1))
             y, last, _ = kernel.run(grid.h, self.y0, int(save[-1]), save, carry=carry)
@@ -220,4 +220,4 @@ class Chunk:
         if not isinstance(self.integrator, FixedStep) or math.isnan(t):
             return message or Failure.NON_FINITE.value[0] + "."
         what, remedy = self.integrator.breakdown.value
-        return f"{what} after t = {t:.17g}. {remedy}, or end `t_span` earlier."
+        return f"{what} after t = {t:.15g}. {remedy}, or end `t_span` earlier."

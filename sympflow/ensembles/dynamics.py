@@ -75,7 +75,7 @@ class _Indicator(Reduction):
             found = self.follow(chunk, rows)
             value[rows], time[rows] = found.value, found.t_end
             for i in set(rows[np.asarray(found.status) < 0].tolist()):
-                text = f"The orbit or its deviation vectors ceased to be finite after t = {time[i]:.17g}. Reduce `dt`, "
+                text = f"The orbit or its deviation vectors ceased to be finite after t = {time[i]:.15g}. Reduce `dt`, "
                 chunk.fail(i, f"{text}or end `t_span` earlier.")
         return {self.name: value, f"{self.name}_time": time}
 

@@ -265,8 +265,8 @@ def _runs_together(
         (rows,) = ParameterRows(system, general).by_form()
     except ValueError:
         return False
-    problem = Problem(rows.system, *t_span, y0[:1], backend=backend, letters=rows.letters)
-    return rows.letters is not None and integrator.takes_letters(problem)
+    problem = Problem(rows.system, *t_span, y0[:1], backend=backend, parameter_values=rows.parameter_values)
+    return rows.parameter_values is not None and integrator.takes_parameter_values(problem)
 
 
 # chunks --------------------------------------------------------------------------------------------------------------

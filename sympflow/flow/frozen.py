@@ -55,15 +55,11 @@ class PrimedKnown(KnownFlow):
         self.check_compilable()
         if compensated:
             return PrimedFlowKernel(tables, system, compensated=True)
-        tables.kernel = PrimedFlowKernel(tables, system, step=self.step_of_arrays)
+        tables.kernel = PrimedFlowKernel(tables, system)
         return tables.kernel
 
     def check_compilable(self) -> None:
         """Raise a ValueError unless the numbers of the flow are float64 on the CPU, which compiled loops need."""
-
-    def step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
-        """ψ̄_h of rows y (N, 2d) at times t, for h < 0 the inverse of ψ̄_|h|, each with its own h (N,)."""
-        raise NotImplementedError
 
     # its system ---------------------------------------------------------------------------------------------
 
@@ -166,9 +162,6 @@ class FrozenFlow(PrimedKnown):
     def thawed(self) -> Any:
         """The flow itself, a module of torch."""
         return _thawed(self.path, self._system)
-
-    def step_of_arrays(self, h: np.ndarray, y: np.ndarray, t: Any = 0.0) -> np.ndarray:
-        return self.thawed.step_of_arrays(h, y, t)
 
     def bound(self, system: HamiltonianSystem) -> Self:
         return self.of_size(system)

@@ -26,7 +26,7 @@ MOST_PAIRS = 1_000_000
 """Pairs whose values stand in memory at a time."""
 ALL_AT_ONCE = 24
 """Bodies up to which the pairs are met by one product with the matrix of their ends, which is faster than indices."""
-SHORTEST, LONGEST, SCANNED = 1e-4, 1e4, 4001
+SHORTEST, LONGEST, SCANNED = 1e-30, 1e30, 30001
 """Distances between which a minimum of V is looked for."""
 FAR, REACH = (10.0, 100.0), 2.0
 """Bond lengths at which V must have fallen off faster than bodies grow in number, and which a cut-off must have."""
@@ -224,7 +224,7 @@ class PairsHamiltonian(LocalHamiltonian):
 
     @cached_property
     def bond_length(self) -> float | None:
-        """The distance at which two bodies rest, if V has a minimum and so short a range that only neighbours count."""
+        """About how far two bodies rest apart, if V has a minimum and so short a range that only neighbours count."""
         if not self.uniform:
             return None
         r = np.geomspace(SHORTEST, LONGEST, SCANNED)
@@ -239,10 +239,7 @@ class PairsHamiltonian(LocalHamiltonian):
             return None
         if self.cutoff is not None and self.cutoff < REACH * r[k]:
             return None
-        from scipy.optimize import minimize_scalar
-
-        low, high = r[k - 1], r[k + 1]
-        return float(minimize_scalar(lambda x: float(self._of_distance(np.array([x]))[0]), (low, r[k], high)).x)
+        return float(r[k])
 
     def _of_distance(self, r: np.ndarray) -> np.ndarray:
         """V of two bodies at distances (n,), the first two bodies where they differ."""

@@ -6,17 +6,32 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from sympflow.arguments import check_flag
-from sympflow.arrays import Array, differentiable, is_tensor, library, stack, to_numpy, unfollowed, values
-from sympflow.compiler.tracing import Untraceable, trace
+from sympflow.arrays import (
+    Array,
+    as_tensor,
+    concatenate,
+    differentiable,
+    is_tensor,
+    library,
+    like,
+    of_library,
+    opaque,
+    stack,
+    to_numpy,
+    unfollowed,
+    values,
+)
+from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.formulas import TracedHamiltonian
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
+from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.times import probe_times
 
 MOST_BY_ARRAYS = 2000  # operations of a gradient, beyond which torch differentiates its own functions of arrays
@@ -24,10 +39,12 @@ TRIED = 6  # states at which a traced function is compared with itself
 CLOSE = 1e-9  # of the largest value
 
 
-class Functions(Definition):
-    """A user's functions of V(q) or H(q, p), as a program where they can be traced: `form`.
+class CallableHamiltonian(Definition):
+    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`.
 
-    They are traced when they are first used, and compared by value with the program.
+    They are traced when they are first used, and compared by value with the program. Those of a driven system take the
+    time before the states, one number: a float beside arrays, and a tensor of one double beside tensors. See
+    `HamiltonianSystem` for the arguments.
 
     Attributes
     ----------
@@ -41,6 +58,48 @@ class Functions(Definition):
     untraced: str = ""
     _scene: tuple[Any, ...] = (None, None, None, (0.0, 1.0))
     _functions: tuple[Any, Any, Any, Any]
+    _potential: Any
+    _hamiltonian: Any
+
+    def __init__(
+        self,
+        ndof: int,
+        potential: Callable[..., Array] | None,
+        hamiltonian: Callable[..., Array] | None,
+        gradient: Callable[..., Any] | None,
+        hessian_vector: Callable[..., Any] | None,
+        check: bool = True,
+        timed: bool = False,
+    ) -> None:
+        check_flag("check", check)
+        if (potential is None) == (hamiltonian is None):
+            raise TypeError("`potential` or `hamiltonian` must be given, and not both.")
+        functions = potential, hamiltonian, gradient, hessian_vector
+        for (name, arguments), function in zip(_ARGUMENTS.items(), functions, strict=True):
+            _check_callable(name, function, gradient)
+            if timed and function is not None and not _is_numba(function):
+                _check_arguments(name, function, f"t, {arguments}")
+        if potential is None and (gradient is not None or hessian_vector is not None):
+            raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
+        self.ndof, self.given, self.timed = ndof, bool(check), timed
+        self.separable = potential is not None
+        self._functions = functions
+        if _is_numba(gradient):
+            _check_numba(potential, gradient, hessian_vector, "t, " * timed)
+            self.numba_functions = potential, gradient, hessian_vector
+        of_arrays = [None if f is None else _OverTimes(f) if timed else f for f in self._of_states]
+        self._potential, self._hamiltonian, self._gradient, self._hessian_vector = of_arrays
+
+    @property
+    def _of_states(self) -> Sequence[Any]:
+        """V, H, the gradient and the product as functions of arrays of states, the time first."""
+        if self.numba_functions is None:
+            return self._functions
+        V, gradient, product = (NumbaFunction(self.numba_functions, order) for order in range(3))
+        return V, None, gradient, None if self.numba_functions[2] is None else product
+
+    def identity_parts(self) -> Any:
+        return [self.ndof, self._functions] if self.timed else [self.ndof, *self._functions]
 
     @property
     def given_functions(self) -> bool:  # type: ignore[override]
@@ -64,6 +123,26 @@ class Functions(Definition):
             except Untraceable as reason:
                 self.untraced = str(reason)
                 return None
+
+    @cached_property
+    def layered(self) -> LayeredPotential | None:
+        *_, gradient, product = self._functions
+        given = self.timed or gradient is not None or product is not None or not self.separable
+        if self.form is not None or self.untraced != WEIGHTS or given:
+            return None
+        y0, domain, inverse_mass, _ = self._scene
+        try:
+            chain = trace_chain(self._given_function, [f"q{i + 1}" for i in range(self.ndof)])
+            found = LayeredPotential(self.ndof, chain, inverse_mass)
+        except Untraceable as reason:
+            if str(reason) != WEIGHTS:
+                self.untraced = f"{WEIGHTS}, and {reason}"
+            return None
+        states = probe_states(y0, domain, 2 * self.ndof)[:TRIED]
+        if not _alike(found.value(states[:, : self.ndof]), self._values(states, [0.0] * len(states))):
+            return None
+        self._known = states[0], 0.0, np.nan
+        return found
 
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]
@@ -166,9 +245,13 @@ class Functions(Definition):
 
     def check_unchanged(self) -> None:
         """Raise a ValueError if the function has another value than when it was traced."""
-        if self.form is None:
+        if self.layered is not None:
+            state, t, _ = self._known
+            expected = float(self.layered.value(state[None, : self.ndof])[0])
+        elif self.form is not None:
+            state, t, expected = self._known
+        else:
             return
-        state, t, expected = self._known
         with np.errstate(all="ignore"):
             value = float(self._single(self._given_function, state, t))
         if not abs(value - expected) <= CLOSE * abs(expected):
@@ -191,20 +274,15 @@ class Functions(Definition):
             return self.library == "torch"
         import torch
 
-        d, t, f = self.ndof, self._scene[3][0], self._given_function
+        d, times = self.ndof, (self._scene[3][0],) * self.timed
         state = probe_states(None, None, 2 * d)[0, : d * (2 - self.separable)]
-
-        def value(x: Array) -> Any:
-            times = (torch.tensor(t, dtype=torch.float64),) if self.timed else ()
-            return f(*times, *((x,) if self.separable else (x[:d], x[d:])))
-
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             try:
-                found = to_numpy(torch.func.grad(value)(torch.tensor(state)))
+                found = to_numpy(torch.func.grad(partial(self._own, *times))(torch.tensor(state)))
             except Exception:  # whatever a user's function raises
                 return False
-        return _alike(found, self.form.gradient(state, *((t,) if self.timed else ())))
+        return _alike(found, self.form.gradient(state, *times))
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but the program, which is traced again."""
@@ -213,6 +291,167 @@ class Functions(Definition):
             for name, value in vars(self).items()
             if name not in ("form", "takes_tensors", "_follows_tensors")
         }
+
+    def learns(self, y: Array) -> bool:
+        if self.numba_functions is not None or (self.form is not None and self.library == "numpy"):
+            return False
+        y = unfollowed(y)
+        try:
+            slope = self.gradient(y[..., : self.ndof] if self.separable else y, *self._some_time)
+        except (TypeError, ValueError, RuntimeError):  # written for NumPy arrays: torch can follow nothing in it
+            return False
+        return differentiable(slope)
+
+    @property
+    def _some_time(self) -> tuple[float, ...]:
+        return (0.0,) * self.timed
+
+    def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
+        """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
+        if self.form is not None and self.library == "numpy":
+            like = np.empty(0) if is_tensor(like) or self._gradient is None else like
+        elif self.differentiates_itself and not is_tensor(like):
+            like = as_tensor(np.empty(0, like.dtype))
+        if self.separable:
+            states = states[:, : self.ndof]
+        for t in [(s,) for s in times] if self.timed else [()]:
+            if self.numba_functions is not None:
+                like = np.empty(0)
+                _, gradient, product = self.numba_functions
+                q = np.ascontiguousarray(states[0])
+                check_writes("gradient", partial(gradient, *t), q)
+                if product is not None:
+                    check_writes("hessian_vector", partial(product, *t), q, q[::-1].copy())
+            test(self._tested(*t), states, like, n_given)
+
+    def _tested(self, *t: float) -> Tested:
+        """The functions, at a time, as they are tested."""
+        exact = self.form is not None and self._gradient is None
+        return Tested(
+            (self._name, "gradient", "q" if self.separable else "[q, p]"),
+            lambda x: self.hamiltonian(x, *t),
+            None if exact else lambda x: self.gradient(x, *t),
+            None if self._hessian_vector is None else lambda q, v: self.hessian_vector(q, v, *t),
+            automatic=self._gradient is None,
+            parts=1 if self.separable else 2,
+            result_types=lambda x: self._result_types(x, *t),
+            time=t[0] if t else None,
+        )
+
+    def _result_types(self, x: Array, *t: float) -> list[tuple[str, Any]]:
+        """The types in which the functions themselves answer for a state x."""
+        if self.numba_functions is not None:
+            return []
+        functions = (self._name, self._own), ("gradient", self._gradient)
+        return [(name, getattr(f(*t, x), "dtype", None)) for name, f in functions if f is not None]
+
+    @cached_property
+    def takes_tensors(self) -> bool:  # type: ignore[override]
+        """False if the gradient fails on a tensor, or answers with something else or NumPy's warnings."""
+        if self.form is not None:
+            return True
+        if self._gradient is None or self.numba_functions is not None:
+            return self.library != "numpy"
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                return is_tensor(self._gradient(*self._some_time, as_tensor(np.full((2, self.ndof), 0.5))))
+            except Exception:  # whatever a user's function raises
+                return False
+
+    def _own(self, *arguments: Any) -> Any:
+        """V of (t, q), or H of (t, y), by the function itself."""
+        *t, x = arguments
+        if self.separable:
+            return self._potential(*t, x)
+        return self._hamiltonian(*t, x[..., : self.ndof], x[..., self.ndof :])
+
+    def hamiltonian(self, x: Array, *t: Any) -> Array:
+        """V of q or H of y, by the function itself, but for tensors that it does not take."""
+        if is_tensor(x) and (form := self._exact(x)) is not None:
+            return form.value(x, *t)
+        if self._gradient is not None or (self.library == "numpy" and not is_tensor(x)):
+            return _checked(self._protected(self._own, self._name, t, x), x, self._name, ())
+        return _with_torch(partial(self._own, *t), x, self._name, (), self.untraced)
+
+    def gradient(self, x: Array, *t: Any) -> Array:
+        if self._gradient is None or (is_tensor(x) and self._exact(x) is not None):
+            return self._derived("gradient", _gradient_of, x, x.shape[-1:], t)
+        return _checked(self._protected(self._gradient, "gradient", t, x), x, "gradient", x.shape[-1:])
+
+    def potential_hessian(self, x: Array, *t: Any) -> Array:
+        n = x.shape[-1]
+        if self._exact(x) is not None:
+            return self._derived("hessian", _hessian_of, x, (), t)
+        if self._hessian_vector is not None:
+            columns = [self._protected(self._hessian_vector, "hessian_vector", t, x, e) for e in _basis(x)]
+            return stack([_checked(column, x, "hessian_vector", (n,)) for column in columns])
+        if self._gradient is not None and not is_tensor(x):
+            raise ValueError(
+                "`hessian_vector` is needed here (force-gradient methods, volume and symplecticity metrics) and was "
+                "not given: pass it to HamiltonianSystem, or write `potential` so that it can be traced and leave "
+                f"`gradient` out; it was not, for {self.untraced}."
+            )
+        if self._gradient is not None:
+            return _jacobian(partial(self._gradient, *t), x)
+        return self._derived("hessian", _hessian_of, x, (n, n), t)
+
+    potential, potential_gradient, hessian = hamiltonian, gradient, potential_hessian
+
+    def _derived(self, name: str, make: Callable[..., Any], x: Array, tail: tuple[int, ...], t: Sequence[Any]) -> Array:
+        """A derivative of V or H at x: by the program, or of a function of tensors by torch."""
+        form = self._exact(x)
+        if form is not None:
+            return getattr(form, name)(x, *t)
+        return _with_torch(make(partial(self._own, *t), self._name), x, self._name, tail, self.untraced)
+
+    def _protected(self, function: Callable[..., Any], name: str, times: Sequence[Any], *states: Array) -> Any:
+        """The user's function of arrays that it cannot write into, for they are the state of the run."""
+        if self.numba_functions is not None:
+            return function(*times, *states)
+        refused = f"`{name}` writes into its argument, the state of the run: let it work on a copy"
+        if is_tensor(states[0]):
+            versions = [getattr(x, "_version", 0) for x in states]
+            value = function(*times, *states)
+            if versions != [getattr(x, "_version", 0) for x in states]:
+                raise ValueError(f"{refused}, q.clone().")
+            return value
+        views = [x[...] for x in states]  # the flag is not that of the caller's array
+        for view in views:
+            view.flags.writeable = False
+        try:
+            return function(*times, *views)
+        except ValueError as error:
+            if "read-only" not in str(error):
+                raise
+            raise ValueError(f"{refused}, q.copy() ({error}).") from error
+
+    def hessian_vector(self, q: Array, v: Array, *t: Any) -> Array:
+        form = self._exact(q)
+        if form is not None and (self._hessian_vector is None or is_tensor(q)):
+            return form.hessian_vector(q, v, *t)
+        if self._hessian_vector is None:
+            return super().hessian_vector(q, v, *t)
+        return self._protected(self._hessian_vector, "hessian_vector", t, q, v)
+
+    def third_derivative(self, q: Array, v: Array, w: Array, *t: Any) -> Array:
+        assert self.form is not None
+        return self.form.third_derivative(q, v, w, *t)
+
+    def time_derivative(self, y: Array, t: Any) -> Array:
+        """∂H/∂t (...): of functions that torch differentiates by that, of others by differences of order 6."""
+        x = y[..., : self.ndof] if self.separable else y
+        if (form := self._exact(y)) is not None:
+            return form.time_derivative(x, t)
+        if self.differentiates_itself:
+            import torch
+
+            from sympflow.arrays import jvp
+
+            s, tensor = torch.as_tensor(t, dtype=torch.float64), torch.as_tensor(x)
+            found = jvp(lambda u: self.hamiltonian(tensor, u), s, torch.ones_like(s))[1]
+            return like(of_library(found, y), y)
+        return _time_difference(lambda s: self.hamiltonian(x, s), t)
 
 
 def _alike(found: np.ndarray, expected: np.ndarray) -> bool:
@@ -224,216 +463,14 @@ def _alike(found: np.ndarray, expected: np.ndarray) -> bool:
     return bool((np.abs(found[finite] - expected[finite]) <= CLOSE * size).all())
 
 
-class CallableHamiltonian(Functions):
-    """The functions of a system given by V(q) or H(q, p). See `HamiltonianSystem` for the arguments."""
-
-    time: float | None = None
-    """The time of the functions of a driven system, for messages."""
-    traced: bool = False
-    """True of functions at one time of a driven system that was traced."""
-
-    def __init__(
-        self,
-        ndof: int,
-        potential: Callable[..., Array] | None,
-        hamiltonian: Callable[..., Array] | None,
-        gradient: Callable[..., Any] | None,
-        hessian_vector: Callable[..., Any] | None,
-        check: bool = True,
-    ) -> None:
-        check_flag("check", check)
-        if (potential is None) == (hamiltonian is None):
-            raise TypeError("`potential` or `hamiltonian` must be given, and not both.")
-        _check_callable(potential=potential, hamiltonian=hamiltonian, gradient=gradient)
-        if potential is None and (gradient is not None or hessian_vector is not None):
-            raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
-        self.ndof, self.given = ndof, bool(check)
-        self.separable = potential is not None
-        self._functions = potential, hamiltonian, gradient, hessian_vector
-        self._potential, self._hamiltonian = potential, hamiltonian
-        self._gradient, self._hessian_vector = gradient, hessian_vector
-        if _is_numba(gradient):
-            _check_numba(potential, gradient, hessian_vector)
-            self.take_numba(potential, gradient, hessian_vector)
-
-    @classmethod
-    def at_time(cls, driven: DrivenCallables, functions: Sequence[Any]) -> CallableHamiltonian:
-        """The functions of a driven system at one time, which are not traced again."""
-        now = cls(driven.ndof, *functions)
-        now.given = driven.given
-        now.form, now.library = None, driven.library
-        return now
-
-    def take_numba(self, potential: Any, gradient: Any, hessian_vector: Any | None) -> None:
-        """Take Numba functions of single states."""
-        self.numba_functions = (potential, gradient, hessian_vector)
-        arrays = NumbaFunctions(potential, gradient, hessian_vector)
-        self._potential, self._gradient = arrays.potential, arrays.gradient
-        self._hessian_vector = None if hessian_vector is None else arrays.hessian_vector
-
-    def identity_parts(self) -> Any:
-        return [self.ndof, *self._functions]
-
-    def learns(self, y: Array) -> bool:
-        if self.numba_functions is not None or (self.form is not None and self.library == "numpy"):
-            return False
-        y = unfollowed(y)
-        try:
-            slope = self.potential_gradient(y[..., : self.ndof]) if self.separable else self.gradient(y)
-        except (TypeError, ValueError, RuntimeError):  # written for NumPy arrays: torch can follow nothing in it
-            return False
-        return differentiable(slope)
-
-    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
-        """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
-        traced = self.traced or self.form is not None
-        if traced and self.library == "numpy":
-            like = np.empty(0) if is_tensor(like) or self._gradient is None else like
-        elif self.differentiates_itself and not is_tensor(like):
-            import torch
-
-            like = torch.from_numpy(np.empty(0, like.dtype))
-        exact = traced and self._gradient is None
-        if not self.separable:
-            names = "hamiltonian", "gradient", "[q, p]"
-            gradient = None if exact else self.gradient
-            functions = Tested(names, self.hamiltonian, gradient, None, True, 2, self._result_types, self.time)
-            test(functions, states, like, n_given)
-            return
-        if self.numba_functions is not None:
-            _, gradient, hessian_vector = self.numba_functions
-            q = np.ascontiguousarray(states[0, : self.ndof])
-            check_writes("gradient", gradient, q)
-            if hessian_vector is not None:
-                check_writes("hessian_vector", hessian_vector, q, q[::-1].copy())
-            like = np.empty(0)
-        names = "potential", "gradient", "q"
-        product = None if self._hessian_vector is None else self.hessian_vector
-        automatic, slope = self._gradient is None, None if exact else self.potential_gradient
-        functions = Tested(names, self.potential, slope, product, automatic, 1, self._result_types, self.time)
-        test(functions, states[:, : self.ndof], like, n_given)
-
-    def _result_types(self, x: Array) -> list[tuple[str, Any]]:
-        """The types in which the functions themselves answer for a state x."""
-        if self.numba_functions is not None:
-            return []
-        if not self.separable:
-            return [("hamiltonian", getattr(self._H(x), "dtype", None))]
-        functions = ("potential", self._potential), ("gradient", self._gradient)
-        return [(name, getattr(f(x), "dtype", None)) for name, f in functions if f is not None]
-
-    @cached_property
-    def takes_tensors(self) -> bool:  # type: ignore[override]
-        """False if the gradient fails on a tensor, or answers with something else or NumPy's warnings."""
-        if self.form is not None:
-            return True
-        if self._gradient is None or self.numba_functions is not None:
-            return self.library != "numpy"
-        import torch
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            try:
-                return is_tensor(self._gradient(torch.full((2, self.ndof), 0.5, dtype=torch.float64)))
-            except Exception:  # whatever a user's function raises
-                return False
-
-    def _value(self, f: Callable[[Array], Any], x: Array, name: str) -> Array:
-        """V or H of x by the function itself, but for tensors that it does not take."""
-        if is_tensor(x) and (form := self._exact(x)) is not None:
-            return form.value(x)
-        if self._gradient is not None or (self.library == "numpy" and not is_tensor(x)):
-            return _checked(self._protected(f, name, x), x, name, ())
-        return _with_torch(f, x, name, (), self.untraced)
-
-    def _derived(self, name: str, make: Callable[..., Any], f: Any, x: Array, tail: tuple[int, ...]) -> Array:
-        """A derivative of V or H at x: by the program, or of a function of tensors by torch."""
-        form = self._exact(x)
-        if form is not None:
-            return getattr(form, name)(x)
-        return _with_torch(make(f, self._name), x, self._name, tail, self.untraced)
-
-    def hamiltonian(self, y: Array) -> Array:
-        return self._value(self._H, y, "hamiltonian")
-
-    def gradient(self, y: Array) -> Array:
-        return self._derived("gradient", _gradient_of, self._H, y, (2 * self.ndof,))
-
-    def hessian(self, y: Array) -> Array:
-        return self._derived("hessian", _hessian_of, self._H, y, (2 * self.ndof, 2 * self.ndof))
-
-    def _H(self, y: Array) -> Array:
-        assert self._hamiltonian is not None
-        return self._hamiltonian(y[..., : self.ndof], y[..., self.ndof :])
-
-    def potential(self, q: Array) -> Array:
-        assert self._potential is not None
-        return self._value(self._potential, q, "potential")
-
-    def potential_gradient(self, q: Array) -> Array:
-        if self._gradient is None or (is_tensor(q) and self._exact(q) is not None):
-            return self._derived("gradient", _gradient_of, self._potential, q, (self.ndof,))
-        return _checked(self._protected(self._gradient, "gradient", q), q, "gradient", (self.ndof,))
-
-    def _protected(self, function: Callable[..., Any], name: str, *states: Array) -> Any:
-        """The user's function of arrays that it cannot write into, for they are the state of the run."""
-        if self.numba_functions is not None:
-            return function(*states)
-        refused = f"`{name}` writes into its argument, the state of the run: let it work on a copy"
-        if is_tensor(states[0]):
-            versions = [getattr(x, "_version", 0) for x in states]
-            value = function(*states)
-            if versions != [getattr(x, "_version", 0) for x in states]:
-                raise ValueError(f"{refused}, q.clone().")
-            return value
-        views = [x[...] for x in states]  # the flag is not that of the caller's array
-        for view in views:
-            view.flags.writeable = False
-        try:
-            return function(*views)
-        except ValueError as error:
-            if "read-only" not in str(error):
-                raise
-            raise ValueError(f"{refused}, q.copy() ({error}).") from error
-
-    def hessian_vector(self, q: Array, v: Array) -> Array:
-        form = self._exact(q)
-        if form is not None and (self._hessian_vector is None or is_tensor(q)):
-            return form.hessian_vector(q, v)
-        if self._hessian_vector is None:
-            return super().hessian_vector(q, v)
-        return self._protected(self._hessian_vector, "hessian_vector", q, v)
-
-    def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
-        assert self.form is not None
-        return self.form.third_derivative(q, v, w)
-
-    def potential_hessian(self, q: Array) -> Array:
-        if self._exact(q) is not None:
-            return self._derived("hessian", _hessian_of, self._potential, q, ())
-        if self._hessian_vector is not None:
-            columns = [self._protected(self._hessian_vector, "hessian_vector", q, e) for e in _basis(q)]
-            return stack([_checked(column, q, "hessian_vector", (self.ndof,)) for column in columns])
-        if self._gradient is not None and not is_tensor(q):
-            raise ValueError(
-                "`hessian_vector` is needed here (force-gradient methods, volume and symplecticity metrics) and was "
-                "not given: pass it to HamiltonianSystem, or write `potential` so that it can be traced and leave "
-                f"`gradient` out; it was not, for {self.untraced}."
-            )
-        if self._gradient is not None:
-            return _jacobian(self._gradient, q)
-        return self._derived("hessian", _hessian_of, self._potential, q, (self.ndof, self.ndof))
-
-
-def _check_callable(**functions: Any) -> None:
-    for name, function in functions.items():
-        if function is not None and not callable(function):
-            raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
-        if name in ("potential", "hamiltonian") and functions["gradient"] is None and _is_numba(function):
-            raise TypeError(
-                f"`{name}` is a Numba function, through which torch cannot differentiate: pass the function that it is "
-                "made of, its `.py_func`, written with torch functions, or a `potential` with its `gradient`."
-            )
+def _check_callable(name: str, function: Any, gradient: Any) -> None:
+    if function is not None and not callable(function):
+        raise TypeError(f"`{name}` must be callable; got {type(function).__name__}.")
+    if name in ("potential", "hamiltonian") and gradient is None and _is_numba(function):
+        raise TypeError(
+            f"`{name}` is a Numba function, through which torch cannot differentiate: pass the function that it is "
+            "made of, its `.py_func`, written with torch functions, or a `potential` with its `gradient`."
+        )
 
 
 def _is_numba(function: Any) -> bool:
@@ -538,157 +575,39 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
     return value.astype(x.dtype, copy=False)
 
 
-class DrivenCallables(Functions):
-    """The functions of a driven system, H(t, q, p), each with the time as its first argument.
+_ARGUMENTS = {"potential": "q", "hamiltonian": "q, p", "gradient": "q", "hessian_vector": "q, v"}
 
-    A user's function is called with one time, a number: as a float beside arrays, and as a tensor of one double beside
-    tensors. States of several times are taken apart.
-    """
 
-    timed = True
+class _OverTimes:
+    """A function of a user whose first argument is the time, one number: of states (..., k) at one time, or each."""
 
-    def __init__(
-        self,
-        ndof: int,
-        potential: Callable[..., Array] | None,
-        hamiltonian: Callable[..., Array] | None,
-        gradient: Callable[..., Any] | None,
-        hessian_vector: Callable[..., Any] | None,
-        check: bool = True,
-    ) -> None:
-        _check_callable(potential=potential, hamiltonian=hamiltonian, gradient=gradient, hessian_vector=hessian_vector)
-        self._functions = potential, hamiltonian, gradient, hessian_vector
-        for (name, arguments), function in zip(_ARGUMENTS.items(), self._functions, strict=True):
-            if function is not None and not _is_numba(function):
-                _check_arguments(name, function, arguments)
-        if _is_numba(gradient):
-            _check_numba(potential, gradient, hessian_vector, "t, ")
-            self.numba_functions = (potential, gradient, hessian_vector)
-        check_flag("check", check)
-        self.ndof, self.given, self.separable = ndof, bool(check), potential is not None
-        self._at(0.0)  # refuses what does not fit
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
 
-    def identity_parts(self) -> Any:
-        return [self.ndof, self._functions]
-
-    def _at(self, t: Any) -> CallableHamiltonian:
-        """The functions at one time."""
-        now = CallableHamiltonian.at_time(self, [None if f is None else _AtTime(f, t) for f in self._functions])
-        if self.numba_functions is not None:
-            now.take_numba(*(None if f is None else _AtTime(f, float(t)) for f in self.numba_functions))
-        return now
-
-    def _over_times(self, name: str, t: Any, *states: Array) -> Array:
-        """A function of `CallableHamiltonian` of states (..., k), each at its time."""
-        form, of_form = self._exact(states[0]), _OF_FORM.get(name)
-        if form is not None and (of_form or is_tensor(states[0])):
-            return getattr(form, of_form or "value")(*states, t)
+    def __call__(self, t: Any, *states: Array) -> Any:
         if not getattr(t, "ndim", 0):
-            return getattr(self._at(t), name)(*states)
-        flat = [x.reshape(-1, x.shape[-1]) for x in states]
-        times = t.reshape(-1)
-        if is_tensor(times) and (found := values(times)) is not None and (found == found[..., :1]).all():
-            return getattr(self._at(times[0]), name)(*states)
+            return self._at(t, *states)
+        flat, times = [x.reshape(-1, x.shape[-1]) for x in states], t.reshape(-1)
         if is_tensor(times):
-            rows = [getattr(self._at(s), name)(*(x[i] for x in flat)) for i, s in enumerate(times)]
-            return stack(rows, axis=0).reshape(*t.shape, *rows[0].shape)
+            if (found := values(times)) is not None and (found == found[..., :1]).all():
+                return self._at(times[0], *states)
+            each = [self._at(s, *(x[i] for x in flat)) for i, s in enumerate(times)]
+            return stack(each, axis=0).reshape(*t.shape, *each[0].shape)
         distinct, which = np.unique(times, return_inverse=True)
-        result: Any = None
-        for k, s in enumerate(distinct.tolist()):
-            rows = which == k
-            each = getattr(self._at(s), name)(*(x[rows] for x in flat))
-            if result is None:
-                result = np.empty((len(times), *each.shape[1:]), dtype=each.dtype)
-            result[rows] = each
+        groups = [np.flatnonzero(which == k) for k in range(len(distinct))]
+        parts = [self._at(s, *(x[rows] for x in flat)) for s, rows in zip(distinct.tolist(), groups, strict=True)]
+        for part, rows in zip(parts, groups, strict=True):
+            if getattr(part, "shape", ())[:1] != rows.shape:
+                return part  # which is refused by its shape
+        result = concatenate(parts, 0)[np.argsort(np.concatenate(groups))]
         return result.reshape(*t.shape, *result.shape[1:])
 
-    def learns(self, y: Array) -> bool:
-        return (self.form is None or self.library == "torch") and self._at(0.0).learns(y)
-
-    def check(self, states: np.ndarray, like: Array, n_given: int, times: np.ndarray | None = None) -> None:
-        """Test them at each of the times (n,)."""
-        traced = self.form is not None
-        for t in (0.0,) if times is None else times.tolist():
-            now = self._at(t)
-            now.time, now.traced = t, traced
-            now.check(states, like, n_given)
-
-    @cached_property
-    def takes_tensors(self) -> bool:  # type: ignore[override]
-        return self.form is not None or self._at(0.0).takes_tensors
-
-    def hamiltonian(self, y: Array, t: Any) -> Array:
-        return self._over_times("hamiltonian", t, y)
-
-    def gradient(self, y: Array, t: Any) -> Array:
-        return self._over_times("gradient", t, y)
-
-    def hessian(self, y: Array, t: Any) -> Array:
-        return self._over_times("hessian", t, y)
-
-    def potential(self, q: Array, t: Any) -> Array:
-        return self._over_times("potential", t, q)
-
-    def potential_gradient(self, q: Array, t: Any) -> Array:
-        return self._over_times("potential_gradient", t, q)
-
-    def potential_hessian(self, q: Array, *t: Any) -> Array:
-        return self._over_times("potential_hessian", *t, q)
-
-    def hessian_vector(self, q: Array, v: Array, *t: Any) -> Array:
-        return self._over_times("hessian_vector", *t, q, v)
-
-    def third_derivative(self, q: Array, v: Array, w: Array, *t: Any) -> Array:
-        assert self.form is not None
-        return self.form.third_derivative(q, v, w, *t)
-
-    def time_derivative(self, y: Array, t: Any) -> Array:
-        """∂H/∂t (...): of functions that torch differentiates by that, of others by differences of order 6."""
-        states, name = (y[..., : self.ndof], "potential") if self.separable else (y, "hamiltonian")
-        if (form := self._exact(y)) is not None:
-            return form.time_derivative(states, t)
-
-        def value(s: Any) -> Array:
-            return self._over_times(name, s, states)
-
-        if self.differentiates_itself:
+    def _at(self, t: Any, *states: Array) -> Any:
+        if is_tensor(states[0]):
             import torch
 
-            from sympflow.arrays import jvp
-
-            s = torch.as_tensor(t, dtype=torch.float64)
-            tensor = torch.as_tensor(states)
-            found = jvp(lambda u: self._over_times(name, u, tensor), s, torch.ones_like(s))[1]
-            return found.to(states.dtype) if is_tensor(y) else to_numpy(found).astype(y.dtype)
-        return _time_difference(value, t)
-
-
-_OF_FORM = {
-    "gradient": "gradient",
-    "hessian": "hessian",
-    "potential_gradient": "gradient",
-    "potential_hessian": "hessian",
-    "hessian_vector": "hessian_vector",
-}
-"""Methods of a form, by the functions of which they give derivatives."""
-_ARGUMENTS = {"potential": "t, q", "hamiltonian": "t, q, p", "gradient": "t, q", "hessian_vector": "t, q, v"}
-
-
-class _AtTime:
-    """A function of a user at a time, which is its first argument."""
-
-    def __init__(self, function: Callable[..., Any], t: Any) -> None:
-        self.function, self.t = function, t
-
-    def __call__(self, *states: Any) -> Any:
-        t, x = self.t, states[0]
-        if is_tensor(x):
-            import torch
-
-            t = torch.as_tensor(t, dtype=torch.float64, device=x.device)
-        elif is_tensor(t):
-            t = float(t)
-        return self.function(t, *states)
+            t = torch.as_tensor(t, dtype=torch.float64, device=states[0].device)
+        return self.function(t if is_tensor(states[0]) else float(t), *states)
 
 
 def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:
@@ -718,57 +637,51 @@ def _time_difference(value: Callable[[Any], Array], t: Any) -> Array:
     return found
 
 
-class NumbaFunctions:
-    """The three functions of a system, for any batch of states.
+class NumbaFunction:
+    """V, ∇V or ∇²V·v of a system, by its order 0, 1 or 2, for any batch of states, of a driven one with the time first.
 
     Tensors are taken through NumPy; derivatives of V and of ∇V flow back by ∇V and ∇²V·v, in reverse and forward mode.
-
-    Parameters
-    ----------
-    potential : Numba function
-        q (d,) ↦ V.
-    gradient : Numba function
-        (q, out) ↦ None.
-    hessian_vector : Numba function, optional
-        (q, v, out) ↦ None.
+    The Numba functions are V(q), gradient(q, out) and hessian_vector(q, v, out).
     """
 
-    def __init__(self, potential: Any, gradient: Any, hessian_vector: Any | None) -> None:
-        self.functions = potential, gradient, hessian_vector
+    def __init__(self, functions: tuple[Any, Any, Any | None], order: int, times: tuple[float, ...] = ()) -> None:
+        self.functions, self.order, self.times = functions, order, times
 
-    def potential(self, q: Array) -> Array:
-        """V(q): (..., d) to (...)."""
-        return self._on_tensors[0](q) if is_tensor(q) else self._potential(q)
+    def __call__(self, *arguments: Any) -> Array:
+        n = 2 if self.order == 2 else 1
+        times, x = tuple(map(float, arguments[:-n])), arguments[-n:]
+        at = NumbaFunction(self.functions, self.order, times)
+        return opaque(at, *x) if is_tensor(x[0]) else at.value(*x)
 
-    def gradient(self, q: Array) -> Array:
-        """∇V(q): (..., d) to (..., d)."""
-        return self._on_tensors[1](q) if is_tensor(q) else self._gradient(q)
-
-    def hessian_vector(self, q: Array, v: Array) -> Array:
-        """∇²V(q)·v: (..., d), (..., d) to (..., d)."""
-        return self._on_tensors[2](q, v) if is_tensor(q) else self._hessian_vector(q, v)
-
-    @cached_property
-    def _on_tensors(self) -> tuple[Callable[..., Array], ...]:
-        return _tensor_functions(self)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"functions": self.functions}  # what is generated cannot be pickled
-
-    def _potential(self, q: np.ndarray) -> np.ndarray:
-        f = self.functions[0]
-        return np.array([f(row) for row in _rows(q, q.shape)], dtype=q.dtype).reshape(q.shape[:-1])
-
-    def _gradient(self, q: np.ndarray) -> np.ndarray:
-        return _each_row(self.functions[1], q)
-
-    def _hessian_vector(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        if self.functions[2] is None:
+    def value(self, *x: np.ndarray) -> np.ndarray:
+        """The values for arrays."""
+        f = self.functions[self.order]
+        if f is None:
             raise ValueError(
                 "`hessian_vector` is needed here (force-gradient methods, volume and symplecticity metrics) and was "
                 "not given: pass it to HamiltonianSystem."
             )
-        return _each_row(self.functions[2], q, v)
+        if self.order:
+            return _each_row(partial(f, *self.times), *x)
+        rows = [f(*self.times, row) for row in _rows(x[0], x[0].shape)]
+        return np.array(rows, dtype=x[0].dtype).reshape(x[0].shape[:-1])
+
+    def _slope(self, *x: Array) -> Array:
+        return NumbaFunction(self.functions, self.order + 1)(*self.times, *x)
+
+    def vjp(self, x: Sequence[Array], w: Array, wanted: Sequence[bool]) -> tuple[Array | None, ...]:
+        if self.order == 2:
+            if wanted[0]:
+                raise _third_derivative()
+            return None, self(*self.times, x[0], w)
+        return (self._slope(x[0], w) if self.order else w[..., None] * self._slope(x[0]),)
+
+    def jvp(self, x: Sequence[Array], v: Sequence[Array | None]) -> Array:
+        if self.order == 2:
+            if v[0] is not None or v[1] is None:
+                raise _third_derivative()
+            return self(*self.times, x[0], v[1])
+        return self._slope(x[0], v[0]) if self.order else (v[0] * self._slope(x[0])).sum(-1)
 
 
 def _rows(x: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -783,90 +696,6 @@ def _each_row(f: Any, *arguments: np.ndarray) -> np.ndarray:
     for each in zip(*rows, out, strict=True):
         f(*each)
     return out.reshape(shape).astype(arguments[0].dtype, copy=False)
-
-
-def _tensor_functions(numba: NumbaFunctions) -> tuple[Callable[..., Array], ...]:
-    """The same as differentiable functions of tensors."""
-    import torch
-
-    def through_numpy(f: Callable[..., np.ndarray], *x: torch.Tensor) -> torch.Tensor:
-        return torch.as_tensor(f(*map(to_numpy, x)), dtype=x[0].dtype, device=x[0].device)
-
-    class Function(torch.autograd.Function):
-        @staticmethod
-        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-            ctx.save_for_backward(*inputs)
-            ctx.save_for_forward(*inputs)
-
-        @classmethod
-        def in_batch(cls, in_dims: tuple[Any, ...], *x: torch.Tensor) -> tuple[torch.Tensor, int]:
-            n = next(y.shape[i] for y, i in zip(x, in_dims, strict=True) if i is not None)
-            moved = [y.expand(n, *y.shape) if i is None else y.movedim(i, 0) for y, i in zip(x, in_dims, strict=True)]
-            return cls.apply(*moved), 0
-
-    class Potential(Function):
-        @staticmethod
-        def forward(q: torch.Tensor) -> torch.Tensor:
-            return through_numpy(numba._potential, q)
-
-        @staticmethod
-        def backward(ctx: Any, v: torch.Tensor) -> torch.Tensor:
-            return v[..., None] * Gradient.apply(*ctx.saved_tensors)
-
-        @staticmethod
-        def jvp(ctx: Any, v: torch.Tensor) -> torch.Tensor:
-            return (v * Gradient.apply(*ctx.saved_tensors)).sum(-1)
-
-        @staticmethod
-        def vmap(info: Any, in_dims: tuple[Any, ...], q: torch.Tensor) -> tuple[torch.Tensor, int]:
-            return Potential.in_batch(in_dims, q)
-
-    class Gradient(Function):
-        @staticmethod
-        def forward(q: torch.Tensor) -> torch.Tensor:
-            return through_numpy(numba._gradient, q)
-
-        @staticmethod
-        def backward(ctx: Any, v: torch.Tensor) -> torch.Tensor:
-            return HessianVector.apply(*ctx.saved_tensors, v)
-
-        @staticmethod
-        def jvp(ctx: Any, v: torch.Tensor) -> torch.Tensor:
-            return HessianVector.apply(*ctx.saved_tensors, v)
-
-        @staticmethod
-        def vmap(info: Any, in_dims: tuple[Any, ...], q: torch.Tensor) -> tuple[torch.Tensor, int]:
-            return Gradient.in_batch(in_dims, q)
-
-    class HessianVector(Function):
-        @staticmethod
-        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-            Function.setup_context(ctx, inputs, output)
-            ctx.set_materialize_grads(False)  # so that a q that does not vary is told from one that does
-
-        @staticmethod
-        def forward(q: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-            return through_numpy(numba._hessian_vector, q, v)
-
-        @staticmethod
-        def backward(ctx: Any, w: torch.Tensor | None) -> tuple[None, torch.Tensor | None]:
-            if w is None:
-                return None, None
-            if ctx.needs_input_grad[0]:
-                raise _third_derivative()
-            return None, HessianVector.apply(ctx.saved_tensors[0], w)
-
-        @staticmethod
-        def jvp(ctx: Any, dq: torch.Tensor | None, dv: torch.Tensor | None) -> torch.Tensor:
-            if dq is not None or dv is None:
-                raise _third_derivative()
-            return HessianVector.apply(ctx.saved_tensors[0], dv)
-
-        @staticmethod
-        def vmap(info: Any, in_dims: tuple[Any, ...], *x: torch.Tensor) -> tuple[torch.Tensor, int]:
-            return HessianVector.in_batch(in_dims, *x)
-
-    return Potential.apply, Gradient.apply, HessianVector.apply
 
 
 def _third_derivative() -> Exception:

@@ -227,12 +227,8 @@ def gauss_legendre(stages: int) -> Tableau:
 
         a_ij/b_j = ½ + Σ_k ξ_k (P_k(c_i) P_{k−1}(c_j) − P_{k−1}(c_i) P_k(c_j)),   k = 1 … s − 1,
 
-    of which a_ij/b_j + a_ji/b_i = 1 is plain. The larger of the two lies in [1/2, 2], so that the other is computed
-    without rounding.
-
-    References
-    ----------
-    .. [1] E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II*, 2nd ed. (Springer 1996), theorem IV.5.6.
+    so that a_ij/b_j + a_ji/b_i = 1 [Hairer, Wanner, Solving ODEs II, 1996, theorem IV.5.6]. The larger of the two lies
+    in [1/2, 2], and the other is computed without rounding.
     """
     nodes, weights = np.polynomial.legendre.leggauss(stages)
     P = np.polynomial.legendre.legvander(nodes, stages - 1) * np.sqrt(2 * np.arange(stages) + 1)

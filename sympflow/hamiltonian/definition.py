@@ -18,67 +18,29 @@ class Definition:
 
     If `separable`, `potential(q)`, `potential_gradient(q)` and `potential_hessian(q)`, and where T is not quadratic
     `kinetic(p)`, `kinetic_gradient(p)` and `kinetic_hessian(p)`; else `hamiltonian(y)`, `gradient(y)` and `hessian(y)`.
-
-    Attributes
-    ----------
-    ndof : int
-    separable : bool
-    numba_functions : tuple of three functions or None
-        (potential, gradient, hessian_vector), if they are Numba's.
-    differentiates_itself : bool
-        True if all derivatives are automatic ones of a function that is written with torch.
-    has_hessian_vector : bool
-        False if ∇²V·v of arrays is not to be had: a gradient was given without it.
-    takes_tensors : bool
-        False if the functions take NumPy arrays alone.
-    given : bool
-        True if the functions are a user's own, whose derivatives may be wrong: `check` tests them.
-    timed : bool
-        True if H depends on the time: then each function takes t, a number or (...), after the states, and there is
-        `time_derivative(y, t)`.
-    kinetic_timed : bool
-        True if T depends on it: then there are `drifted(p, t, s)` and `drift_jacobian(p, t, s)`.
-    shortest_piece : float
-        The shortest time between two jumps of H in t that are known, inf if there are none.
-    has_third_derivative : bool
-        True if there is `third_derivative(q, v, w)` of all arrays; else it is found by differences.
-    loops : str
-        Name of the compiled loops that are generated for it, of a definition by one piece: see
-        `sympflow.hamiltonian.local`.
-    instead : str
-        The methods that are advised where H is not separable, in words.
-    impulses : tuple
-        Those of H, DiracDelta in t, if it has some: then there are `between_impulses` and `kicks`.
-    leaps : bool
-        True if bodies may meet, over which a step may leap: then there is `leapt`.
-    form : TracedHamiltonian or None
-        The program of functions that could be traced: see `sympflow.hamiltonian.formulas`.
-    given_functions : bool
-        True if H is given by functions of Python, which are traced where that is possible.
-    untraced : str
-        The reason for which functions could not be traced, a clause, known after `form`.
-    poles : Poles or None
-        The places that a step may leap over at which H as it is written is infinite or no number.
+    If `timed`, each takes t, a number or (...), after the states, and there is `time_derivative(y, t)`; if
+    `kinetic_timed`, `drifted(p, t, s)` and `drift_jacobian(p, t, s)`.
     """
 
     ndof: int
     separable: bool
-    numba_functions: tuple[Any, Any, Any] | None = None
-    differentiates_itself: bool = False
-    has_hessian_vector: bool = True
-    takes_tensors: bool = True
-    given: bool = False
+    numba_functions: tuple[Any, Any, Any] | None = None  # V, gradient, hessian_vector
+    differentiates_itself: bool = False  # by torch alone, in which the functions are written
+    has_hessian_vector: bool = True  # of arrays: not where a gradient was given without it
+    takes_tensors: bool = True  # not if the functions take NumPy arrays alone
+    given: bool = False  # by a user, so that derivatives may be wrong: `check` tests them
     timed: bool = False
     kinetic_timed: bool = False
-    shortest_piece: float = inf
-    has_third_derivative: bool = False
-    loops: str = ""
-    leaps: bool = False
-    impulses: tuple[Any, ...] = ()
-    poles: Poles | None = None
-    form: Any = None
-    untraced: str = ""
-    given_functions: bool = False
+    shortest_piece: float = inf  # the shortest time between two jumps of H in t
+    has_third_derivative: bool = False  # `third_derivative` of all arrays; else by differences
+    loops: str = ""  # the compiled loops of a definition by one piece: see `sympflow.hamiltonian.local`
+    leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`
+    impulses: tuple[Any, ...] = ()  # DiracDelta in t: then there are `between_impulses` and `kicks`
+    poles: Poles | None = None  # the places at which H is infinite or no number, which a step may leap over
+    form: Any = None  # the program of functions that could be traced: see `sympflow.hamiltonian.formulas`
+    layered: Any = None  # V with layers whose weights torch follows: see `sympflow.hamiltonian.layered`
+    untraced: str = ""  # the reason for which they could not, a clause, known after `form`
+    given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
@@ -108,10 +70,7 @@ class Definition:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
 
     def learns(self, y: Array) -> bool:
-        """Return True if torch follows numbers within the functions at the states y (..., 2d), such as weights.
-
-        Inside a transform of `torch.func`, which takes hold of all that is computed there, also where it follows none.
-        """
+        """Return True if torch follows numbers within the functions at the states y (..., 2d), such as weights."""
         return False
 
     def potential_hessian(self, q: Array, *t: Array) -> Array:
@@ -123,16 +82,7 @@ class Definition:
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
 
     def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
-        """Return True for each run from states (n, 2d) to others that is seen to have leapt over an infinite V: (n,).
-
-        Parameters
-        ----------
-        starts, ends : ndarray of shape (n, 2d)
-        n_steps : int
-            Steps of a run, beside which the answer should take little time.
-        conserves : bool
-            True if the exact solution keeps H.
-        """
+        """Return True for each run of steps from states (n, 2d) to others that leapt over an infinite V: (n,)."""
         raise NotImplementedError(f"{type(self).__name__} must define leapt().")
 
     def leap(self, y: np.ndarray, start: np.ndarray) -> str:

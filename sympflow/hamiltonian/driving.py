@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
 from sympy.core.symbol import Str
 
-from sympflow.arrays import Array, is_tensor
+from sympflow.arrays import Array, is_tensor, opaque
 from sympflow.hamiltonian.expression import ELEMENTARY
 
 JUMP = 1e-9
@@ -114,7 +114,7 @@ class Samples:
     def __call__(self, t: Array, order: int = 0) -> Array:
         """The derivative of an order, −1 for the antiderivative, at times: numbers or arrays; tensors by NumPy."""
         if is_tensor(t):
-            return _on_tensors(self, t, order)
+            return opaque(_Derivative(self, order), t)
         return self._values(np.asarray(t, dtype=float), order)
 
     def _values(self, t: np.ndarray, order: int) -> np.ndarray:
@@ -161,35 +161,20 @@ def is_spline(value: object) -> bool:
     return module is not None and isinstance(value, module.PPoly | module.BPoly | module.BSpline)
 
 
-def _on_tensors(samples: Samples, t: Any, order: int) -> Any:
-    import torch
+class _Derivative(NamedTuple):
+    """A derivative of samples, as `opaque` takes it."""
 
-    class Values(torch.autograd.Function):
-        generate_vmap_rule = False
+    samples: Samples
+    order: int
 
-        @staticmethod
-        def forward(s: torch.Tensor) -> torch.Tensor:
-            found = samples(s.detach().cpu().numpy(), order)
-            return torch.as_tensor(found, dtype=s.dtype, device=s.device)
+    def value(self, t: np.ndarray) -> np.ndarray:
+        return self.samples(np.asarray(t), self.order)
 
-        @staticmethod
-        def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-            ctx.save_for_backward(*inputs)
-            ctx.save_for_forward(*inputs)
+    def vjp(self, x: Sequence[Array], w: Array, wanted: Sequence[bool]) -> tuple[Array]:
+        return (w * self.samples(x[0], self.order + 1),)
 
-        @staticmethod
-        def backward(ctx: Any, v: torch.Tensor) -> torch.Tensor:
-            return v * _on_tensors(samples, ctx.saved_tensors[0], order + 1)
-
-        @staticmethod
-        def jvp(ctx: Any, v: torch.Tensor) -> torch.Tensor:
-            return v * _on_tensors(samples, ctx.saved_tensors[0], order + 1)
-
-        @staticmethod
-        def vmap(info: Any, in_dims: tuple[Any, ...], s: torch.Tensor) -> tuple[torch.Tensor, int | None]:
-            return Values.apply(s), in_dims[0]
-
-    return Values.apply(t)
+    def jvp(self, x: Sequence[Array], v: Sequence[Array]) -> Array:
+        return v[0] * self.samples(x[0], self.order + 1)
 
 
 class sampled(sp.Function):

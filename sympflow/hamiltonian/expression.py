@@ -142,6 +142,8 @@ def _remedy(text: str) -> str | None:
         return f"{found[0]} lacks a sign: write {found[1]}*{found[2]}"
     if found := re.search(r"[²³⁴½¼√·×÷−π]", text):
         return f"{found[0]} is not understood: write q**2, sqrt(q), *, /, - and pi"
+    if found := re.match(r"\s*[A-Za-z]\w*\s*(\([^)]*\)\s*)?=(?!=)", text):
+        return f"leave {found[0].strip()!r} out: only what stands after it is H"
     words = [word for word in re.findall(r"[A-Za-z_]\w*", text) if keyword.iskeyword(word)]
     return f"{words[0]} is a word of Python: choose another name, such as {words[0]}_" if words else None
 

@@ -34,14 +34,7 @@ class Letter(NamedTuple):
 
 
 class Formula:
-    """A function of letters, a program of one output.
-
-    Parameters
-    ----------
-    program : Program
-    letters : sequence of Letter
-        Those of its inputs.
-    """
+    """A function of letters, those of the inputs of a program of one output."""
 
     def __init__(self, program: Program, letters: Sequence[Letter]) -> None:
         self.program, self.letters = program, tuple(letters)
@@ -99,23 +92,7 @@ class Entries:
 class TracedHamiltonian:
     """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
 
-    Parameters
-    ----------
-    ndof : int
-    program : Program
-        V of q, or H of q and p; of a driven system of the time first.
-    separable : bool
-        True of V.
-    inverse_mass : ndarray, optional
-        (d,) or (d, d), of V.
-    timed : bool
-
-    Attributes
-    ----------
-    H, V, T : Formula
-        V and T are None if it is not separable.
-    parameters : tuple of Letter
-        Those of the time, in the form that `driving` has.
+    The program is V of q, if it is `separable`, or H of q and p; of a driven system the time comes first.
     """
 
     parameters: tuple[Letter, ...] = ()
@@ -260,14 +237,7 @@ class TracedHamiltonian:
 
 
 class TracedDriving:
-    """Letters of a traced V that depend on the time alone, and V in these.
-
-    Attributes
-    ----------
-    form : TracedHamiltonian
-    means : tuple
-        Those of T, none.
-    """
+    """Letters of a traced V that depend on the time alone, and V in these; those of T, `means`, are none."""
 
     means: tuple[()] = ()
 
@@ -287,15 +257,7 @@ class TracedDriving:
 
 
 class TracedLetters:
-    """Formulas with letters for what depends on the time alone.
-
-    Attributes
-    ----------
-    symbols : TracedHamiltonian
-    expressions : list of Formula
-    letters : mapping of Letter to Formula
-    given : tuple of Letter
-    """
+    """Formulas with letters for what depends on the time alone, `given` those of parameters too."""
 
     def __init__(self, form: TracedHamiltonian, expressions: Sequence[Formula]) -> None:
         self.symbols, self.expressions, self.letters = form, list(expressions), dict[Letter, Formula]()
@@ -360,13 +322,7 @@ def _kinetic(M: np.ndarray, p: Sequence[Any]) -> Any:
 
 
 def evaluator(numbers: Mapping[Any, Any]) -> Callable[[Any], Any]:
-    """Return a function of expressions that calculates with these numbers; common subexpressions once.
-
-    Raises
-    ------
-    NotRecorded
-        From that function, if something in an expression cannot be calculated.
-    """
+    """Return a function of expressions that calculates with these numbers, or raises NotRecorded."""
     known: dict[Any, Any] = dict(numbers)
 
     def value(f: Any) -> Any:

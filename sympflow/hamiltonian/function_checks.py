@@ -82,48 +82,20 @@ def farther_states(y: np.ndarray, reached: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Tested:
-    """A function of states x (..., n), its gradient, and its Hessian times a vector where that was given.
+    """A function of states x (..., n), its gradient, and its Hessian times a vector where that was given."""
 
-    Parameters
-    ----------
-    names : (str, str, str)
-        Those of the functions, and of the state, in messages.
-    gradient : callable, optional
-        None of an exact one, of a function that was traced.
-    automatic : bool
-        True if the gradient is an automatic one.
-    parts : int
-        2 if x is [q, p], two halves of sizes of their own, else 1.
-    result_types : callable, optional
-        The types in which the user's own functions answer.
-    time : float, optional
-        The time of the functions, of a driven system.
-    """
-
-    names: tuple[str, str, str]
+    names: tuple[str, str, str]  # of the functions, and of the state, in messages
     value: Callable[[Array], Array]
-    gradient: Callable[[Array], Array] | None
+    gradient: Callable[[Array], Array] | None  # None of an exact one, of a function that was traced
     hessian_vector: Callable[[Array, Array], Array] | None = None
-    automatic: bool = False
-    parts: int = 1
-    result_types: Callable[[Array], list[tuple[str, Any]]] | None = None
+    automatic: bool = False  # the gradient is an automatic one
+    parts: int = 1  # 2 if x is [q, p], two halves of sizes of their own
+    result_types: Callable[[Array], list[tuple[str, Any]]] | None = None  # in which the user's own functions answer
     time: float | None = None
 
 
 def test(functions: Tested, states: np.ndarray, like: Array, n_given: int) -> None:
-    """Test the functions at states (N, n), in the library, dtype and on the device of `like`.
-
-    Parameters
-    ----------
-    n_given : int
-        How many of the first states must be in the domain of the functions; where they fail at others, these are
-        left out.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If a function is wrong: the message names it, the component, the state and both values.
-    """
+    """Test the functions at states (N, n), in the library and dtype of `like`; `n_given` must be in their domain."""
     with np.errstate(all="ignore"):
         kept = _evaluated(functions, as_like(states, like), n_given)
         if kept is None:
@@ -401,13 +373,7 @@ def _products(functions: Tested, x: Array, v: np.ndarray) -> np.ndarray:
 
 
 def check_writes(name: str, function: Callable[..., Any], *states: np.ndarray) -> None:
-    """Test that a Numba function (x, …, out) sets every number of `out`, which holds anything before, and no other.
-
-    Raises
-    ------
-    ValueError
-        If one is left as it was, or added to; or if x is written into.
-    """
+    """Refuse a Numba function (x, …, out) that writes into x, or does not set every number of `out`."""
     found = []
     for fill in (7.0, -3.0):
         out = np.full(states[0].shape, fill)

@@ -16,6 +16,7 @@ from sympflow.hamiltonian.times import checked_time
 
 if TYPE_CHECKING:
     from sympflow.compiler.program import Program
+    from sympflow.hamiltonian.layered import LayeredPotential
     from sympflow.hamiltonian.local import LocalHamiltonian
     from sympflow.hamiltonian.poles import Poles
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -585,6 +586,11 @@ class Hamiltonian:
     def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
         """The definition that programs are recorded of: symbols, or functions that were traced; else None."""
         return self.symbols if self.symbols is not None else self._definition.form
+
+    @property
+    def layered(self) -> LayeredPotential | None:
+        """V as a chain of linear layers whose weights torch follows, of functions that are one; else None."""
+        return self._definition.layered
 
     @property
     def untraced(self) -> str:

@@ -508,9 +508,13 @@ def has_period(
 ) -> bool:
     """Return True if H, up to a function of t alone, has a period: every term of it by its functions of t."""
     rng, states = np.random.default_rng(0), set(states)
+    terms: dict[sp.Expr, sp.Expr] = {}
     for term in sp.Add.make_args(H.replace(Impulse, sp.Abs)):
-        if time not in term.free_symbols or not term.free_symbols & states:
-            continue
+        if time in term.free_symbols and term.free_symbols & states:
+            alone = all(map(math.isfinite, _leaves(term, time, samples)))  # t and floor(t) are periodic together
+            key = term if alone else term.as_independent(*states, as_Add=False)[1]
+            terms[key] = terms.get(key, sp.S.Zero) + term
+    for term in terms.values():
         leaves = list(_leaves(term, time, samples))
         if -math.inf not in leaves:
             if math.inf in leaves:
@@ -518,7 +522,7 @@ def has_period(
             turns = period / np.array(leaves)
             if (np.round(turns) > 0).all() and (np.abs(turns - np.round(turns)) <= PERIOD_TOLERANCE * turns).all():
                 continue
-        factor, rest = term.as_independent(*states, as_Add=False)
+        factor, rest = sp.factor_terms(term).as_independent(*states, as_Add=False)
         [f], letters = with_letters([term if time in rest.free_symbols else factor])
         variables = sorted(f.free_symbols - {time} - set(letters.values()), key=str)
         values = _values([time, *letters.values(), *variables], [f])

@@ -34,7 +34,9 @@ MANY = 64, 10, 5
 MOST_JUDGED = 1024
 """Degrees of freedom of the lattice on which a flow is judged, where it has more."""
 WELLS, FAR = 8, 100.0
-"""Starts from which minima of U are looked for, for each field, and how far they may be."""
+"""Starts from which minima of U are looked for, for each field, and how far they may be, in units of U."""
+SIZES, LINES = np.geomspace(1e-30, 1e30, 3001), 64
+"""Sizes of fields, and lines for each but one of them, at which U is looked at first."""
 
 
 class LatticeHamiltonian(LocalHamiltonian):
@@ -155,29 +157,45 @@ class LatticeHamiltonian(LocalHamiltonian):
         }
 
     def wells(self) -> list[np.ndarray]:
-        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U."""
-        n = len(self.fields)
+        """The values of the fields (F,) at which all sites are at rest: the lowest minima of U, 0 without U.
+
+        U is first looked at along straight lines, at fields of all sizes, for the units in which it is minimized.
+        """
+        n, rng = len(self.fields), np.random.default_rng(0)
         if self.U == 0:
             return [np.zeros(n)]
         from scipy.optimize import minimize
 
         values = {s: float(np.mean(v)) for s, v in zip(self.c, self.params.values(), strict=True)}
         U = sp.lambdify([self.x], self.U.xreplace(values), "numpy")
-        starts = [np.zeros(n), *np.random.default_rng(0).uniform(-3, 3, (WELLS * n, n))]
+        starts = [np.zeros(n), *rng.uniform(-3, 3, (WELLS * n, n))]
+        lines = np.concatenate([np.eye(n), -np.eye(n), rng.standard_normal((LINES * (n - 1), n))])
+        lines /= np.linalg.norm(lines, axis=1, keepdims=True)
         with np.errstate(all="ignore"):
-            found = [minimize(U, start) for start in starts if np.isfinite(U(start))]
+            low = np.fmin.reduce(U(SIZES * lines.T[..., None]))
+            zero = float(U(np.zeros(n, dtype=np.float64)))
+            dips = 1 + np.flatnonzero((low[1:-1] < low[:-2]) & (low[1:-1] <= low[2:]) & ~(low[1:-1] >= zero))
+            if not len(dips):
+                return [np.zeros(n)]
+            least = low[dips].min()
+            depth = (zero - least if math.isfinite(zero) else abs(least)) or 1.0
+            size = SIZES[dips[low[dips] <= least + 0.01 * depth][0]]
+
+            def scaled(x: np.ndarray) -> float:
+                return float((U(size * x) - least) / depth)
+
+            found = [minimize(scaled, start) for start in starts if np.isfinite(scaled(start))]
         found = [m for m in found if np.isfinite(m.fun) and np.abs(m.x).max() < FAR]
         if not found:
             return [np.zeros(n)]
         least = min(m.fun for m in found)
-        room = 1e-6 * max(1.0, abs(least))
-        lowest = sorted((m.x for m in found if m.fun <= least + room), key=lambda x: float(np.linalg.norm(x)))
+        lowest = sorted((m.x for m in found if m.fun <= least + 1e-6), key=lambda x: float(np.linalg.norm(x)))
         near = 1.5 * float(np.linalg.norm(lowest[0])) + 1e-3  # of a periodic U those about 0
         kept: list[np.ndarray] = []
         for x in lowest:
             if np.linalg.norm(x) <= near and all(np.linalg.norm(x - y) > 1e-2 for y in kept):
                 kept.append(x)
-        return kept
+        return [size * x for x in kept]
 
     @property
     def poles(self) -> Poles | None:  # type: ignore[override]

@@ -21,7 +21,7 @@ SPREAD, CALM = 8.0, 2.0
 the factor in a calm system, where no density is known but theirs."""
 RELAXED, PHASE = 60, 0.3
 """Verlet steps by which drawn states are relaxed, and their length times the fastest frequency."""
-HALVINGS, POWERS = 60, 12
+HALVINGS, SCALES, POWERS = 60, 400, 12
 DRAWN = 200
 """States of another domain from which densities are taken."""
 SHARE = 0.05
@@ -173,29 +173,14 @@ class LatticeStates:
 
 @dataclass(frozen=True)
 class Rest:
-    """A lattice at rest, all sites in one of the wells, and what is drawn about it.
-
-    Attributes
-    ----------
-    system : Hamiltonian
-    parts : int
-        Sites.
-    positions : ndarray (n, d)
-        Positions at rest, n of them that are as good.
-    moves : bool
-        True if nothing holds the lattice at its place, so that the sum of the momenta is left out.
-    energy : ndarray
-        Of each site, that of its bonds among it.
-    block : tuple of int
-        Sites along each axis of which densities are taken together.
-    """
+    """A lattice at rest, all sites in one of the wells, and what is drawn about it."""
 
     system: Hamiltonian
-    parts: int
-    positions: np.ndarray
-    moves: bool
-    energy: np.ndarray
-    block: tuple[int, ...]
+    parts: int  # sites
+    positions: np.ndarray  # (n, d), at rest, n of them that are as good
+    moves: bool  # nothing holds the lattice at its place, so that the sum of the momenta is left out
+    energy: np.ndarray  # of each site, that of its bonds among it
+    block: tuple[int, ...]  # sites along each axis of which densities are taken together
 
     @property
     def state(self) -> np.ndarray:
@@ -242,7 +227,7 @@ class Rest:
     def _relaxed(self, q: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States after a while of the system's own motion."""
         system = self.system
-        v = np.ones_like(q) * (-1.0) ** np.arange(q.shape[1]) + 0.1 * p
+        v = np.ones_like(q) * (-1.0) ** np.arange(q.shape[1]) + 0.1 * p / np.abs(p).max(-1, keepdims=True)
         square = np.ones((len(q), 1))
         for _ in range(POWERS):
             v = system.velocity(system.hessian_vector(q, v / np.linalg.norm(v, axis=-1, keepdims=True)))
@@ -260,7 +245,12 @@ class Rest:
 def _scaled(energy: Callable[[np.ndarray], np.ndarray], target: np.ndarray) -> np.ndarray:
     """The smallest scales s (n, 1) at which an energy that rises from 0 has the values (n,)."""
     low, high = np.zeros((len(target), 1)), np.full((len(target), 1), 1e-3)
-    for _ in range(HALVINGS):
+    for _ in range(SCALES):
+        above = energy(high / 2) >= target
+        if not above.any():
+            break
+        high = np.where(above[:, None], high / 2, high)
+    for _ in range(SCALES):
         below = energy(high) < target
         if not below.any():
             break

@@ -28,26 +28,13 @@ class LinearPart:
     *hyperbolic* mode (K negative along it), and Y_j²/2 for a *free* one; coordinates that B leaves out are *idle*.
     In these variables, in which a state moves on a circle, the exact flow needs no number that depends on the scales
     of q and p, and does not drift by rounding.
-
-    Attributes
-    ----------
-    inverse_mass : (d, d)
-        B, symmetric positive semidefinite: M⁻¹ where the kinetic energy is ½ pᵀM⁻¹p.
-    stiffness_matrix : (d, d)
-        K, symmetric.
-    center : (d,)
-        c. Of a system given by functions the equilibrium along the stiff directions, where their forces vanish.
-    potential : sympy.Expr or None
-        U(q), what the potential has beside the quadratic part, if the system is symbolic.
-    interval : float
-        Length of the system's default interval.
     """
 
-    inverse_mass: np.ndarray
-    stiffness_matrix: np.ndarray
-    center: np.ndarray
-    potential: sp.Expr | None = None
-    interval: float = 0.0
+    inverse_mass: np.ndarray  # B (d, d), symmetric positive semidefinite
+    stiffness_matrix: np.ndarray  # K (d, d), symmetric
+    center: np.ndarray  # c (d,): where the forces along stiff directions vanish, of a system given by functions
+    potential: sp.Expr | None = None  # U(q), what V has beside the quadratic part, if the system is symbolic
+    interval: float = 0.0  # length of the system's default interval
 
     dense: ClassVar[bool] = True
     """False of modes by fast transforms, which have no loops."""

@@ -33,28 +33,13 @@ class LocalHamiltonian(Definition, ABC):
 
     A subclass defines `potential`, `potential_gradient`, `hessian_vector`, `third_derivative` and, unless T is
     quadratic, `kinetic` and its derivatives; all of arrays and tensors (..., d), at the cost of O(d).
-
-    Attributes
-    ----------
-    loops : str
-        Name of the compiled loops that are generated for it: see `sympflow.kernels.splitting_loops`.
-    inverse_mass : ndarray of shape (d,) or None
-        M⁻¹ of T = ½ pᵀM⁻¹p; None if it is the identity or T is not quadratic.
-    quadratic_kinetic : bool
-    params : mapping of str to float or ndarray
-    shape : tuple of int
-        Sites along the axes of a lattice; () of another system.
-    ends : tuple of str
-        How each axis of a lattice ends.
-    noun : str
-        The kind of system, in messages.
     """
 
     separable = True
     has_third_derivative = True
-    shape: tuple[int, ...] = ()
-    ends: tuple[str, ...] = ()
-    noun: str = "system"
+    shape: tuple[int, ...] = ()  # sites along the axes of a lattice
+    ends: tuple[str, ...] = ()  # how each axis of a lattice ends
+    noun: str = "system"  # in messages
     felt: np.ndarray | None = None
     """1 of the momenta that count in H, 0 of those of bodies without mass (d,); None where all do."""
     frame: Any = None
@@ -62,7 +47,7 @@ class LocalHamiltonian(Definition, ABC):
     written: SymbolicHamiltonian | None = None
     """H in symbols, of a system so small that it is written out when symbols are asked for."""
     loops: str
-    inverse_mass: np.ndarray | None
+    inverse_mass: np.ndarray | None  # (d,), of T = ½ pᵀM⁻¹p; None for the identity
     quadratic_kinetic: bool
     params: Mapping[str, Any]
 
@@ -196,23 +181,7 @@ def letters(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
 
 
 def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Symbol], example: str) -> sp.Expr:
-    """Return the expression in the symbols that its names stand for.
-
-    Parameters
-    ----------
-    argument : str
-        Name of the argument, for messages.
-    expression : str or sympy.Expr
-    symbols : mapping of str to Symbol
-        By the names that the expression may hold.
-    example : str
-        A legal one, for messages.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it cannot be read, is not real, or has other names.
-    """
+    """Return an expression, the argument of this name, in the symbols that its names stand for; refuse all others."""
     if isinstance(expression, bool) or not isinstance(expression, str | sp.Basic | sp.MatrixBase | int | float):
         raise TypeError(
             f"`{argument}` must be a string or a SymPy expression such as {example!r}; got {type(expression).__name__}."

@@ -25,7 +25,7 @@ class Rows(NamedTuple):
 
     places: np.ndarray
     system: HamiltonianSystem
-    letters: np.ndarray | None = None
+    parameter_values: np.ndarray | None = None
 
 
 class ParameterRows:
@@ -91,7 +91,7 @@ class ParameterRows:
             yield Rows(index, system, np.stack([np.broadcast_to(x, index.shape) for x in letters]))
 
     def _formed(self, kinds: tuple[float, ...], row: int) -> HamiltonianSystem:
-        """A system of the form of a row, made once: of a trajectory with letters of its own the form alone counts."""
+        """A system of the form of a row, made once; with parameter values of its own the form alone counts."""
         known = _FORMED.setdefault(self.system, {})
         key = tuple(self.values), kinds
         if key not in known:

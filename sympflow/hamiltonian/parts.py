@@ -32,46 +32,20 @@ LINEAR = 0
 
 @dataclass(frozen=True)
 class SubFlow:
-    """The exact flow of a part, in units of absolute time; every entry may have a batch shape in front.
-
-    Attributes
-    ----------
-    part : int
-    length : (...) for the parts 1, 2, …; (..., F) for the linear part
-        How long it acts; the linear part has a time for each of its F frequencies.
-    gradient : (...)
-        g, adds −g ½|∇H_k|²_{M⁻¹} to the Hamiltonian of a part H_k(q), times 1.
-    filters : (..., F) or None
-        φ: the part acts at c + C φ X in place of q = c + C X, with a factor for each frequency.
-    at : float
-        The share of a step after which a part that depends on t acts, at that time.
-    """
+    """The exact flow of a part, in units of absolute time; every entry may have a batch shape in front."""
 
     part: int
-    length: Any
-    gradient: Any = 0.0
-    filters: Any = None
-    at: float = 0.0
+    length: Any  # how long it acts: (...), or (..., F), a time for each of the F frequencies of the linear part
+    gradient: Any = 0.0  # g (...): adds −g ½|∇H_k|²_{M⁻¹} to the Hamiltonian of a part H_k(q), times 1
+    filters: Any = None  # φ (..., F): the part acts at c + C φ X in place of q = c + C X
+    at: float = 0.0  # share of a step after which a part that depends on t acts, at that time
 
     def inverse(self) -> SubFlow:
         return SubFlow(self.part, -self.length, -self.gradient, self.filters, self.at)
 
 
 class PartFunctions(SymbolicHamiltonian):
-    """A part H_k(q, p) as a SymPy expression, with array functions of states [q, p]; of t, where it holds that.
-
-    Parameters
-    ----------
-    H : SymPy expression
-    q, p : tuple of Symbol
-    whole : SymbolicHamiltonian
-        With the time and the samples that H may hold.
-
-    Attributes
-    ----------
-    of_positions : bool
-        True for a potential, H_k(q).
-    """
+    """A part H_k(q, p) as a SymPy expression, with array functions of states [q, p], and of t where `whole` has it."""
 
     turns = False
 
@@ -116,14 +90,7 @@ class RestOfPotential:
 class ExactParts:
     """The parts of a system, and their flows in the normal modes (X, Y) of the linear one.
 
-    Parameters
-    ----------
-    linear : LinearPart or None
-    rest : sequence of PartFunctions
-        The parts 1, 2, …
-    ndof : int
-    sequence : sequence of int, optional
-        The parts in the order of a splitting, the last innermost; the default is 1, 2, …, 0: kicks outside.
+    `rest` are the parts 1, 2, …; `sequence` is the order of a splitting, the last innermost: kicks outside by default.
     """
 
     def __init__(
@@ -205,7 +172,7 @@ class ExactParts:
                 Y = Y + each_mode(m.gradient) * self.force_gradient(m.part, X, m.filters, *time)
         return X, Y
 
-    def pushed(
+    def jvp(
         self, maps: Sequence[SubFlow], x: tuple[Array, Array], w: tuple[Array, Array], t: Any = 0.0, h: Any = 0.0
     ) -> tuple[tuple[Array, Array], tuple[Array, Array]] | None:
         """The modes (..., d) after the maps, and vectors (..., k, d) moved by the derivative of these.
@@ -378,13 +345,7 @@ def _low(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> np.ndarray:
 
 
 def linear_and_rest(system: HamiltonianSystem) -> ExactParts:
-    """The linear part and U(q), for the kicks and exact linear flows of Nyström splittings.
-
-    Raises
-    ------
-    ValueError
-        If the system has no linear part, or more than a potential beside it.
-    """
+    """The linear part and U(q), for the kicks and exact linear flows of Nyström splittings."""
     linear = system.linear_part
     parts = exact_parts(system)
     if len(parts.rest) > 1 or any(not (functions.of_positions or functions.turns) for functions in parts.rest):
@@ -395,20 +356,9 @@ def linear_and_rest(system: HamiltonianSystem) -> ExactParts:
 
 
 def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = None) -> ExactParts:
-    """H as a sum of parts that are solved exactly.
+    """H as a sum of parts that are solved exactly: given as texts, the last innermost, or as few as its terms allow.
 
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        Symbolic, or given by functions with a `stiffness_matrix`.
-    expressions : sequence of str, optional
-        The parts, in the symbols of the system, in the order of the splitting, the last innermost. The default is as
-        few as the terms of H allow, potentials first, and at the end the linear part, if there is one.
-
-    Raises
-    ------
-    ValueError
-        If a part is not solved exactly, or the parts do not add up to H.
+    By default potentials come first, and at the end the linear part, if there is one.
     """
     check_parts_conservative(system)
     by_arrays = system.local is not None or (system.stiffness_matrix is not None and expressions is None)

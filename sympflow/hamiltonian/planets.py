@@ -34,13 +34,7 @@ MOON = 0.5  # of a Hill radius: bodies that are nearer may be bound
 
 
 def gravity(units: Any) -> float:
-    """Return G in units of length, time and mass, three names such as ("AU", "day", "solar mass").
-
-    Raises
-    ------
-    ValueError
-        If a name is not known.
-    """
+    """Return G in units of length, time and mass, three names such as ("AU", "day", "solar mass")."""
     names = [x.strip() for x in units.split(",")] if isinstance(units, str) else units
     tables = LENGTHS, TIMES, MASSES
     if not isinstance(names, list | tuple) or len(names) != 3:
@@ -59,25 +53,8 @@ def gravity(units: Any) -> float:
 class Frame:
     """The coordinates of planets about a star in which the splitting "kepler" makes its steps.
 
-    Parameters
-    ----------
-    local : PairsHamiltonian
-        Whose first body is the star.
-    G : float
-    y0 : ndarray of shape (2d,)
-        States that tell the order of the planets.
-    coordinates : {"jacobi", "democratic"}
-    encounter : float or None
-        The distance of two planets, in their Hill radii, that ends a run.
-
-    Attributes
-    ----------
-    order, test : ndarray of int
-        The planets that have a mass, by their semi-major axes, and those without.
-    inside : ndarray of int
-        For each of the latter, how many of the former are inside of its orbit.
-    mu : ndarray
-        Of Kepler's motion of each, `order` before `test`.
+    `order` and `test` are the planets with a mass, by their semi-major axes in y0, and those without; `inside`, for
+    each of the latter, how many of the former are inside of its orbit; `mu` belongs to Kepler's motion of each.
     """
 
     def __init__(
@@ -387,12 +364,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
 
 
 def checked_planets(masses: Any, elements: Any, y0: Any, G: Any, units: Any) -> tuple[np.ndarray, float, np.ndarray]:
-    """Masses, G and the state y0 that `HamiltonianSystem.planets` is given, tested.
-
-    Raises
-    ------
-    ValueError, TypeError
-    """
+    """Masses, G and the state y0 that `HamiltonianSystem.planets` is given, tested."""
     G, given = plain(G), masses
     if G is not None and units is not None:
         raise ValueError("`units` tell what `G` is: leave out one of them.")

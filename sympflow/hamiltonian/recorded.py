@@ -8,7 +8,7 @@ from typing import Any
 
 import sympy as sp
 
-from sympflow.compiler.functions import apply, where
+from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
 from sympflow.compiler.program import Program, Traced
 from sympflow.hamiltonian.removable import sinc
 
@@ -61,7 +61,7 @@ _RULES: dict[type, Callable[..., Any]] = {
     sp.lowergamma: lambda s, x: apply("gamma", s) * apply("gammainc", s, x),
     sp.uppergamma: lambda s, x: apply("gamma", s) * apply("gammaincc", s, x),
     sp.elliptic_k: lambda m: apply("ellipk", m), sp.Ei: lambda x: apply("expi", x),
-    sp.polygamma: lambda n, x: apply({0.0: "digamma", 1.0: "trigamma"}[n], x),
+    sp.polygamma: lambda n, x: apply(f"polygamma{int(n)}" if n else "digamma", x),
     sp.sinc: _sinc, sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
     sp.Max: _folded("max"), sp.Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
     sp.Not: lambda x: apply("not", x),
@@ -103,7 +103,7 @@ def can_be_recorded(f: sp.Expr) -> bool:
 def _takes_order(f: sp.Basic) -> bool:
     """False of a special function of an order for which there is no rule."""
     if isinstance(f, sp.polygamma):
-        return f.args[0] in (0, 1)
+        return f.args[0] in range(MOST_DERIVATIVES + 1)
     ordered = (sp.besselj, sp.bessely, sp.besseli, sp.besselk, sp.lowergamma, sp.uppergamma)
     return not isinstance(f, ordered) or bool(f.args[0].is_number)
 
@@ -145,13 +145,7 @@ def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
 
 
 def in_symbols(program: Program) -> sp.Expr:
-    """The one output of a program as an expression, in real symbols of the names of its inputs.
-
-    Raises
-    ------
-    NotRecorded
-        If an operation has no SymPy form.
-    """
+    """The one output of a program as an expression in real symbols; NotRecorded where an operation has no such form."""
     known: dict[int, Any] = {x.order: sp.Symbol(repr(x), real=True) for x in program.inputs}
 
     def given(x: Any) -> sp.Expr:

@@ -76,37 +76,10 @@ class Kick:
 class SymbolicHamiltonian(Definition):
     """H(q, p) as a SymPy expression; its derivatives; array functions of them.
 
-    Parameters
-    ----------
-    expression : str or sympy.Expr
-        In the symbols q1 … qd, p1 … pd (or q, p when d = 1).
-    params : mapping of str to float or spline, optional
-        Values of the remaining symbols; a spline is one of t.
-    time : str or sympy.Symbol, optional
-        The time, of a Hamiltonian that depends on it.
-
-    Raises
-    ------
-    ValueError
-        If the expression cannot be parsed, holds a symbol without a value, or does not use the time that is named.
-    TypeError
-        If H depends on a time t that is not named.
-
-    Attributes
-    ----------
-    H, V, T : sympy.Expr
-        V and T are None unless H = T(p) + V(q), each of t too.
-    time : sympy.Symbol or None
-        t, which H, V and T may hold; None of an autonomous H.
-    samples : dict of str to Samples
-        The functions of t that are given by samples, by the names that `driving.sampled` has in H.
-    q, p : tuple of sympy.Symbol, length d
-    parameters : tuple of sympy.Symbol
-        Symbols of H beside q and p: only a `parametric` form has some.
-    values : tuple of float
-        Their values.
-    meanings : tuple of sympy.Expr
-        What they stand for, in the symbols of H as it was written.
+    H, V and T are expressions in the symbols `q`, `p` and `time`; V and T are None unless H = T(p) + V(q), each of t
+    too. A `parametric` form has `parameters`, symbols for parts of H that depend on parameters alone, with their
+    `values` and, in the symbols of H as it was written, their `meanings`. `samples` are the functions of t that are
+    given by samples, by the names that `driving.sampled` has in H.
     """
 
     parameters: tuple[sp.Symbol, ...] = ()

@@ -163,7 +163,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         check: bool = True,
         **scene: Unpack[SceneOptions],
     ) -> None:
-        from sympflow.hamiltonian.callables import CallableHamiltonian, DrivenCallables
+        from sympflow.hamiltonian.callables import CallableHamiltonian
 
         settled = Scene.given(scene)
         for argument, H in (("potential", potential), ("hamiltonian", hamiltonian)):
@@ -179,8 +179,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         if isinstance(time, str):
             raise TypeError(f"`time` must be True for functions with t first; got {time!r}: names are for from_sympy.")
         check_flag("time", time)
-        kind = DrivenCallables if time else CallableHamiltonian
-        definition = kind(int(ndof), potential, hamiltonian, gradient, hessian_vector, check)
+        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector, check, bool(time))
         if definition.separable:
             super().__init__(settled.name, definition, matrices.inverse_mass(mass, int(ndof)), True)
         elif mass is not None:

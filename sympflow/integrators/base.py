@@ -32,7 +32,7 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.grid_runs import GridRun
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.steppers import ArraySteps, Stepper, rollout
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class OwnSteps(ArraySteps):
         return self.integrator.checked_step(self.problem.system, t, y, h)
 
     def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
     ) -> tuple[Array, np.ndarray]:
         if not self.takes_carry:
             part, end = self.problem, t0 + n_steps * h

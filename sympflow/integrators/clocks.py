@@ -429,7 +429,7 @@ class PhysicalRun:
         which = (
             "" if len(self.start) == 1 else f"{count} of {len(self.start)} trajectories failed, the first (index {i}): "
         )
-        return f"{which}{what}, after t = {self.failed_at[i]:.17g}. {remedy}."
+        return f"{which}{what}, after t = {self.failed_at[i]:.15g}. {remedy}."
 
     def _deliver(
         self, states: np.ndarray, last: np.ndarray, wanted: np.ndarray, delivered: np.ndarray, out: np.ndarray

@@ -29,7 +29,7 @@ from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, sc
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parts import ExactParts, SubFlow
     from sympflow.hamiltonian.planets import Frame
-    from sympflow.kernels.protocol import Carry, Kernel
+    from sympflow.kernels.protocol import Kernel, RunCheckpoint
     from sympflow.kernels.splitting_loops import SplittingLoops
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()
@@ -110,7 +110,7 @@ class Composition(ABC, ArraySteps):
         """The step and its Jacobian (..., 2d, 2d); None where `step` itself is to be differentiated."""
         return None
 
-    def pushed(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
+    def jvp(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         """The step and the vectors W (..., 2d, k) moved by its derivative; None likewise."""
         return None
 
@@ -214,14 +214,14 @@ class KineticPotential(Composition):
             return None
         if not self.system.has_hessian_vector:
             self.system.potential_hessian(y[..., : self.system.ndof], t)  # which says so, before anything large is made
-        return self.pushed(y, h, np.broadcast_to(np.eye(n, dtype=y.dtype), (*y.shape, n)).copy(), t)
+        return self.jvp(y, h, np.broadcast_to(np.eye(n, dtype=y.dtype), (*y.shape, n)).copy(), t)
 
     @property
     def _pushes(self) -> bool:
         """True if the step is differentiated by second derivatives of V, or by third ones known as products."""
         return self.scheme.level <= (0 if self.system.local is None else FORCE_GRADIENT)
 
-    def pushed(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
+    def jvp(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         if not self._pushes:
             return None
         system, d = self.system, self.system.ndof
@@ -242,9 +242,9 @@ class KineticPotential(Composition):
                     U = U + c * h[..., None] * _velocities(system, p, P)
                 q, p = system.drifted(q, p, at, c * h)
             else:
-                change = (c * h)[..., None] * _bends(system, q, U, at)
+                change = (c * h)[..., None] * _hessian_products(system, q, U, at)
                 if substep.three:
-                    G = (substep.three * h**3)[..., None] * _bends_of_gradient(system, q, U, at)
+                    G = (substep.three * h**3)[..., None] * _force_gradient_jvp(system, q, U, at)
                     change = change + G
                 P = P - change
                 p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
@@ -261,10 +261,7 @@ class KineticPotential(Composition):
         return kernel
 
     def kernel(self, compensated: bool) -> Kernel:
-        loops = _splitting_loops()(self.system)
-        if not self.system.friction:
-            return loops.kernel(self.scheme, compensated)
-        return loops.damped_kernel(self.scheme, self.step)
+        return _splitting_loops()(self.system).kernel(self.scheme, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
@@ -298,14 +295,14 @@ def _velocities(system: HamiltonianSystem, p: Array, P: np.ndarray) -> np.ndarra
     return system.velocity(P.swapaxes(-1, -2)).swapaxes(-1, -2)
 
 
-def _bends(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
+def _hessian_products(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
     """∇²V(q)·U of vectors (..., d, k), of a system by one piece without the matrix."""
     if system.local is None:
         return system.potential_hessian(q, t) @ U
     return system.hessian_vector(q[..., None, :], U.swapaxes(-1, -2), t).swapaxes(-1, -2)
 
 
-def _bends_of_gradient(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
+def _force_gradient_jvp(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
     """The derivatives along vectors (..., d, k) of the force gradient's ∇²V·M⁻¹F, F = −∇V; of a system by one piece."""
     x, along = q[..., None, :], U.swapaxes(-1, -2)
     v = system.velocity(system.force(q, t))[..., None, :]
@@ -332,7 +329,7 @@ class ExactMaps(Composition):
         return type(self), self.scheme, self.parts
 
     def force_times(self) -> list[float]:
-        return [m.at for m in known_maps(self, 1.0) if self.parts.timed(m.part)]
+        return [m.at for m in maps_of_step(self, 1.0) if self.parts.timed(m.part)]
 
     @abstractmethod
     def maps(self, h: Any) -> list[SubFlow]:
@@ -342,13 +339,13 @@ class ExactMaps(Composition):
         parts = self.parts
         return parts.from_modes(*parts.apply(self.maps(h), *parts.to_modes(y), t, h))
 
-    def pushed(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
+    def jvp(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         parts, linear, d = self.parts, self.parts.linear, self.parts.ndof
         if linear is None:
             return None
         y, w = to_numpy(y), W.swapaxes(-1, -2)
         vectors = linear.coordinates(w[..., :d]), linear.slopes(w[..., d:])
-        found = parts.pushed(self.maps(np.asarray(h)), parts.to_modes(y), vectors, t, h)
+        found = parts.jvp(self.maps(np.asarray(h)), parts.to_modes(y), vectors, t, h)
         if found is None:
             return None
         U, P = found[1]
@@ -361,23 +358,23 @@ class ExactMaps(Composition):
         return parts.from_modes(*parts.apply(back, *parts.to_modes(y), t, h))
 
     def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
     ) -> tuple[Array, np.ndarray]:
         return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save, h, t0, carry)
 
     def kernel(self, compensated: bool) -> Kernel:
         from sympflow.kernels.parts_loops import parts_loops
 
-        return parts_loops(self.parts).kernel(lambda h: known_maps(self, float(h)) if h.ndim == 0 else self.maps(h))
+        return parts_loops(self.parts).kernel(lambda h: maps_of_step(self, float(h)) if h.ndim == 0 else self.maps(h))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         from sympflow.hamiltonian.parts import map_evaluations  # SymPy, which other splittings do without
 
-        return map_evaluations(known_maps(self, 1.0), n_steps, n_saved, n_extra, backend)
+        return map_evaluations(maps_of_step(self, 1.0), n_steps, n_saved, n_extra, backend)
 
 
 @lru_cache(maxsize=64)
-def known_maps(composition: ExactMaps, h: float) -> Sequence[SubFlow]:
+def maps_of_step(composition: ExactMaps, h: float) -> Sequence[SubFlow]:
     """The maps of a step, the same object for the same step, whose table the kernel then knows."""
     return composition.maps(h)
 
@@ -390,7 +387,7 @@ def rollout_in_modes(
     save: np.ndarray,
     h: float,
     t0: float,
-    carry: Carry | None = None,
+    carry: RunCheckpoint | None = None,
 ) -> tuple[Array, np.ndarray]:
     """`steppers.rollout` of exact flows, in the modes from beginning to end."""
     d = parts.ndof

@@ -64,7 +64,7 @@ FINISHED = "The solver successfully reached the end of the integration interval.
 ENDED = "A termination event occurred."
 
 
-INTERRUPTED = "The run was interrupted after t = {t:.17g}; what was computed until then is kept."
+INTERRUPTED = "The run was interrupted after t = {t:.15g}; what was computed until then is kept."
 
 
 def interrupted(outcome: Outcome, t: float) -> Interrupted:
@@ -85,8 +85,8 @@ def finished(problem: Problem) -> str:
     if abs(last - problem.t1) <= 8 * math.ulp(problem.t1):
         return FINISHED
     return (
-        f"The run ended at t = {last:.17g}, the last time of `t_eval`, before the end of `t_span`, t = "
-        f"{problem.t1:.17g}: nothing later was asked for. To go on, add the end to `t_eval`."
+        f"The run ended at t = {last:.15g}, the last time of `t_eval`, before the end of `t_span`, t = "
+        f"{problem.t1:.15g}: nothing later was asked for. To go on, add the end to `t_eval`."
     )
 
 
@@ -134,10 +134,10 @@ class Problem:
     dense_output: bool = False
     backend: str = "auto"
     events: EventSearch | None = None
-    letters: np.ndarray | None = None
+    parameter_values: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
     followed: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters whose gradients are wanted, tensors (N,), by their names: then `letters` are the values of these."""
+    """Parameters whose gradients are wanted, tensors (N,), by name: `parameter_values` then are their values."""
     progress: Progress | None = None
     """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None
@@ -219,7 +219,7 @@ class Integrator:
         """True if every step holds the friction −Γp of a damped system; where it does not, the system is refused."""
         return False
 
-    def takes_letters(self, problem: Problem) -> bool:
+    def takes_parameter_values(self, problem: Problem) -> bool:
         """True if a run takes values of parameters for each trajectory, as numbers of one compiled run."""
         return False
 
@@ -330,11 +330,11 @@ class Integrator:
         """The Jacobian (..., n, n) of a step from y in the phase space where steps are made; n = 2d but if extended."""
         return self.tangent(system, t, y, h)[1]
 
-    def pushed(self, system: HamiltonianSystem, t: Any, y: Array, h: Array, W: np.ndarray) -> np.ndarray:
+    def jvp(self, system: HamiltonianSystem, t: Any, y: Array, h: Array, W: np.ndarray) -> np.ndarray:
         """Vectors W (..., 2d, k) moved by the derivative of the step from y (..., 2d)."""
         return self.tangent(system, t, y, h)[1] @ W
 
-    def pushing(
+    def jvp_steps(
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]]:
         """The steps of the run, one by one: times and lengths (...), and what moves vectors W (..., 2d, k)."""

@@ -54,10 +54,10 @@ _TOLD: WeakSet[Any] = WeakSet()
 def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> None:
     """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
     system, failed = problem.system, _failed(outcome)
-    looked = system.poles is not None or problem.letters is not None
+    looked = system.poles is not None or problem.parameter_values is not None
     if not problem.diagnosed or not (failed or looked) or not readable(outcome.y):
         return
-    passed, plain = False, problem.letters is None
+    passed, plain = False, problem.parameter_values is None
     if problem.store is None and looked:
         if np.any(np.asarray(outcome.status) >= 0):
             passed = note_poles(outcome, integrator, problem, rows)
@@ -85,7 +85,7 @@ def diagnose(
         diagnose_piece(outcome, integrator, problem, rows)
     values, between = readable(outcome.y), system.between_impulses
     held = values and problem.store is None and not _failed(outcome)
-    told = held and system.leaps and problem.letters is None and warn_of_leap(outcome, system, y0)
+    told = held and system.leaps and problem.parameter_values is None and warn_of_leap(outcome, system, y0)
     if values and system.functions_given:
         told = system.check_functions_along(outcome.y) or told
     if integrator.trained:
@@ -117,9 +117,9 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
     """End a run where it passed a place at which H is infinite or no number; warn where it may have."""
     poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
-    if problem.letters is not None:
+    if problem.parameter_values is not None:
         assert problem.system.symbols is not None
-        poles, numbers = problem.system.symbols.parametric.poles, [*problem.letters]
+        poles, numbers = problem.system.symbols.parametric.poles, [*problem.parameter_values]
     if poles is None or not poles.watched or not n:
         return False
     starts = to_numpy(problem.y0).reshape(-1, width)
@@ -144,8 +144,8 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
                 continue
             own = (
                 problem
-                if values is None or problem.letters is None
-                else replace(problem, system=values.system_of(row), letters=None)
+                if values is None or problem.parameter_values is None
+                else replace(problem, system=values.system_of(row), parameter_values=None)
             )
             if own.system.poles is None or not own.system.poles.watched:
                 continue
@@ -515,7 +515,9 @@ def note_singularities_of_rows(sol: Any, integrator: Integrator, problem: Proble
         i = failed[few]
         stats = {name: value[i] if isinstance(value, np.ndarray) else value for name, value in sol.stats.items()}
         outcome = Outcome(sol.t, np.moveaxis(sol.y[i], -1, 0), status[i], "", stats)
-        note_singularities(outcome, integrator, replace(problem, system=system, y0=problem.y0[i], letters=None))
+        note_singularities(
+            outcome, integrator, replace(problem, system=system, y0=problem.y0[i], parameter_values=None)
+        )
         times[i] = outcome.stats.get("blow_up_time", np.nan)
     if np.isfinite(times).any():
         sol.stats["blow_up_time"] = times

@@ -171,7 +171,7 @@ def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
         index = tuple(np.argwhere(~inside[first])[0].tolist())
         count = int((~inside).any(0).sum())
         which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
-    note = f"The state left the domain at t = {t:.17g}{which}"
+    note = f"The state left the domain at t = {t:.15g}{which}"
     if action == "warn":
         held = "the figures" if flow is None or flow.certified is None else "the figures and the certificate"
         outcome.message += f" {note}: {held} of a trained flow do not hold there{_meaning(flow)}."

@@ -22,7 +22,7 @@ APART = 0.1
 """Distance of two copies, over the size of the states of the run, beyond which these mean little."""
 
 
-class Projected(DenseOutput):
+class ProjectedSolution(DenseOutput):
     """The dense output of a run on an extended phase space."""
 
     def __init__(self, sol: Any, extension: Composition) -> None:
@@ -51,7 +51,7 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Composition, prob
         search.n_dense = lifted.n_dense
     outcome.y = extension.project(x)
     if outcome.sol is not None:
-        outcome.sol = Projected(outcome.sol, extension)
+        outcome.sol = ProjectedSolution(outcome.sol, extension)
     if store is not None and "copy_distance" in store.noted:
         noted = np.array([store.noted[name] for name in ("copy_distance", "size")])
         outcome.stats["copy_distance"] = apart = float(_ratio(noted))

@@ -33,7 +33,7 @@ from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
 from sympflow.integrators.grid_runs import GridRun
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do without
     from sympflow.flow.flow_map import FlowMap
@@ -226,7 +226,7 @@ class FlowSteps(ArraySteps):
         self.backend = "compiled" if compiled else "torch"
 
     def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
     ) -> tuple[Array, np.ndarray]:
         import torch
 
@@ -263,13 +263,13 @@ class FlowSteps(ArraySteps):
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
 
 
-def _as_tensors(carry: Carry | None) -> Carry | None:
+def _as_tensors(carry: RunCheckpoint | None) -> RunCheckpoint | None:
     """A carry of arrays as one of tensors."""
     if carry is None or carry.running is None:
-        return None if carry is None else Carry()
+        return None if carry is None else RunCheckpoint()
     import torch
 
-    return Carry(carry.steps, torch.from_numpy(carry.running))
+    return RunCheckpoint(carry.steps, torch.from_numpy(carry.running))
 
 
 def _apply(function: Any, y: Array, h: float | Array, t: Any) -> Array:

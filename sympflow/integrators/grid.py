@@ -23,7 +23,7 @@ def open_end(t0: float, t1: float, dt: float, most: int = MOST_OPEN_STEPS) -> fl
 def no_event(n_steps: int, t: float) -> str:
     """Return the message of a run to an infinite end that no event ended."""
     return (
-        f"No terminal event ended the run within {n_steps:,} steps, up to t = {t:.17g}. Check the event, or give "
+        f"No terminal event ended the run within {n_steps:,} steps, up to t = {t:.15g}. Check the event, or give "
         "`t_span` a finite end, however late."
     )
 

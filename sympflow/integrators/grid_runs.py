@@ -32,7 +32,7 @@ from sympflow.integrators.grid import Grid, Outputs, distinct
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper, shorter_steps
 from sympflow.integrators.windows import ARRAY_STEPS, MOST_SAVED, ONE, Pace, Pieces, Saved, first_window
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 if TYPE_CHECKING:
     from sympflow.storage.runs import Place, RunStore
@@ -43,7 +43,7 @@ COUNTED = ("force_evaluations", "hessian_evaluations", "curvature_evaluations", 
 """Statistics of which those of a run that goes on are added to the earlier ones, where it counts them itself."""
 DONE = ("saved", "within", "counted", "last")
 """Counts of a stored run: states that were saved, outputs within steps, the step of the last, and whether within it."""
-UNDER_WAY = "The run had reached t = {t:.17g}: make the same call with resume=True to go on."
+UNDER_WAY = "The run had reached t = {t:.15g}: make the same call with resume=True to go on."
 
 
 class GridRun:
@@ -98,7 +98,11 @@ class GridRun:
     def _in_windows(self, first: int, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, int]:
         """`Stepper.rollout` in windows: also the step that was reached, less than n_steps where Ctrl-C ended it."""
         problem, h = self.problem, self.grid.h
-        pieces, pace, saved = Pieces(self.stepper, problem, h, Carry()), Pace(first), Saved(len(save), problem.y0)
+        pieces, pace, saved = (
+            Pieces(self.stepper, problem, h, RunCheckpoint()),
+            Pace(first),
+            Saved(len(save), problem.y0),
+        )
         most = max(2, MOST_SAVED // math.prod(problem.y0.shape))
         k = row = 0
         try:
@@ -273,7 +277,7 @@ class GridRun:
 
     def _failure(self, t: float, step: int) -> str:
         what, remedy = self.integrator.breakdown.value
-        return f"{what} after t = {t:.17g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
+        return f"{what} after t = {t:.15g} (step {step + 1} of {self.grid.n_steps}). {remedy}, or end `t_span` earlier."
 
     def report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
         """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there."""
@@ -298,7 +302,7 @@ class GridRun:
                 outcome.stats["failed_at"] = np.where(outcome.status < 0, times, np.nan)
                 outcome.message = (
                     f"{len(failed)} of {finite.size} trajectories failed, the first of them (index "
-                    f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.17g}. {what}. {remedy}."
+                    f"{', '.join(map(str, i))}) after t = {grid.time(int(finite[i])):.15g}. {what}. {remedy}."
                 )
         elif finite < n_run or not ok.all():
             last = int(finite) if finite < n_run else int(grid.locate(outcome.t[~ok][:1])[0][0])
@@ -316,7 +320,7 @@ def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
     outcome.status = np.where(bad, -1, 0) if bad.ndim else -1
     outcome.stats["failed_at"] = float(outcome.t[int(np.argmin(ok.reshape(len(ok), -1).all(1)))])
     outcome.message = (
-        f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.17g}. {remedy}, or pass the "
+        f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.15g}. {remedy}, or pass the "
         "states as a batch, whose trajectories are told apart."
     )
 
@@ -337,13 +341,20 @@ class GridSolution(DenseOutput):
             "grid": self.grid,
             "states": self.kept,
             "backend": stepper.backend,
-            "letters": stepper.problem.letters,
+            "parameter_values": stepper.problem.parameter_values,
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         integrator, grid, states = state["integrator"], state["grid"], state["states"]
         backend = "auto" if state["backend"] == "compiled" else "array"
-        problem = Problem(state["system"], grid.t0, grid.t1, states[0], backend=backend, letters=state.get("letters"))
+        problem = Problem(
+            state["system"],
+            grid.t0,
+            grid.t1,
+            states[0],
+            backend=backend,
+            parameter_values=state.get("parameter_values"),
+        )
         GridSolution.__init__(self, integrator.stepper(problem), grid, states)
 
     def states(self, times: np.ndarray) -> Array:
@@ -415,12 +426,12 @@ class StoredRun:
 
     def _begin(self, place: Place | None, cut: bool) -> None:
         """Take up the run at a place; `cut` if the last output of the store was left out."""
-        carry, finite = Carry(), None
+        carry, finite = RunCheckpoint(), None
         if place is not None:
             self.state, self.failed = place.state, place.failed
             self.done = {name: place.counts[name] for name in DONE}
             if place.steps:
-                carry, finite = Carry(place.steps, place.running), place.finite
+                carry, finite = RunCheckpoint(place.steps, place.running), place.finite
             if cut:  # it was within a step
                 self.done["within"] -= self.done["last"]
             if self.stepper.counts_itself:

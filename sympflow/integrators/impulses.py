@@ -34,7 +34,7 @@ def landings(
         times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
     else:
         said, times = jumps_met(system, t0, t1, dt, label)
-    able = able and len(times) <= MOST_LANDINGS and not integrator.keeps and not integrator.forces_beyond(system)
+    able = able and len(times) <= MOST_LANDINGS and not integrator.forces_beyond(system)
     # all times are known, of which the first ones may be listed
     if able and times and not len(system.jump_times(max(times), max(t0, t1), step)):
         return "", times
@@ -137,12 +137,12 @@ def _merged(found: list[Outcome], problem: Problem, pieces: list[Any], impulses:
     outcome = Outcome(t, concatenate([each.y for each in found], 0), status, message, stats)
     if problem.dense_output:
         solutions = tuple(each.sol for each in found if each.sol is not None)
-        outcome.sol = Pieces(solutions, np.array(pieces)[: len(found), :2])
+        outcome.sol = PiecewiseSolution(solutions, np.array(pieces)[: len(found), :2])
     return outcome
 
 
 @dataclass(frozen=True)
-class Pieces:
+class PiecewiseSolution:
     """The dense output of a run in pieces: that of the piece in which t lies, at an impulse the later one.
 
     `spans` (n, 2) are their ends, which decrease in a run back in time.

@@ -31,6 +31,11 @@ _INSTEAD = {
     **dict.fromkeys(("rtol", "atol"), "it has fixed steps: give `dt`, or `tol`, for which the step is chosen"),
     "max_step": "`dt` is the step, and `event_step` samples events within it",
     **dict.fromkeys(("h", "step", "step_size"), "the step of fixed-step methods is `dt`"),
+    **dict.fromkeys(("n_steps", "num_steps", "steps"), "n steps over `t_span` are dt=(t1 - t0)/n"),
+    **dict.fromkeys(("t_end", "t1", "T", "tmax", "t0"), "times are `t_span`, (start, end)"),
+    **dict.fromkeys(
+        ("t", "ts", "times", "saveat"), "times of outputs are `t_eval`, or every few steps by `save_every`"
+    ),
 }
 SYNONYMS = {
     **dict.fromkeys(("velocity_verlet", "stormer_verlet", "störmer_verlet", "kdk"), "verlet"),
@@ -90,6 +95,7 @@ def get(method: str | type[Integrator]) -> type[Integrator]:
         return method
     if not isinstance(method, str):
         hint = " Make one of it by sympflow.splitting_method(scheme)." if isinstance(method, Scheme) else ""
+        hint = " The order is solve(system, method, t_span, y0)." if isinstance(method, tuple | list) else hint
         raise TypeError(f"`method` must be a name or an Integrator class; got {type(method).__name__}.{hint}")
     if method in TRIPLES or method in CLASSES or method in UNLISTED:
         return _built_in(method)

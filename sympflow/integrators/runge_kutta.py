@@ -124,7 +124,7 @@ def hopeless(n_steps: int, t0: float, t: float, t1: float, most: int) -> str | N
         return None
     pace = n_steps * left / abs(t - t0) if t != t0 else math.inf
     return (
-        f"After {n_steps:,} steps t = {t:.17g} is reached, and at this pace the end needs about {pace:.1g} more; "
+        f"After {n_steps:,} steps t = {t:.15g} is reached, and at this pace the end needs about {pace:.1g} more; "
         f"`max_steps` is {most:,}. Raise it, or `max_step` or the tolerances, or end `t_span` earlier; a fixed-step "
         "method may do with fewer steps."
     )

@@ -100,11 +100,11 @@ class _Scipy(RungeKutta):
             finite = bool(np.isfinite(system.vector_field(y0.astype(float), t0)).all())
         if finite and self.atol == 0 and (y0 == 0).any():
             return (
-                f"There is no first step from t = {t0:.17g}: `atol` is 0, and `y0` has components that are 0, of which "
+                f"There is no first step from t = {t0:.15g}: `atol` is 0, and `y0` has components that are 0, of which "
                 "a relative error has no meaning. Give an `atol`, such as `rtol` times the size of the state."
             )
         what = "first step" if finite else "vector field"
-        return f"The {what} is not finite at t = {t0:.17g}. Check `y0` and its scale{', or raise `atol`' * finite}."
+        return f"The {what} is not finite at t = {t0:.15g}. Check `y0` and its scale{', or raise `atol`' * finite}."
 
     def run(self, problem: Problem) -> Outcome:
         self.check_library(problem.y0)
@@ -160,10 +160,10 @@ class _Scipy(RungeKutta):
                 while solver is not None and solver.status == "running":
                     failure = solver.step()
                     if solver.status == "failed":
-                        failure = f"{failure} The solver stopped at t = {solver.t:.17g}."
+                        failure = f"{failure} The solver stopped at t = {solver.t:.15g}."
                         break
                     if not np.isfinite(solver.y).all():
-                        failure = f"The solution became non-finite after t = {solver.t_old:.17g}. End `t_span` earlier."
+                        failure = f"The solution became non-finite after t = {solver.t_old:.15g}. End `t_span` earlier."
                         break
                     stats["n_steps"] += 1
                     interpolant = _Lazily(solver.dense_output)

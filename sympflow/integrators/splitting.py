@@ -310,7 +310,7 @@ class Splitting(FixedStep):
     def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Splitting | None:
         return self if SPLITTINGS[self.splitting].takes_extended else None
 
-    def takes_letters(self, problem: Problem) -> bool:
+    def takes_parameter_values(self, problem: Problem) -> bool:
         composition = self.composed(problem.system)
         asked = map(self.overrides, ("step", "rollout", "evaluations"))
         if self.clock != "physical" or any(asked) or not composition.takes_values:
@@ -379,24 +379,24 @@ class Splitting(FixedStep):
         known = None if self.keeps else self.composed(system).tangent(y, h, t)
         return super().tangent(system, t, y, h) if known is None else known
 
-    def pushed(self, system: HamiltonianSystem, t: Any, y: Array, h: Array, W: np.ndarray) -> np.ndarray:
+    def jvp(self, system: HamiltonianSystem, t: Any, y: Array, h: Array, W: np.ndarray) -> np.ndarray:
         if self.keeps or self.on_clock(system) is not None:
-            return super().pushed(system, t, y, h, W)
-        known = self.composed(system).pushed(y, h, W, t)
+            return super().jvp(system, t, y, h, W)
+        known = self.composed(system).jvp(y, h, W, t)
         return known[1] if known else forward_tangent(lambda x, s: self.step(system, t, x, s), y, h, W)[1]
 
-    def pushing(
+    def jvp_steps(
         self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array
     ) -> Iterator[tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]]:
         """The same, of a system by one piece, which may be large, without Jacobians."""
         if system.local is None:
-            yield from super().pushing(system, t_span, y0)
+            yield from super().jvp_steps(system, t_span, y0)
             return
         for times, states, lengths in self.steps(system, t_span, y0):
             for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
                 at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
                 start = start_of(system, at)
-                yield at, length, partial(self.pushed, system, start, y, length.astype(y.dtype))
+                yield at, length, partial(self.jvp, system, start, y, length.astype(y.dtype))
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
         scheme = self.kicks_and_drifts
@@ -442,8 +442,8 @@ class Splitting(FixedStep):
             told=told,
             system=problem.system,
         )
-        if problem.letters is not None:
-            kernel = kernel.varied(problem.letters)
+        if problem.parameter_values is not None:
+            kernel = kernel.varied(problem.parameter_values)
         return Stepper(self, problem, composition, kernel, told)
 
     def run(self, problem: Problem) -> Outcome:

@@ -20,7 +20,7 @@ from sympflow.arrays import (
 )
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 if TYPE_CHECKING:
     from sympflow.kernels.protocol import Kernel
@@ -45,7 +45,7 @@ class ArraySteps:
         raise NotImplementedError
 
     def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
     ) -> tuple[Array, np.ndarray]:
         """See `Stepper.rollout`."""
         return rollout(lambda k, y: self.step(y, h, t0 + k * h), y0, n_steps, save, carry=carry)
@@ -112,7 +112,12 @@ class Stepper:
         if self.kernel is None:
             return self.arrays.takes_carry
         y0 = self.problem.y0  # where torch follows the run, it cannot from piece to piece
-        return not is_tensor(y0) or not differentiable(y0, *self.problem.followed.values())
+        return not is_tensor(y0) or not differentiable(y0, *self.followed)
+
+    @property
+    def followed(self) -> Sequence[Any]:
+        """The tensors besides y0 to which gradients of compiled loops flow: parameters, or weights in H."""
+        return [*self.problem.followed.values()] or (() if self.kernel is None else self.kernel.tensors)
 
     @property
     def counts_itself(self) -> bool:
@@ -120,7 +125,7 @@ class Stepper:
         return self.arrays.counts is not None or self.arrays.stages > 0
 
     def rollout(
-        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: Carry | None = None
+        self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
     ) -> tuple[Array, np.ndarray]:
         """Return the states (len(save), ..., 2d) after the steps `save` (sorted counts in 0 … n_steps) of length h.
 
@@ -216,7 +221,7 @@ def _no_loops_for(y0: Array, system: Any) -> str | None:
         return f"`y0` is on {y0.device}: move it to the CPU, or use backend='array'."
     if transformed(y0):
         return "`y0` is followed by torch.func, forward mode or torch.compile: use backend='array'."
-    if system.learns(y0):
+    if system.layered is None and system.learns(y0):
         return "`system` has numbers that torch follows: use backend='array'."
     return None
 
@@ -227,7 +232,7 @@ def rollout(
     n_steps: int,
     save: np.ndarray,
     block: int = 64,
-    carry: Carry | None = None,
+    carry: RunCheckpoint | None = None,
 ) -> tuple[Array, np.ndarray]:
     """States at the counts `save` of n_steps times `step(k, y)`, and the last finite count of each trajectory."""
     k = 0

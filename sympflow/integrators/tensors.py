@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import differentiable, to_numpy, transformed
-from sympflow.kernels.protocol import Carry, Task
+from sympflow.kernels.protocol import RunCheckpoint, Task
 
 __all__ = ["rolled_out", "stepped"]
 
 
 def rolled_out(
-    stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: Carry | None
+    stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: RunCheckpoint | None
 ) -> tuple[Tensor, np.ndarray]:
     """`Stepper.rollout` of a tensor on the CPU: float32 is computed in double, and rounded at the outputs."""
     if y0.dtype != torch.float64:
         states, finite = rolled_out(stepper, y0.double(), h, n_steps, save, t0, carry)
         return states.to(y0.dtype), finite
-    followed = stepper.problem.followed.values()
+    followed = stepper.followed
     if not differentiable(y0, *followed):
         found, finite = stepper.rollout(to_numpy(y0), h, n_steps, save, t0, carry)
         return torch.from_numpy(found), finite
@@ -36,7 +36,7 @@ def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
         h = h.double() if isinstance(h, Tensor) else h
         return stepped(stepper, y.double(), h, t).to(y.dtype)
     h = torch.as_tensor(h, dtype=y.dtype).expand(y.shape[:-1])
-    return _Step.apply(stepper, t, y, h, *stepper.problem.followed.values())
+    return _Step.apply(stepper, t, y, h, *stepper.followed)
 
 
 class _Rolled:
@@ -56,9 +56,13 @@ class _Rolled:
         """The cotangents of y0 and of k numbers of each trajectory."""
         shape = cotangents.shape[1:]
         given = to_numpy(cotangents).reshape(len(self.save), -1, shape[-1]).swapaxes(0, 1)
-        of_states, of_table = self.recorded.pulled(given, k > 0)
-        numbers = of_table[len(of_table) - k :].sum(1) if k else []
-        return [torch.from_numpy(x) for x in (of_states.reshape(shape), *numbers)]
+        of_states, of_table, of_weights = self.recorded.pulled(given, k > 0)
+        if weights := self.stepper.kernel.tensors:
+            pieces = torch.from_numpy(of_weights).split([x.numel() for x in weights])
+            numbers = [x.reshape(w.shape).to(w.dtype) for x, w in zip(pieces, weights, strict=True)]
+        else:
+            numbers = list(torch.from_numpy(of_table[len(of_table) - k :].sum(1))) if k else []
+        return [torch.from_numpy(of_states.reshape(shape)), *numbers]
 
     def by_arrays(self, y0: Tensor, *followed: Tensor) -> Tensor:
         y, states, wanted = y0, [], self.save.tolist()
@@ -102,7 +106,7 @@ class _Step(torch.autograd.Function):
 
 def _by_arrays(stepper: Any, y: Tensor, h: Any, t: Any, *followed: Tensor) -> Tensor:
     """A step by tensor operations, of which torch follows the parameters too."""
-    if not followed:
+    if not stepper.problem.followed:  # weights are read by the functions themselves
         return stepper.arrays.step(y, h, t)
     if stepper.system.friction:
         raise ValueError(
@@ -117,11 +121,33 @@ def _pulled(
     function: Callable[..., Tensor], inputs: Sequence[Tensor], wanted: Sequence[bool], cotangents: Tensor
 ) -> list[Tensor | None]:
     """The cotangents of those inputs that are wanted, with a graph of their own where one is asked for."""
-    again = torch.is_grad_enabled()
+    gate, again = _Gate(), torch.is_grad_enabled()
     with torch.enable_grad():
-        if not again:
-            inputs = [x.detach().requires_grad_(asked) for x, asked in zip(inputs, wanted, strict=True)]
+        if again:
+            inputs = [x if x.is_leaf else _Gated.apply(x, gate) for x in inputs]
+        else:
+            inputs = [x if x.is_leaf else x.detach().requires_grad_() for x in inputs]
         y = function(*inputs)
-        some = [x for x, asked in zip(inputs, wanted, strict=True) if asked]
-        found = iter(torch.autograd.grad(y, some, cotangents, create_graph=again, allow_unused=True))
+    some = [x for x, asked in zip(inputs, wanted, strict=True) if asked]
+    found = iter(torch.autograd.grad(y, some, cotangents, create_graph=again, allow_unused=True))
+    gate.open = True
     return [next(found) if asked else None for asked in wanted]
+
+
+class _Gate:
+    """Closed while derivatives by each input alone are taken, though one input may depend on another."""
+
+    open = False
+
+
+class _Gated(torch.autograd.Function):
+    """The same tensor, to whose past derivatives go while a gate is open."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, gate: _Gate) -> Tensor:
+        ctx.gate = gate
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Any, ...]:
+        return cotangent if ctx.gate.open else None, None

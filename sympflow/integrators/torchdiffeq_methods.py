@@ -126,7 +126,7 @@ class Watched(ByVectorField):
             except _EndedError:
                 pass
             except AssertionError as error:  # torchdiffeq's step underflow, or a state that is not finite
-                failure = f"torchdiffeq stopped after t = {trace.reached:.17g} ({error}). End `t_span` earlier."
+                failure = f"torchdiffeq stopped after t = {trace.reached:.15g} ({error}). End `t_span` earlier."
             except TooManyStepsError as error:
                 failure, trace.spent = str(error), True
             except RuntimeError as error:  # their own autograd.Function has derivatives in reverse mode only
@@ -292,7 +292,7 @@ def _message(
         said.append(
             f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
             f"because some of its trajectories fail, ended before {unfinished.sum()} of {len(done)} trajectories: they "
-            f"are kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.17g}. Raise "
+            f"are kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
             "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
         )
     return " ".join(said)
@@ -379,7 +379,7 @@ class Adaptive(Watched, RungeKutta):
             (t0, t1), t = trace.t_span, trace.reached
             more = most * abs(t1 - t) / abs(t - t0) if t != t0 else math.inf
             raise TooManyStepsError(
-                f"After `max_num_steps` = {self.max_num_steps} steps t = {t:.17g} is reached, and at this pace the end "
+                f"After `max_num_steps` = {self.max_num_steps} steps t = {t:.15g} is reached, and at this pace the end "
                 f"needs about {more:.2g} more. Raise `max_num_steps` or the tolerances, or end `t_span` earlier."
             ) from None
 

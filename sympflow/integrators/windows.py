@@ -14,7 +14,7 @@ import numpy as np
 from sympflow.arrays import Array, concatenate, full_of_nan, is_tensor, readable
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.steppers import Stepper
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 SECONDS = 0.2
 """The time that a window is to take."""
@@ -67,7 +67,7 @@ class Pieces:
     """A run in pieces."""
 
     def __init__(
-        self, stepper: Stepper, problem: Problem, h: float, carry: Carry, finite: np.ndarray | None = None
+        self, stepper: Stepper, problem: Problem, h: float, carry: RunCheckpoint, finite: np.ndarray | None = None
     ) -> None:
         self.stepper, self.problem, self.h = stepper, problem, h
         self.carry, self.finite = carry, finite
@@ -76,7 +76,7 @@ class Pieces:
     def to(self, k: int, save: np.ndarray) -> Array:
         """Go on to step k; return the states after the steps `save`."""
         before = self.carry
-        carry = Carry(before.steps, before.running, self._spare)
+        carry = RunCheckpoint(before.steps, before.running, self._spare)
         problem = self.problem
         states, finite = self.stepper.rollout(problem.y0, self.h, k, save, problem.t0, carry=carry)
         if self.finite is not None:

@@ -234,7 +234,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             y_end = self._whole_step() if whole else self._shorter(self._h)
             if not np.isfinite(y_end).all():
                 return False, (
-                    f"The solution became non-finite after t = {self.t:.17g} (step {self._k + 1}). Reduce `dt`, or end "
+                    f"The solution became non-finite after t = {self.t:.15g} (step {self._k + 1}). Reduce `dt`, or end "
                     "`t_span` earlier."
                 )
             self._next_anchor = (self._end, y_end)

@@ -41,14 +41,7 @@ def position_ranges(symbols: SymbolicHamiltonian, domain: Domain) -> Ranges:
 
 @dataclass(frozen=True)
 class OnInterval:
-    """Functions of x as polynomials in x − center on [low, high].
-
-    Attributes
-    ----------
-    low, high, center : float
-    coefficients : ndarray of shape (n, K)
-        One row for each function, the coefficients of the powers 0 … K−1.
-    """
+    """Functions of x on [low, high], a row of `coefficients` (n, K) each, of the powers 0 … K−1 of x − center."""
 
     low: float
     high: float

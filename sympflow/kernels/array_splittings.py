@@ -6,16 +6,17 @@ depend on the size of a system; or functions at an address.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, POINTER, Rows, Value
 from sympflow.compiler.functions import added, fma
-from sympflow.compiler.program import Program, gradient, traced
+from sympflow.compiler.program import gradient, traced
 from sympflow.hamiltonian.formulas import Letter
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Numbers, Room
@@ -29,107 +30,76 @@ __all__ = ["ArrayCode", "Functions", "TermForces", "function_code", "term_code"]
 ARRAYS = 4  # of d numbers that a kick needs: slopes, velocities, products with the Hessian, curvatures
 
 
-class Forces(Protocol):
-    """The derivatives of T and V as code, of positions and momenta at places in memory into other places.
+class Forces:
+    """Derivatives of V and T as code, which reads arrays `data`: the inverse mass (d,) or (d, d), if any, last."""
 
-    Attributes
-    ----------
-    data : sequence of ndarray
-        Arrays that the code reads.
-    lanes : int
-        Trajectories side by side.
-    """
-
+    lanes = 1
     data: list[np.ndarray]
-    lanes: int
 
-    def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        """∇V(q)."""
+    def __init__(self, inverse_mass: np.ndarray | None) -> None:
+        self._mass = inverse_mass
 
-    def product(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        """∇²V(q) v."""
-
-    def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        """½ ∇³V(q)(v, v)."""
+    @abstractmethod
+    def sum(self, order: int, room: Room, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]) -> None:
+        """∇V(q), ∇²V(q) v and ½ ∇³V(q)(v, v) of places q and v in memory, by the order 0, 1, 2, into another one."""
 
     def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         """∇T(p)."""
+        code, M = room.code, self._mass
+        masses = None if M is None else room.data(len(self.data) - 1)
+        with code.over(d) as i:
+            if masses is None or M is None:
+                room.store(room.load(i, p), i, out)
+            elif M.ndim == 1:
+                room.store(room.load(i, p) * code.load(masses, i), i, out)
+            else:
+                room.store(0.0, i, out)
+                with code.over(d) as j:
+                    room.add(code.load(masses, i * d + j) * room.load(j, p), i, out)
 
 
-class TermForces:
-    """Forces by loops over the terms of each kind.
-
-    Parameters
-    ----------
-    V : Terms
-    T : Terms or ndarray, optional
-        Of a kinetic energy; its inverse masses (d,); None where all are 1.
-    """
+class TermForces(Forces):
+    """Forces by loops over the terms of each kind, those of T too where it is no ½ pᵀM⁻¹p."""
 
     lanes = 8
 
     def __init__(self, V: Terms, T: Terms | np.ndarray | None) -> None:
+        super().__init__(T if isinstance(T, np.ndarray) else None)
         self._V, self._T = V, T
-        self._masses = isinstance(T, np.ndarray)
-        kinetic = [] if T is None else [T] if isinstance(T, np.ndarray) else T.data
-        self.data = [*V.data, *kinetic]
+        self.data = [*V.data, *([] if T is None else [T] if isinstance(T, np.ndarray) else T.data)]
 
-    def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        self._add(room, self._V.slopes, [q], out, d, letters)
-
-    def product(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        self._add(room, self._V.products, [q, v], out, d, letters)
-
-    def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        self._add(room, self._V.bends, [q, v], out, d, letters)
+    def sum(self, order: int, room: Room, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]) -> None:
+        self._add(self._V, 0, order, room, given, out, d, letters)
 
     def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
         if self._T is None or isinstance(self._T, np.ndarray):
-            with room.code.over(d) as i:
-                x = room.load(i, p)
-                room.store(x if self._T is None else x * room.code.load(room.data(len(self._V.data)), i), i, out)
-            return
-        self._add(room, self._T.slopes, [p], out, d, letters, self._T)
+            super().velocity(room, p, out, d, letters)
+        else:
+            self._add(self._T, len(self._V.data), 0, room, [p], out, d, letters)
 
     def _add(
-        self,
-        room: Room,
-        derivatives: Sequence[Program],
-        given: Sequence[Value],
-        out: Value,
-        d: Value,
-        letters: Sequence[Any],
-        T: Terms | None = None,
+        self, terms: Terms, first: int, order: int, room: Room, given: Any, out: Value, d: Value, letters: Sequence[Any]
     ) -> None:
-        """Write derivatives of V, or of T, at places in memory into another one."""
+        """Write derivatives of terms, whose arrays are those from the `first` on, into another place in memory."""
         with room.code.over(d) as i:
             room.store(0.0, i, out)
-        terms, first = (self._V, 0) if T is None else (T, len(self._V.data))
         data = [room.data(first + k) for k in range(len(terms.data))]
         rows, total = [Rows(x, room.type) for x in given], Rows(out, room.type)
-        terms.add(data, derivatives, rows, letters, lambda places: [(total, place) for place in places])
+        terms.add(data, terms.derivatives(order), rows, letters, lambda places: [(total, i) for i in places])
 
 
-class Functions:
+class Functions(Forces):
     """Forces by a user's Numba functions, called at their addresses; one trajectory after the other.
 
-    Parameters
-    ----------
-    gradient, hessian_vector : functions
-        The latter may be None.
-    inverse_mass : ndarray, optional
-        (d,) or (d, d).
-    driven : bool
-        True if functions take the time first.
+    Functions of a driven system take the time first.
     """
-
-    lanes = 1
 
     def __init__(
         self, gradient: Any, hessian_vector: Any | None, inverse_mass: np.ndarray | None, driven: bool
     ) -> None:
+        super().__init__(inverse_mass)
         self._given = gradient, hessian_vector, inverse_mass, driven
-        self._mass, self._functions = inverse_mass, [addressed(gradient, False, driven)]
+        self._functions = [addressed(gradient, False, driven)]
         if hessian_vector is not None:
             self._functions.append(addressed(hessian_vector, True, driven))
         addresses = np.array([f.address for f in self._functions], dtype=np.int64)
@@ -138,36 +108,13 @@ class Functions:
     def __reduce__(self) -> tuple[Any, ...]:
         return Functions, self._given
 
-    def gradient(self, room: Room, q: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        self._called(room, 0, [q], out, d, letters)
-
-    def product(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        self._called(room, 1, [q, v], out, d, letters)
-
-    def bend(self, room: Room, q: Value, v: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        raise NotImplementedError("Numba functions have no third derivative.")
-
-    def _called(
-        self, room: Room, which: int, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]
-    ) -> None:
+    def sum(self, order: int, room: Room, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]) -> None:
         code = room.code
         with code.over(d) as i:
             room.store(float("nan"), i, out)  # what a function does not write ends the run
-        address = code.load(room.data(0), which, POINTER)
+        address = code.load(room.data(0), order, POINTER)
         time = letters[0] if letters else code.constant(0.0)
         code.call_address(address, [time, given[0], given[-1], out, d])
-
-    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
-        code, M = room.code, self._mass
-        with code.over(d) as i:
-            if M is None:
-                room.store(room.load(i, p), i, out)
-            elif M.ndim == 1:
-                room.store(room.load(i, p) * code.load(room.data(1), i), i, out)
-            else:
-                room.store(code.constant(0.0), i, out)
-                with code.over(d) as j:
-                    room.add(code.load(room.data(1), i * d + j) * room.load(j, p), i, out)
 
 
 def term_code(splitting: Splitting) -> ArrayCode:
@@ -244,14 +191,7 @@ def addressed(function: Any, along: bool, timed: bool) -> Any:
 
 
 class ArrayCode(SplittingCode):
-    """The compiled functions of splitting schemes of states in memory.
-
-    Parameters
-    ----------
-    splitting : Splitting
-        Of which the symbols say no more than how many there are, where forces are functions.
-    forces : Forces
-    """
+    """The compiled functions of splitting schemes of states in memory; see `Splitting` and `Forces`."""
 
     def __init__(self, splitting: Splitting, forces: Forces) -> None:
         super().__init__(splitting, chunked=False)
@@ -283,20 +223,20 @@ class ArrayCode(SplittingCode):
         letters = self._letters(given)
         q, p = room.state, room.part(d)
         slope, velocity, product, bent = (room.part(d * i, room.work) for i in range(ARRAYS))
-        forces.gradient(room, q, slope, d, letters)
+        forces.sum(0, room, [q], slope, d, letters)
         factors = [(-kicks[0], slope)]
         if terms > 1:
             forces.velocity(room, slope, velocity, d, letters)
-            forces.product(room, q, velocity, product, d, letters)
+            forces.sum(1, room, [q, velocity], product, d, letters)
             factors.append((kicks[1], product))
         if terms > 2:
-            forces.bend(room, q, velocity, bent, d, letters)
+            forces.sum(2, room, [q, velocity], bent, d, letters)
             with code.over(d) as i:
                 bend = kicks[2] * room.load(i, bent)
                 change = fma(kicks[1], room.load(i, product), -(kicks[0] * room.load(i, slope)))
                 room.store(change - bend, i, slope)
             forces.velocity(room, product, velocity, d, letters)
-            forces.product(room, q, velocity, product, d, letters)
+            forces.sum(1, room, [q, velocity], product, d, letters)
             factors = [(1.0, slope), (-kicks[2], product)]
         if splitting.monomials:
             self._store_polynomial(room, velocity, kicks)

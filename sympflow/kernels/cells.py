@@ -31,14 +31,7 @@ def most_cells(n: int, dim: int) -> int:
 
 
 class Cells:
-    """The code of cells.
-
-    Parameters
-    ----------
-    dim : int
-    periodic : bool
-        True if there is a box.
-    """
+    """The code of cells in so many dimensions, `periodic` if there is a box."""
 
     def __init__(self, dim: int, periodic: bool) -> None:
         self.dim, self.periodic = dim, periodic

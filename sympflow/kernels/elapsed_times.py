@@ -51,9 +51,7 @@ def reach_times(
     Parameters
     ----------
     system : HamiltonianSystem
-        The transformed one, symbolic, with states [q, t, p, B].
-    scheme : Scheme
-        Without force gradients.
+        The transformed one, symbolic, with states [q, t, p, B]; the scheme has no force gradients.
     h : float
         Step in the other time, negative to go back.
     y0 : ndarray of shape (N, 2d + 2)
@@ -69,12 +67,8 @@ def reach_times(
 
     Returns
     -------
-    Y : ndarray of shape (n, N, 2d)
-        [q, p].
-    counts : ndarray of int64, shape (N, 2)
-        The steps taken, and those tried to meet the times.
-
-    None where a trajectory does not reach its times: because a state is not finite, time turns, or steps run out.
+    [q, p] of shape (n, N, 2d), and counts (N, 2) of the steps taken and those tried to meet the times; None where a
+    trajectory does not reach its times: because a state is not finite, time turns, or steps run out.
     """
     loops = splitting_loops(system)
     found = loops.functions(0, False)

@@ -29,13 +29,7 @@ class Tableau(Protocol):
 
 
 def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKernel:
-    """The compiled loops of a method on a symbolic system.
-
-    Raises
-    ------
-    ValueError
-        If the system cannot be compiled, with the reason.
-    """
+    """The compiled loops of a method on a symbolic system; a ValueError says why there are none."""
     field = _field(system)
     kind = _InMemory if field.large else _InRegisters
     A = tuple(tuple(map(float, row)) for row in tableau.A)
@@ -44,13 +38,7 @@ def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKerne
 
 
 def compiled_field(system: HamiltonianSystem) -> CompiledField:
-    """Return the vector field of a symbolic system, compiled, for one solver.
-
-    Raises
-    ------
-    ValueError
-        If the system cannot be compiled, with the reason.
-    """
+    """The vector field of a symbolic system, compiled, for one solver; a ValueError says why there is none."""
     return CompiledField(_field(system))
 
 
@@ -66,13 +54,7 @@ _FIELDS: WeakKeyDictionary[HamiltonianSystem, Field] = WeakKeyDictionary()
 class Field:
     """J∇H of a symbolic system, less Γp, plus a force by symbols, as code.
 
-    Attributes
-    ----------
-    lettered : Lettered
-    large : bool
-        True if terms of a kind are looped over.
-    data : list of ndarray
-        Arrays that the code of a large system reads: coordinates and constants of the kinds of terms, and Γ.
+    Terms of a kind are looped over if it is `large`; its code reads arrays `data`: those of the terms, and Γ.
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
@@ -148,7 +130,8 @@ class Field:
             code.store(code.constant(0.0), g, m)
         slope = Rows(g, DOUBLE)
         assert self._terms is not None
-        self._terms.add(data, self._terms.slopes, [Rows(y, DOUBLE)], given, lambda places: [(slope, m) for m in places])
+        slopes = self._terms.derivatives(0)
+        self._terms.add(data, slopes, [Rows(y, DOUBLE)], given, lambda places: [(slope, m) for m in places])
         with code.over(d) as m:
             code.store(code.load(g, m + d), out, m)
             force = -code.load(g, m)

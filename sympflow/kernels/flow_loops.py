@@ -14,7 +14,7 @@ from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Carry, Kernel, Run, Steps, Task, run_states
+from sympflow.kernels.protocol import Kernel, Run, RunCheckpoint, Steps, Task, both_ways, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
 from sympflow.kernels.stages import StageTable, run_table, single_table, with_last_stage
 from sympflow.schemes import CURVATURE, Scheme
@@ -32,21 +32,8 @@ __all__ = [
 ]
 
 
-ArrayStep = Callable[..., np.ndarray]
-
-
 class TableSource(Protocol):
-    """The numbers of a primed flow ψ̄ = χ ∘ K ∘ χ⁻¹, which do not change.
-
-    Attributes
-    ----------
-    level : int
-        The terms of its kicks: see `sympflow.schemes.Scheme.level`.
-    monomials
-        Of the polynomials of kicks, where they have them.
-    processed : bool
-        False if χ is the identity.
-    """
+    """The numbers of a primed flow ψ̄ = χ ∘ K ∘ χ⁻¹, which do not change; not `processed` if χ is the identity."""
 
     level: int
     monomials: Monomials
@@ -77,23 +64,9 @@ class PrimedFlowKernel(Kernel):
     """Compiled loops of a primed flow on its system, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
 
     A flow with a processor, ψ̄ = χ ∘ K ∘ χ⁻¹, starts a run by χ⁻¹, makes its steps by K, and applies χ to each output.
-
-    Parameters
-    ----------
-    tables : TableSource
-        The numbers of the flow.
-    system : HamiltonianSystem
-        The flow's, one that can be compiled.
-    compensated : bool
-        Sum with Kahan's compensation in runs.
-    step : callable, optional
-        ψ̄_h of rows y (N, 2d) by array operations, ``step(h, y, t)`` with h and the times t (N,): of a system with
-        friction, where the numbers of a step are no polynomials in h.
     """
 
-    def __init__(
-        self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False, step: ArrayStep | None = None
-    ) -> None:
+    def __init__(self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False) -> None:
         if system.friction and compensated:
             raise ValueError(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
@@ -106,8 +79,7 @@ class PrimedFlowKernel(Kernel):
             )
         self.system = system
         self._tables, self._splitting, self._compensated = tables, splitting_loops(system), compensated
-        self._step = step if system.friction else None
-        self._ranges = self._splitting.ranges(tables.level, compensated)
+        self._ranges = None if system.friction else self._splitting.ranges(tables.level, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
         """Count those of the numbers that the kernel has: see `Kernel`."""
@@ -123,27 +95,13 @@ class PrimedFlowKernel(Kernel):
         return run_states(rollout, task, size * (1 + self._compensated), work)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,); its numbers are polynomials in h.
+        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,), of a driven system at the times t."""
+        lengths, times = (np.broadcast_to(np.asarray(x, dtype=np.float64), len(y)) for x in (h, t))
 
-        `t` are the times of the rows, of a driven system.
-        """
-        h = np.asarray(h, dtype=np.float64)
-        h = h.repeat(len(y)) if h.ndim == 0 else h
-        if self._step is not None:
-            return Steps(self._step(h, np.ascontiguousarray(y, dtype=np.float64), t))
-        if len(h) == 1 and h[0] != 0:
-            back = bool(h[0] < 0)
-            return Steps(self._stepped(-h if back else h, y, back, t))
-        forwards = h > 0
-        if forwards.all():
-            return Steps(self._stepped(h, y, False, t))
-        if (h < 0).all():
-            return Steps(self._stepped(-h, y, True, t))
-        out, times = np.array(y, dtype=np.float64), np.broadcast_to(np.asarray(t, dtype=np.float64), h.shape)
-        for rows, back in ((forwards, False), (h < 0, True)):
-            if rows.any():
-                out[rows] = self._stepped(np.abs(h[rows]), y[rows], back, times[rows])
-        return Steps(out)
+        def one_way(rows: Any, back: bool) -> np.ndarray:
+            return self._stepped(np.abs(lengths[rows]), y[rows], back, times[rows])
+
+        return Steps(both_ways(one_way, lengths, y))
 
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """ψ̄_h of each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d): see `Kernel`."""
@@ -173,8 +131,6 @@ class PrimedFlowKernel(Kernel):
     def _kernel(self, h: float) -> SplittingKernel:
         """K_h, or for h < 0 its inverse."""
         scheme = self._tables.scheme("primed kernel", abs(h), back=h < 0)
-        if (step := self._step) is not None:
-            return self._splitting.damped_kernel(scheme, partial(_stepped_by, step))
         return self._splitting.kernel(scheme, self._compensated, self._ranges)
 
     def _functions(self) -> SplittingRollouts:
@@ -215,10 +171,6 @@ def _stages(tables: Sequence[np.ndarray], task: Task) -> int:
     return tables[1].shape[1] + tables[2].shape[1] * -(-len(task.save) // max(task.n_steps, 1))
 
 
-def _stepped_by(step: ArrayStep, y: np.ndarray, h: np.ndarray, t: Any = 0.0) -> np.ndarray:
-    return step(h, y, t)
-
-
 class MapSource(Protocol):
     """The maps of a split flow, which do not change."""
 
@@ -232,16 +184,7 @@ class MapSource(Protocol):
 
 
 class SplitFlowKernel(Kernel):
-    """Compiled loops of a flow made of exact flows of parts, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
-
-    Parameters
-    ----------
-    maps : MapSource
-    parts : ExactParts
-        Of a system that can be compiled.
-    dt : float
-        Δt.
-    """
+    """Compiled loops of a flow made of exact flows of parts, for Δt = `dt`; a step h < 0 is the inverse of ψ̄_|h|."""
 
     def __init__(self, maps: MapSource, parts: ExactParts, dt: float) -> None:
         from sympflow.kernels.parts_loops import parts_loops
@@ -256,31 +199,20 @@ class SplitFlowKernel(Kernel):
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
-        h = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
-        out = np.array(y, dtype=np.float64)
-        for back, rows in ((False, h > 0), (True, h < 0)):
-            sequence, dt = self._maps.coefficients(back), self._dt
-            if rows.all():
-                return Steps(self._loops.step_by_coefficients(sequence, dt, np.abs(h), y))
-            if rows.any():
-                out[rows] = self._loops.step_by_coefficients(sequence, dt, np.abs(h[rows]), y[rows])
-        return Steps(out)
+        lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
+
+        def one_way(rows: Any, back: bool) -> np.ndarray:
+            maps = self._maps.coefficients(back)
+            return self._loops.step_by_coefficients(maps, self._dt, np.abs(lengths[rows]), y[rows])
+
+        return Steps(both_ways(one_way, lengths, y))
 
 
 class ClockedFlowKernel(Kernel):
-    """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B].
+    """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B], of the transformed system.
 
-    B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept.
-
-    Parameters
-    ----------
-    scheme : Scheme
-    system : HamiltonianSystem
-        The transformed one, one that can be compiled.
-    advance : callable
-        By how much the clock puts the time forward in steps s at B, ``advance(s, B)``, numbers or arrays.
-    numbers : callable
-        The numbers of the clock, those that it has now: see `reach_times`.
+    B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept:
+    ``advance(s, B)`` of steps s. The `numbers` are those that the clock has now: see `reach_times`.
     """
 
     saves_finite = False
@@ -333,16 +265,7 @@ class ClockedFlowKernel(Kernel):
 
 
 class CollocatedFlowKernel(Kernel):
-    """Compiled loops of a flow of equal steps of a Gauss method, a `Kernel`.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        Symbolic.
-    tableau : Tableau
-    steps : int
-        Steps of the method in one of the flow.
-    """
+    """Compiled loops of a flow of so many equal `steps` of a Gauss method, a `Kernel`."""
 
     saves_finite = False
 
@@ -354,7 +277,7 @@ class CollocatedFlowKernel(Kernel):
     def runs(self, task: Task) -> Run:
         """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
         m, carry = self._steps, task.carry
-        inner = None if carry is None else Carry(m * carry.steps, carry.running, carry.spare)
+        inner = None if carry is None else RunCheckpoint(m * carry.steps, carry.running, carry.spare)
         asked = task._replace(h=task.h / m, n_steps=m * task.n_steps, save=m * np.asarray(task.save), carry=inner)
         states, n_finite, iterations = self._kernel.runs(asked)
         if carry is not None and inner is not None:

@@ -42,28 +42,10 @@ Key = Any
 class Form:
     """All that the code of a lattice depends on: not its size, nor the values of parameters.
 
-    Attributes
-    ----------
-    terms : dict
-        The terms T ("kinetic"), U ("site") and V by their distances, as pairs of an expression and its letters.
-    directions : tuple of Symbol
-        The letters of the two directions, v and w.
-    c : tuple of Symbol
-        The letters of the parameters.
-    arrays : frozenset of Symbol
-        Those that have a value at each site.
-    unit_masses : bool
-    boundary : tuple of str
-        Of each axis, that of the lanes last.
-    level : int
-        See `Scheme`.
-    compensated : bool
-    damped : bool
-        True if there is friction −γp, whose numbers are the last two of a column.
-    width : int
-        Lanes.
-    even : bool
-        True if all slabs have as many sites.
+    The terms are T ("kinetic"), U ("site") and V by their distances, each an expression and its letters. `directions`
+    are the letters of v and w, `c` those of parameters, `arrays` those of c with a value at each site. The boundary is
+    that of each axis, of the lanes last. With friction −γp (`damped`) a column has two more numbers. `even` slabs are
+    alike.
     """
 
     terms: tuple[tuple[Any, tuple[Any, tuple[Any, ...]]], ...]
@@ -128,22 +110,10 @@ class Form:
 
 
 class Law:
-    """A calculation at one site or along one bond: from numbers by their keys to others.
+    """A calculation at one site or along one bond: from numbers by their keys to `outputs`, others by theirs.
 
-    Parameters
-    ----------
-    form : Form
-    keys : sequence of Key
-        Of numbers that it may read; those of a column have the kind "column".
-    outputs : callable
-        Of an arrangement, its numbers by their keys, and those of the parameters.
-
-    Attributes
-    ----------
-    numbers : list of str
-        The numbers that depend on parameters alone, written out.
-    operations : int
-        About how many instructions it takes.
+    Numbers of a column have the kind "column". `numbers` are those that depend on parameters alone, written out;
+    `operations` about how many instructions it takes.
     """
 
     def __init__(self, form: Form, keys: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> None:
@@ -176,13 +146,7 @@ def _is_costly(x: Traced) -> bool:
 
 
 class Potential:
-    """A term of one site or of one bond, with its derivatives by what it depends on.
-
-    Attributes
-    ----------
-    slopes, bends, bent : Program
-        ∇f; ∇²f, row by row; and ∇²f w + ½ ∇³f(v, v); of x, v, w and the parameters.
-    """
+    """A term of one site or bond f(x), with ∇f (`slopes`), ∇²f row by row (`bends`), ∇²f w + ½ ∇³f(v, v) (`bent`)."""
 
     def __init__(self, form: Form, f: Any, x: Sequence[Any]) -> None:
         n = self.n = len(x)
@@ -223,13 +187,9 @@ KINDS = (KICK,), (OPEN, TURN), (OPEN, MIDDLE, LAST)
 
 
 class Pass:
-    """A pass over sites: what is computed along bonds, and at a site of what these give.
+    """A pass over sites: what is computed along bonds, by their distance, and at a site of what these give.
 
-    Attributes
-    ----------
-    bonds : dict of int to Law
-        By their distance: ("flux", f), by which bonds act on field f at both ends, and second derivatives to be kept.
-    site : Law
+    A bond has ("flux", f), by which it acts on field f at both ends, and second derivatives to be kept.
     """
 
     def __init__(self, form: Form, name: str, terms: dict[Any, Potential]) -> None:
@@ -500,14 +460,8 @@ INLINE = 100
 class _Scene:
     """The code of one stage: the numbers and arrays that it reads, and loops over sites.
 
-    Attributes
-    ----------
-    numbers : dict of str to Value
-        Those of the context.
-    vectors : dict
-        The addresses of the first site in vectors of the state, and in arrays of sites.
-    values : dict
-        Numbers that are the same at all sites.
+    `numbers` are those of the context, `vectors` addresses of the first site in vectors of the state and in arrays of
+    sites, `values` numbers that are the same at all sites.
     """
 
     def __init__(self, stages: LatticeStages, state: Value, context: Value, column: Sequence[Value] = ()) -> None:
@@ -878,17 +832,9 @@ PAGE, NEAR = 512, 64  # numbers
 
 
 class Slabs:
-    """How the sites of a lattice lie in the memory of pieces, for so many threads.
+    """How the sites of a lattice lie in the memory of pieces, for so many threads; `order` has the axis of slabs last.
 
     Pieces have so many planes each; of a lattice of one axis so many slabs.
-
-    Parameters
-    ----------
-    lattice : LatticeHamiltonian
-    stages : LatticeStages
-    order : sequence of int
-        The axes, that of the slabs last.
-    pieces : int
     """
 
     def __init__(self, lattice: LatticeHamiltonian, stages: LatticeStages, order: Sequence[int], pieces: int) -> None:
@@ -1000,17 +946,7 @@ def lattice_code(
 
 
 class LatticeCode(SharedRollouts):
-    """The compiled functions of splitting schemes on one lattice, of which only its form is part of the code.
-
-    Parameters
-    ----------
-    lattice : LatticeHamiltonian
-    level : int
-        See `Scheme`.
-    compensated : bool
-    damped : bool
-        True if there is friction −γp, whose numbers are the last two rows of a table.
-    """
+    """The compiled functions of schemes on one lattice, `damped` by −γp: its form alone is part of the code."""
 
     def __init__(self, lattice: LatticeHamiltonian, level: int, compensated: bool, damped: bool) -> None:
         if level == POLYNOMIAL:

@@ -41,16 +41,8 @@ REGISTER = Type("double", LANES)
 class TrainedNetwork:
     """The network of a kick or a drift, V(t, x) = w · σ(… σ(K x + k t + b_1) …), as it is fitted.
 
-    Attributes
-    ----------
-    inputs : int
-        Beside t: the d of x, and constants of a step.
-    widths : tuple of int
-        Of the hidden layers.
-    activation : str
-    units : ndarray
-        The derivatives of K (h_1, inputs), k (h_1,), w (h_n,), b_1 … b_n, W_1 … W_{n−1}, one after another, by the
-        parameters of the network, each a multiple of its own.
+    Its `inputs` beside t are the d of x and constants of a step; `units` the derivatives of K (h_1, inputs), k (h_1,),
+    w (h_n,), b_1 … b_n, W_1 … W_{n−1}, one after another, by the parameters, each a multiple of its own.
     """
 
     inputs: int
@@ -60,16 +52,7 @@ class TrainedNetwork:
 
 
 class NetworkTangents:
-    """ψ̄_t of kicks and drifts with networks of one architecture, with d/dt ψ̄_t, and their derivatives by the weights.
-
-    Parameters
-    ----------
-    ndof : int
-        d.
-    is_kick : sequence of bool
-    networks : sequence of TrainedNetwork
-        Of the layers, in their order, as are their parameters; all alike, with an activation of `SLOPES`.
-    """
+    """ψ̄_t of layers with networks that are alike, with d/dt ψ̄_t, and their derivatives by the weights."""
 
     def __init__(self, ndof: int, is_kick: Sequence[bool], networks: Sequence[TrainedNetwork]) -> None:
         self.ndof = ndof
@@ -204,17 +187,7 @@ class _Sizes(NamedTuple):
 
 
 class _Sweeps:
-    """The code of one network: its values, and their derivatives along directions and by the weights.
-
-    Parameters
-    ----------
-    code : Code
-    sizes : _Sizes
-    activation : str
-    velocity : bool
-    theta, work : Value
-        Addresses of the weights, and of memory.
-    """
+    """The code of one network: its values, and their derivatives along directions and by the weights `theta`."""
 
     def __init__(self, code: Code, sizes: _Sizes, activation: str, velocity: bool, theta: Value, work: Value) -> None:
         self.code, self.sizes, self.velocity, self.theta = code, sizes, velocity, theta
@@ -330,14 +303,8 @@ def _flat(x: Any) -> list[Value]:
 class _Points:
     """The code of blocks of points: their way through all layers, and back.
 
-    Parameters
-    ----------
-    code : Code
-        Of a function of the addresses of weights, kinds of layers, times, states, constants, then `more`, then those of
-        memory; of the numbers of layers and of points, the first and the last block, then `flags`.
-    sizes, activation, velocity
-    more : int
-        How many addresses.
+    The function takes the addresses of weights, kinds of layers, times, states, constants, `more` others, then of
+    memory; the numbers of layers and of points, the first and the last block, then flags.
     """
 
     def __init__(self, code: Code, sizes: _Sizes, activation: str, velocity: bool, more: int) -> None:

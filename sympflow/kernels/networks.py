@@ -24,7 +24,7 @@ from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.program import traced
 from sympflow.kernels.activations import SLOPES
-from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
+from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, both_ways, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts, aligned
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.threads import run_rows
@@ -68,17 +68,7 @@ class NetworkLayer:
 class MLPFlowKernel(Kernel):
     """Compiled loops of one SympFlow with the weights given, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
 
-    Parameters
-    ----------
-    ndof : int
-        d.
-    layers : sequence of NetworkLayer
-        In their order, with potentials of one depth and one activation; steps |h| are at most Δt.
-
-    Raises
-    ------
-    ValueError
-        If depths or activations differ, or there is no compiled form of the activation.
+    Layers are in their order, with potentials of one depth and one activation, else there is a ValueError; |h| ≤ Δt.
     """
 
     saves_finite = False
@@ -104,14 +94,10 @@ class MLPFlowKernel(Kernel):
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,), negative for the inverse."""
-        steps, out = np.empty(len(y)), np.empty(y.shape)
-        steps[:] = h
-        back = steps < 0
-        for sign, rows in ((1.0, ~back), (-1.0, back)):
-            if rows.all():
-                return Steps(self._steps(sign, y, steps))
-            out[rows] = self._steps(sign, y[rows], steps[rows])
-        return Steps(out)
+        lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), len(y))
+        return Steps(
+            both_ways(lambda rows, back: self._steps(-1.0 if back else 1.0, y[rows], lengths[rows]), lengths, y)
+        )
 
     def _steps(self, sign: float, y: np.ndarray, h: np.ndarray) -> np.ndarray:
         """Steps of one sign."""

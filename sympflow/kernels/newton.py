@@ -40,10 +40,7 @@ LONG = 4e6  # operations between two looks for a stop
 def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
 
-    Raises
-    ------
-    ValueError
-        If the system cannot be compiled, with the reason.
+    A ValueError says why there are none.
     """
     kernels = _KERNELS.setdefault(system, {})
     if (tableau, compensated) not in kernels:
@@ -389,7 +386,7 @@ class _InMemory(NewtonCode):
             def targets(places: list[Value]) -> list[tuple[Rows, Value]]:
                 return [(slope, m) for m in places] + [(rows, i * n + j) for i in places for j in places]
 
-            self._terms.add(data, self._terms.hessians, [Rows(Y, DOUBLE)], given, targets)
+            self._terms.add(data, self._terms.derivatives(0, True), [Rows(Y, DOUBLE)], given, targets)
             return
         slopes, hessian = self._square(self.slopes(*(code.load(Y, m) for m in range(n)), *given))
         for m, x in enumerate(slopes):

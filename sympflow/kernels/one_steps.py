@@ -29,13 +29,7 @@ Lettered = Any
 
 
 def lettered(form: Any, expressions: Sequence[Any]) -> Lettered:
-    """Expressions of a form with letters.
-
-    Raises
-    ------
-    ValueError
-        If a function in them has no compiled form.
-    """
+    """Expressions of a form with letters; a ValueError names a function in them that has no compiled form."""
     if isinstance(form, TracedHamiltonian):
         check_size(form)
         return TracedLetters(form, expressions)
@@ -62,12 +56,7 @@ def terms_of(lettered: Lettered) -> Terms:
 
 
 def check_size(form: TracedHamiltonian) -> None:
-    """Refuse a traced function that would take long to compile.
-
-    Raises
-    ------
-    ValueError
-    """
+    """Refuse a traced function that would take long to compile, by a ValueError."""
     if form.size > MOST_COMPILED:
         raise ValueError(
             f"`system` has {form.size:,} operations in its gradient, more than {MOST_COMPILED:,}, which are not "
@@ -76,17 +65,10 @@ def check_size(form: TracedHamiltonian) -> None:
 
 
 class OneStep(Rollouts):
-    """The stage of a method that is a whole step.
+    """The stage of a method that is a whole step, about `work` nanoseconds.
 
     The numbers of a column are h, the system's parameters, the time t0 of the run's beginning where H depends on it,
     and what a method adds.
-
-    Attributes
-    ----------
-    lettered : Lettered
-    driven : bool
-    work : float
-        About how many nanoseconds a step takes.
     """
 
     closing = False
@@ -132,14 +114,9 @@ class OneStep(Rollouts):
 
 
 class OneStepKernel(Kernel):
-    """Compiled loops of a method of one stage a step on one system, a `Kernel`.
+    """Compiled loops of a method of one stage a step on one system: the code of runs, and that of single steps.
 
-    Parameters
-    ----------
-    code, single : OneStep
-        Of runs, and of single steps.
-    more : callable, optional
-        What the method adds to the numbers of steps of lengths h (n,): (n, k).
+    ``more(h)`` is what the method adds to the numbers of steps of lengths h (n,): (n, k).
     """
 
     def __init__(self, code: OneStep, single: OneStep, more: Callable[[np.ndarray], np.ndarray] | None = None) -> None:

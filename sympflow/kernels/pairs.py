@@ -68,14 +68,7 @@ class Pair(NamedTuple):
 
 
 class PairLaw:
-    """The forces of one pair, of one kind of sum.
-
-    Parameters
-    ----------
-    local : PairsHamiltonian
-    kinds : sequence of int
-        The derivatives of V that are computed.
-    """
+    """The forces of one pair, of one kind of sum, with these derivatives of V."""
 
     def __init__(self, local: PairsHamiltonian, kinds: Sequence[int]) -> None:
         self.columns = len(local.first)
@@ -613,17 +606,7 @@ def _check_level(level: int) -> None:
 
 
 class PairCode(SharedRollouts):
-    """The compiled functions of splitting schemes on bodies in pairs, of which only the potential is part of the code.
-
-    Parameters
-    ----------
-    local : PairsHamiltonian
-    level : int
-        See `Scheme`.
-    compensated : bool
-    damped : bool
-        True if there is friction −γp, whose numbers are the last two rows of a table.
-    """
+    """The compiled functions of schemes on bodies, `damped` by −γp: the potential alone is part of the code."""
 
     def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
         _check_level(level)
@@ -680,14 +663,7 @@ DIRECTIONS = 16
 class PairForces:
     """F = −∇V and G = ∇²V M⁻¹∇V of bodies at many states, and their derivatives, for the fits of tables.
 
-    States q are (d, P), directions (K, d, P), Jacobians (d, d, P), as in `sympflow.training.table_step`. States stand
-    side by side in registers.
-
-    Parameters
-    ----------
-    local : PairsHamiltonian
-    level : int
-        See `Scheme`; there are no curvature terms.
+    States q are (d, P), side by side in registers, directions (K, d, P). No curvature terms.
     """
 
     def __init__(self, local: PairsHamiltonian, level: int) -> None:
@@ -715,12 +691,6 @@ class PairForces:
         self._products(*self._given_arrays(q, F, v, DF, DG), len(v))
         values, changes = ([x[..., :P] for x in pair][: 1 + self._has_gradient] for pair in ((F, G), (DF, DG)))
         return values, changes
-
-    def all(self, q: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        """These, and their Jacobians."""
-        d, P = q.shape
-        values, changes = self.along(q, np.broadcast_to(np.eye(d)[..., None], (d, d, P)))
-        return values, [change.swapaxes(0, 1) for change in changes]
 
     def _given_arrays(self, *arrays: np.ndarray) -> tuple[int, ...]:
         return self._sites.shape[1], arrays[0].shape[1], *map(address, (self._sites, self._numbers, *arrays))

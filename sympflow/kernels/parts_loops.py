@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
-from sympflow.compiler.functions import fma, is_zero, times
-from sympflow.compiler.program import Program, gradient
-from sympflow.hamiltonian.formulas import recorded
+from sympflow.compiler.functions import fma, summed, times
+from sympflow.compiler.program import Program, gradient, tangent, traced
+from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlow, shears
 from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
@@ -46,20 +46,7 @@ Maps = Callable[[np.ndarray], Sequence[SubFlow]]
 
 
 class PartMaps:
-    """The maps of the parts of a system as code.
-
-    Parameters
-    ----------
-    parts : ExactParts
-        Of symbols.
-    filters : bool
-        True if the maps have some.
-
-    Raises
-    ------
-    ValueError
-        If H holds a function that has no compiled form.
-    """
+    """The maps of the parts of a symbolic system as code, with `filters` if they have some."""
 
     def __init__(self, parts: ExactParts, filters: bool) -> None:
         self.parts, self.ndof, self.filters = parts, parts.ndof, filters
@@ -76,48 +63,36 @@ class PartMaps:
 
     def _part(self, number: int, bends: bool, expand: bool) -> tuple[int, Arranged]:
         """x + b J∇H_k(x), and with a force gradient g ∇²U M⁻¹∇U added to y; its cost before it."""
-        parts, d, lettered = self.parts, self.ndof, self.lettered[number - 1]
-        filtered = [f"phi_{j}" for j in range(d) if self.filters]
+        d, letters = self.ndof, self.lettered[number - 1].letters
+        filters = [f"phi_{j}" for j in range(d) if self.filters]
         states = [*((f"x_{j}", 0) for j in range(d)), *((f"y_{j}", EARLY) for j in range(d))]
-        made = Arrangement([*states, *((s.name, EARLY) for s in lettered.letters)], ["b", "g", *filtered], expand)
-        x, y, letters = made.states[:d], made.states[d : 2 * d], made.states[2 * d :]
-        b, g, *phi = made.constants
-        C, inverse = parts.C.tolist(), parts.inverse_C.tolist()
-        by_phi = [f * v for f, v in zip(phi, x, strict=True)] if phi else x
-        q = [_combined(C[i], by_phi) + float(parts.center[i]) for i in range(d)]
-        p = [_combined([row[i] for row in inverse], y) for i in range(d)]
-        slope, velocity, hessian = self._slopes(number, bends)
-        force, *rest = ([made.number(v) for v in program(*q, *p, *letters)] for program in (slope, velocity))
-        forces = [_combined([row[j] for row in C], force) for j in range(d)]
-        moved = [_combined(inverse[j], rest[0]) for j in range(d)]
-        if phi:
-            forces = [f * v for f, v in zip(phi, forces, strict=True)]
-        changes = [-times(b, v) for v in forces]
-        if bends:
-            rates = parts.inverse_masses(np.zeros(d))
-            direction = [float(rate) * v for rate, v in zip(rates, forces, strict=True)]
-            if phi:
-                direction = [f * v for f, v in zip(phi, direction, strict=True)]
-            z = [_combined(C[i], direction) for i in range(d)]
-            rows = [made.number(v) for v in hessian(*q, *p, *letters)]
-            bent = [_combined(z, rows[d * i : d * (i + 1)]) for i in range(d)]
-            added = [_combined([row[j] for row in C], bent) for j in range(d)]
-            if phi:
-                added = [f * v for f, v in zip(phi, added, strict=True)]
-            changes = [v + times(g, w) for v, w in zip(changes, added, strict=True)]
-        new_x = [made.written(v + times(b, w)) for v, w in zip(x, moved, strict=True)]
-        new_y = [made.written(v + w) for v, w in zip(y, changes, strict=True)]
-        arranged = made.finish([*new_x, *new_y])
-        return 2 * max(made.depth(v) for v in (*new_x, *new_y)) + 3 * len(arranged.body), arranged
+        made = Arrangement([*states, *((s.name, EARLY) for s in letters)], ["b", "g", *filters], expand)
+        (b, g, *phi), program = made.constants, self._slopes(number, bends)
+        slopes = program(*made.states, *(phi or [made.number(1.0)] * d))
+        changes = [times(b, v) for v in slopes[d : 2 * d]]
+        changes += [times(g, w) - times(b, v) for v, w in zip(slopes[:d], slopes[2 * d :] or [0.0] * d, strict=True)]
+        new = [made.written(x + made.number(change)) for x, change in zip(made.states, changes, strict=False)]
+        arranged = made.finish(new)
+        return 2 * max(map(made.depth, new)) + 3 * len(arranged.body), arranged
 
-    def _slopes(self, number: int, bends: bool) -> tuple[Program, Program, Program]:
-        """∂H_k/∂q, ∂H_k/∂p and, where it is needed, ∂²H_k/∂q², from q, p and the letters."""
-        part, lettered, d = self.parts.rest[number - 1], self.lettered[number - 1], self.ndof
-        program = recorded(lettered.expressions, (*part.q, *part.p, *lettered.letters))
-        q = program.inputs[:d]
-        slope = gradient(program.outputs[0], program.inputs[: 2 * d])
-        hessian = [x for s in slope[:d] for x in gradient(s, q)] if bends else []
-        return tuple(Program(program.inputs, x) for x in (slope[:d], slope[d:], hessian))  # type: ignore[return-value]
+    def _slopes(self, number: int, bends: bool) -> Program:
+        """∂H_k/∂x, ∂H_k/∂y and, where it is needed, ∂²H_k/∂x² M⁻¹∂H_k/∂x, from modes, letters and filters."""
+        parts, lettered, d = self.parts, self.lettered[number - 1], self.ndof
+        part, C, inverse = parts.rest[number - 1], parts.C.tolist(), parts.inverse_C.tolist()
+
+        def slopes(*numbers: Any) -> list[Any]:
+            x, y, (letters, phi) = numbers[:d], numbers[d : 2 * d], (numbers[2 * d : -d], numbers[-d:])
+            filtered = [f * v for f, v in zip(phi, x, strict=True)]
+            q = [summed(float(center), row, filtered) for center, row in zip(parts.center, C, strict=True)]
+            p = [summed(0.0, [row[i] for row in inverse], y) for i in range(d)]
+            known = evaluator(dict(zip((*part.q, *part.p, *lettered.letters), (*q, *p, *letters), strict=True)))
+            slope = gradient(known(lettered.expressions[0]), [*x, *y])
+            rates = parts.inverse_masses(np.zeros(d)).tolist() if bends else []
+            along = tangent(slope[:d], x, [rate * v for rate, v in zip(rates, slope, strict=False)]) if bends else []
+            return [*slope, *along]
+
+        names = [f"{name}_{j}" for name in ("x", "y") for j in range(d)] + [s.name for s in lettered.letters]
+        return traced(slopes, *names, *(f"phi_{j}" for j in range(d)))
 
     @cached_property
     def size(self) -> int:
@@ -189,14 +164,7 @@ class PartMaps:
 
 
 class PartsCode(Rollouts):
-    """Groups of maps as stages: a column has the numbers of one map after the other.
-
-    Parameters
-    ----------
-    maps : PartMaps
-    groups : sequence of tuple of int
-        The codes of the maps of each kind of column.
-    """
+    """Groups of maps, by their codes, as stages: a column has the numbers of one map after the other."""
 
     lanes = 16
 
@@ -236,25 +204,8 @@ class PartsCode(Rollouts):
         return values
 
 
-def _combined(weights: Sequence[Any], values: Sequence[Any]) -> Any:
-    """Σ weights_i values_i, without those that are 0."""
-    total: Any = 0.0
-    for w, x in zip(weights, values, strict=True):
-        if is_zero(w):
-            continue
-        term = x if isinstance(w, float) and w == 1 else times(w, x)
-        total = term if isinstance(total, float) else total + term
-    return total
-
-
 def parts_loops(parts: ExactParts) -> PartsLoops:
-    """The compiled loops of the parts of a system, made once.
-
-    Raises
-    ------
-    ValueError
-        If the parts cannot be compiled, with the reason.
-    """
+    """The compiled loops of the parts of a system, made once; a ValueError says why there are none."""
     loops = _LOOPS.get(parts)
     if loops is None:
         loops = _LOOPS[parts] = PartsLoops(parts)
@@ -265,22 +216,12 @@ _LOOPS: WeakKeyDictionary[ExactParts, PartsLoops] = WeakKeyDictionary()
 
 
 class PartsLoops:
-    """Compiled loops over the maps of any splitting of one system; states are [q, p], float64.
+    """Compiled loops over the maps of any splitting of one symbolic system; states are [q, p], float64.
 
     The linear part's modes rotate by three shears, each with determinant 1 whatever its number, by at most an eighth of
     a turn, after exact quarter turns; the run stays in the modes. So rounding is none at whole quarter turns, and a
     random walk elsewhere, but at some simple fractions of a turn, such as a sixth: the state comes back to nearly
     the same numbers, whose rounding repeats, and the energy drifts by up to 5e-17 of it with each step.
-
-    Parameters
-    ----------
-    parts : ExactParts
-        Of a symbolic system.
-
-    Raises
-    ------
-    ValueError
-        If the parts are plain functions, or H holds a function that has no compiled form.
     """
 
     def __init__(self, parts: ExactParts) -> None:
@@ -300,20 +241,14 @@ class PartsLoops:
         self._tables: dict[int, tuple[Sequence[SubFlow], _Table]] = {}
 
     def kernel(self, maps: Maps) -> PartsKernel:
-        """The loops of one splitting, whose step of length h is `maps(h)`.
-
-        The tables of runs are kept by the identity of what `maps` returns.
-        """
+        """The loops of one splitting, whose step of length h is `maps(h)`; tables are kept by the identity of that."""
         return PartsKernel(self, maps)
 
     def step_by_coefficients(self, sequence: Sequence[SubFlow], dt: float, t: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from each row of y (N, 2d), each of its own length t (N,) > 0, by maps that are functions of t.
 
-        Parameters
-        ----------
-        sequence : sequence of SubFlow
-            With coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
-            are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
+        Maps have coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
+        are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
         """
         square = (t / dt) ** 2
         terms = max(len(sequence[0].length), 3)

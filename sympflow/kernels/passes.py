@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.compiler.control import BOOL, INT, POINTER, Module, Value
+from sympflow.compiler.control import BOOL, INT, POINTER, Module
 from sympflow.compiler.machine import address, host
 from sympflow.kernels.runs import Lanes, finished, groups
 
@@ -110,10 +110,8 @@ def _products_function() -> Callable[..., None]:
     A, n, x, n_rows, out = code.arguments
     with code.over(n_rows) as i, code.over(n) as j:
         row, start = code.at(A, j * n), code.at(x, i * n)
-
-        def added(k: Value, total: list[Value], row: Value = row, start: Value = start) -> list[Value]:
-            return [total[0] + code.load(row, k) * code.load(start, k)]
-
-        (total,) = code.loop(n, [code.constant(0.0)], added)
-        code.store(total, out, i * n + j)
+        total = code.variable(code.constant(0.0))
+        with code.over(n) as k:
+            total.value = total.value + code.load(row, k) * code.load(start, k)
+        code.store(total.value, out, i * n + j)
     return finished(code, types)

@@ -12,13 +12,13 @@ from numpy.typing import ArrayLike
 
 from sympflow.kernels.threads import NEVER, given, run_rows
 
-__all__ = ["Batch", "Carry", "Kernel", "Run", "Steps", "Task", "run_states"]
+__all__ = ["Batch", "Kernel", "Run", "RunCheckpoint", "Steps", "Task", "both_ways", "run_states"]
 
 NOTHING: Any = np.empty(0)
 
 
 @dataclass
-class Carry:
+class RunCheckpoint:
     """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
 
     The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
@@ -52,7 +52,7 @@ class Task(NamedTuple):
     y0: np.ndarray
     n_steps: int
     save: np.ndarray
-    carry: Carry | None = None
+    carry: RunCheckpoint | None = None
     t0: float = 0.0
     threads: int | None = None
 
@@ -143,21 +143,10 @@ def run_states(
     start: np.ndarray | None = None,
     counts: bool = False,
 ) -> Run:
-    """A run of every row of a task by `rollout`, which is compiled, on as many threads as pay.
+    """A run of every row of a task by `rollout(batch)`, which is compiled, on as many threads as pay.
 
-    Parameters
-    ----------
-    rollout : callable
-        Fills some rows of a batch.
-    task : Task
-    width : int
-        K, the size of the running state.
-    work : float
-        About how many nanoseconds a step takes.
-    start : ndarray of shape (N, 2d + n), optional
-        The states with values of their own behind them.
-    counts : bool
-        True if stages count iterations.
+    The running state has `width` numbers, a step takes about `work` nanoseconds; `start` has the states with values of
+    their own behind them; `counts` if stages count iterations.
     """
     y0, save, carry, first = given(task.y0), given(task.save, np.int64), task.carry, 0
     N, before = len(y0), None
@@ -201,6 +190,18 @@ class Steps(NamedTuple):
     iterations: int = 0
 
 
+def both_ways(step: Callable[[Any, bool], np.ndarray], h: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Rows of `y` (N, 2d) after steps of lengths h (N,): ``step(rows, back)`` is of those that go one way."""
+    out = None
+    for back, rows in ((False, h > 0), (True, h < 0)):
+        if rows.all():
+            return step(slice(None), back)
+        if rows.any():
+            out = np.array(y, dtype=np.float64) if out is None else out
+            out[rows] = step(rows, back)
+    return np.array(y, dtype=np.float64) if out is None else out
+
+
 class Kernel(ABC):
     """Compiled loops of a method on one system; states are [q, p], float64. A subclass says `runs` and `step`.
 
@@ -210,12 +211,15 @@ class Kernel(ABC):
         True if all states that a run saves up to its last finite step are finite numbers.
     backend : str
         The name of what runs, of `stats["backend"]`.
+    tensors : sequence of Tensor
+        Weights in H that torch follows, whose numbers are read in each run.
     remark : str
         A sentence on the end of the last run of a single state that could not go on.
     """
 
     saves_finite = True
     backend = "compiled"
+    tensors: Sequence[Any] = ()
     remark = ""
 
     def run(
@@ -224,7 +228,7 @@ class Kernel(ABC):
         y0: np.ndarray,
         n_steps: int,
         save: np.ndarray,
-        carry: Carry | None = None,
+        carry: RunCheckpoint | None = None,
         t0: float = 0.0,
         threads: int | None = None,
     ) -> Run:
@@ -238,7 +242,7 @@ class Kernel(ABC):
         n_steps : int
         save : ndarray of int64, sorted, in 0 … n_steps
             The steps whose states are kept.
-        carry : Carry, optional
+        carry : RunCheckpoint, optional
             Where the run goes on, and leaves its end: of `n_steps` steps those after ``carry.steps`` are made. All
             counts, those of `save` and of the result too, are from `y0`, which is the state that the first piece began
             with; `save` begins after ``carry.steps``.

@@ -23,26 +23,10 @@ ROWS = 256  # that run together, whatever the threads
 
 
 class Recorded:
-    """A run of rows whose cotangents can be pulled back.
+    """A run of rows y0 (N, 2d), or with own values behind each, whose cotangents can be pulled back.
 
-    Parameters
-    ----------
-    code : SplittingCode
-        With a reverse of its stages.
-    table
-        Its rows are numbers.
-    y0 : ndarray of shape (N, 2d), or (N, 2d + n)
-        With own values of each row.
-    n_steps : int
-    save : ndarray of int64, sorted, in 0 … n_steps
-    work : float
-        About how many nanoseconds a step of a row takes.
-
-    Attributes
-    ----------
-    states : ndarray of shape (N, len(save), 2d)
-    n_finite : ndarray of int64 of shape (N,)
-        The last step of each row that ends in a finite state.
+    A step of a row takes about `work` nanoseconds. The results are `states` (N, len(save), 2d), and `n_finite` (N,),
+    the last step of each row that ends in a finite state.
     """
 
     def __init__(
@@ -99,46 +83,50 @@ class Recorded:
         if self._n_steps == 0:
             self.states[i] = self._y0[i, None, : code.n_out]
 
-    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The cotangents of the states and, of use with `slopes` only, of the numbers of the table.
+    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The cotangents of the states (N, 2d), for those of the outputs (N, len(save), 2d).
 
-        Parameters
-        ----------
-        cotangents : ndarray of shape (N, len(save), 2d)
-
-        Returns
-        -------
-        of_states : ndarray of shape (N, 2d)
-        of_table : ndarray of shape (n, m), with tables of their own (n, m, N)
+        With `slopes` those of the numbers of the table too, (n, m), with tables of their own (n, m, N), and the sums
+        of `SplittingRollouts.summed`.
         """
-        code, table = self._code, self._table
-        of_states = np.zeros((len(self._y0), code.n_values))
-        good = self.n_finite >= self._n_steps
-        found = np.zeros((table.shape[1], code.size, len(good) if slopes else 0))
+        if (self.n_finite < self._n_steps).any():
+            return self._pulled_apart(cotangents, slopes)
+        code, table, N = self._code, self._table, len(self._y0)
+        of_states = np.zeros((N, code.n_values))
+        found = np.zeros((table.shape[1], code.size, N if slopes else 0))
+        sums: dict[int, np.ndarray] = {}
 
         def piece(i: slice, stop: np.ndarray) -> None:
-            of_states[i], lanes = self._pulled(i, cotangents[i], slopes, stop)
+            of_states[i], lanes, sums[i.start] = self._pulled(i, cotangents[i], slopes, stop)
             found[..., i] = lanes
 
-        if self._n_steps and good.any():
+        if self._n_steps:
             self._each(piece)
         of_states = of_states[:, : code.n_out]
         if n := int(self._save.searchsorted(0, "right")):
             of_states += cotangents[:, :n].sum(1)
-        of_table = np.zeros((len(table), table.shape[1], *[len(good)] * self._own))
-        if slopes:
-            found[..., ~good] = 0.0
+        of_weights = np.sum([sums[k] for k in sorted(sums)], axis=0) if sums else code.summed(code.prepared(table)[1])
+        of_table = np.zeros((len(table), table.shape[1], *[N] * self._own))
+        if slopes and not of_weights.size:
             of_table += code.pulled(self._full_table(), found if self._own else found.sum(-1))
-        for k in () if good.all() else np.flatnonzero(~good).tolist():  # up to the last output that is finite
-            m = int(self._save.searchsorted(self.n_finite[k], "right"))
-            end = int(self._save[m - 1]) if m else 0
-            alone = Recorded(code, table, self._y0[k : k + 1], end, self._save[:m], self._work)
-            of_states[k : k + 1], more = alone.pulled(cotangents[k : k + 1, :m], slopes)
-            if self._own:
-                of_table[..., k] += more[..., 0]
-            else:
-                of_table += more
-        return of_states, of_table
+        return of_states, of_table, of_weights
+
+    def _pulled_apart(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`pulled` of the rows that stay finite together, and of others alone up to the last output that is finite."""
+        code, table, save, finite = self._code, self._table, self._save, self.n_finite
+        of_states, of_table = np.zeros((len(finite), code.n_out)), np.zeros((*table.shape, *[len(finite)] * self._own))
+        of_weights = code.summed(code.prepared(table)[1])
+        good = np.flatnonzero(finite >= self._n_steps)
+        parts = [(good, self._n_steps, len(save))] if good.size else []
+        for k in np.flatnonzero(finite < self._n_steps).tolist():
+            m = int(save.searchsorted(finite[k], "right"))
+            parts.append((np.array([k]), int(save[m - 1]) if m else 0, m))
+        for rows, n_steps, m in parts:
+            part = Recorded(code, table, self._y0[rows], n_steps, save[:m], self._work)
+            of_states[rows], more, of_part = part.pulled(cotangents[rows, :m], slopes)
+            of_table[..., rows if self._own else slice(None)] += more
+            of_weights = of_weights + of_part
+        return of_states, of_table, of_weights
 
     def _full_table(self) -> np.ndarray:
         """The table, with the own values of all rows (n, m, N)."""
@@ -149,8 +137,8 @@ class Recorded:
         table[len(table) - len(values) :] = values[:, None]
         return table
 
-    def _pulled(self, i: slice, given: np.ndarray, slopes: bool, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pull cotangents of the outputs of some rows back to their first states, and those of columns (m, size, n)."""
+    def _pulled(self, i: slice, given: np.ndarray, slopes: bool, stop: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Pull cotangents of the outputs of some rows back to their first states, columns (m, size, n), and weights."""
         code, table, n = self._code, self._table, i.stop - i.start
         width, y0 = self._width(n), self._y0[i]
         own = " own" if self._own else ""
@@ -158,7 +146,7 @@ class Recorded:
         entries, kinds = code.own_columns(table, values, width) if own else code.prepared(table)
         groups = -(-n // width)
         found = zeros(groups * len(kinds) * code.size * width if slopes else 1)
-        rows = np.zeros((n, code.n_values))
+        rows = np.zeros((groups * width, code.n_values))  # lanes without a trajectory have no cotangents
         name = ("slopes" if slopes else "reverse") + own
         for (first, to), before in reversed([*zip(pairwise(self._ends), self._histories[i.start], strict=True)]):
             kept = before
@@ -168,16 +156,15 @@ class Recorded:
                 batch = Batch(y0, to, self._save[:0], *nothing, first, before, stop=stop, kept=kept)
                 code.run(table, batch, False)
             chosen = slice(*self._save.searchsorted((first, to), "right").tolist())
-            later, outputs, count = (
-                self._save[chosen],
-                np.ascontiguousarray(given[:, chosen]),
-                chosen.stop - chosen.start,
-            )
+            later, count = self._save[chosen], chosen.stop - chosen.start
+            outputs = np.zeros((len(rows), count, given.shape[-1]))
+            outputs[:n] = given[:, chosen]
             if not count:
                 later = outputs = NEVER
-            arguments = entries, kinds, len(kinds) - 2, kept, rows, n, first, to, later, count, outputs, found
+            arguments = entries, kinds, len(kinds) - 2, kept, rows, len(rows), first, to, later, count, outputs, found
             code.call(name, width, *arguments)
         if not slopes:
-            return rows, np.zeros(0)
+            return rows[:n], np.zeros(0), code.summed(kinds)
         lanes = found.reshape(groups, len(kinds), code.size, width)
-        return rows, lanes.transpose(1, 2, 0, 3).reshape(len(kinds), code.size, groups * width)[..., :n]
+        of_columns = lanes.transpose(1, 2, 0, 3).reshape(len(kinds), code.size, groups * width)[..., :n]
+        return rows[:n], of_columns, code.summed(kinds)

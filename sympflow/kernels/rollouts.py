@@ -19,7 +19,7 @@ from sympflow.kernels.threads import NEVER
 __all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "zeros"]
 
 LINE = 8  # numbers in a line of memory
-START = np.zeros(1, dtype=np.int64)
+START, ONE = np.zeros(1, dtype=np.int64), np.ones(1, dtype=np.int64)
 AT_ONCE = 4096  # trajectories with tables of their own
 
 Columns = tuple[np.ndarray, np.ndarray]
@@ -261,6 +261,25 @@ class SplittingRollouts(Rollouts):
         self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
     ) -> None:
         """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
+
+    def summed(self, kinds: np.ndarray) -> np.ndarray:
+        """The sums over trajectories that a reverse of columns of these kinds left, such as derivatives by weights."""
+        return np.zeros(0)
+
+    def own_steps(self, table: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """One step from every row of `y` (N, 2d) by its own numbers: a table (n, m N), a column of all rows each."""
+        n = len(y)
+        entries, kinds = self.columns(table)
+        entries = entries.reshape(-1, n, self.size).swapaxes(0, 1)
+        nothing = np.zeros((n, 2, self.size))
+        columns = np.concatenate([entries, nothing], axis=1), np.append(kinds[::n], [0, 0])
+        batch = Batch.whole(np.column_stack([y, np.arange(n, dtype=float)]), 1, ONE, self.n_out)
+        self.run(columns, batch, False)
+        return batch.out[:, 0]
+
+    def columns(self, table: np.ndarray) -> Columns:
+        """The columns of a table of numbers."""
+        return self.prepared(table)
 
     def check_reverse(self) -> None:
         """Raise a ValueError, with the reason, where stages have no compiled reverse: see `SplittingCode.adjoint`."""

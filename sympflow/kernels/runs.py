@@ -188,21 +188,10 @@ def reverse_function(
 ) -> Callable[..., None]:
     """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
 
-    Parameters
-    ----------
-    n_values, n_out, size, width, own
-        As for `run_function`.
-    adjoint : callable
-    slopes : bool
-        True to find the derivatives by the numbers of the columns too.
-
-    Returns
-    -------
-    callable
-        Of addresses and integers (table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, slopes):
-        `rows` (n_rows, n_values) are the cotangents of the running states after `n_steps` steps, and become those after
-        `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than `first`. What a table of its own for
-        every `width` trajectories would hold is added to `slopes`, in the same order.
+    Returns a function of addresses and integers (table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved,
+    out, slopes): `rows` (n_rows, n_values) are the cotangents of the running states after `n_steps` steps, and become
+    those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than `first`. With `slopes`, what a
+    table of its own for every `width` trajectories would hold is added to that array, in the same order.
     """
     types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER]
     code = Module(host().fused).function("reverse", types)
@@ -261,18 +250,10 @@ def map_function(
     memory: Callable[..., Memory] | None = None,
     timed: bool = False,
 ) -> Callable[..., None]:
-    """Compile a map of rows: all columns of one table.
+    """Compile a map of rows: all columns of one table. If `timed`, stages are given the steps of each lane.
 
-    Parameters
-    ----------
-    timed : bool
-        True if stages are given the steps of each lane, else those of the first one for all.
-
-    Returns
-    -------
-    callable
-        Of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out), of states in memory then `MEMORY`: row i is
-        mapped after ``steps[i % n_steps]`` whole steps; `out` may be `rows`.
+    Returns a function of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out), of states in memory then
+    `MEMORY`: row i is mapped after ``steps[i % n_steps]`` whole steps; `out` may be `rows`.
     """
     types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("map", types)
@@ -311,20 +292,10 @@ def step_function(
 ) -> Callable[..., None]:
     """Compile single steps from rows, each of its own length.
 
-    Parameters
-    ----------
-    powers : sequence of int
-        Of the step length, with which the given numbers of a column grow.
-    own : int
-        Numbers that follow each state in its row and replace the last ones given.
-    numbers : callable
-        From the time at which a step begins and the given numbers to those that a stage reads.
-
-    Returns
-    -------
-    callable
-        Of (coefficients, n_columns, n_powers, x, h, t, rows, n_rows, out), of states in memory then `MEMORY`: the given
-        numbers of a column of row i are polynomials Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
+    The given numbers of a column grow with `powers` of the length; the last `own` ones follow each state in its row;
+    ``numbers(time, *given)`` are those that a stage reads. Returns a function of (coefficients, n_columns, n_powers, x,
+    h, t, rows, n_rows, out), of states in memory then `MEMORY`: the given numbers of a column of row i are polynomials
+    Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
     """
     types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = Module(host().fused).function("steps", types)
@@ -360,15 +331,8 @@ three states, and after these for what stages need, times the width; an array of
 class Room:
     """A state in memory, of any size: its number i of all trajectories side by side lies at i times the width.
 
-    Attributes
-    ----------
-    state, work : Value
-        Addresses: of the numbers of the state, and of room for others.
-    size : Value
-        How many numbers it has.
-    places : Value
-        The address of the array of addresses.
-    width : int
+    `state` and `work` are the addresses of its numbers, so many as `size`, and of room for others; `places` that of the
+    array of addresses.
     """
 
     def __init__(self, code: Code, width: int, state: Value, work: Value, size: Value, data: Value) -> None:
@@ -473,14 +437,8 @@ class _History:
 class Memory:
     """The same in memory: the state, its end, and the state before a block of steps.
 
-    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`.
-
-    Attributes
-    ----------
-    at_once : int
-        Numbers that are copied at a time: a state has a multiple of these.
-    count : Value
-        How many trajectories there may be.
+    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`. Numbers are copied
+    `at_once`; there are `count` trajectories at most.
     """
 
     at_once = 1

@@ -15,13 +15,14 @@ from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import check_size
-from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
+from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.stages import StageTable, check_damping, run_table, step_table
 from sympflow.kernels.threads import given
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.friction import Friction
+    from sympflow.hamiltonian.layered import LayeredPotential
     from sympflow.kernels.approximations import Ranges
     from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.rollouts import SplittingRollouts
@@ -32,12 +33,7 @@ if TYPE_CHECKING:
 def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> SplittingLoops:
     """The compiled loops of splitting schemes on a separable system, made once per system.
 
-    With `names` the values of `SplittingLoops` are those of these parameters.
-
-    Raises
-    ------
-    ValueError
-        If the system cannot be compiled, with the reason.
+    With `names` the values of `SplittingLoops` are those of these parameters. A ValueError says why there are none.
     """
     known = _LOOPS.get(system)
     if known is None:
@@ -75,6 +71,8 @@ class SplittingLoops:
         By how much less it takes in a batch, whose lanes run side by side.
     driven : bool
         True if H depends on t.
+    tensors : sequence of Tensor
+        Weights that torch follows, whose numbers are read in each run.
     """
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
@@ -88,6 +86,7 @@ class SplittingLoops:
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., SplittingRollouts]
         self._longs: dict[int, bool] = {}
+        self.tensors: Sequence[Any] = ()
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not (system.separable if symbols is None else symbols.separable):
@@ -156,6 +155,14 @@ class SplittingLoops:
                 self._compile = partial(lattice_code, system.local, bool(system.friction))
             self._has_force_gradient = system.quadratic_kinetic
             self.traced = self._written is not None
+        elif system.layered is not None:
+            if system.friction:
+                raise ValueError(
+                    f"`system` {system.name!r} has friction, and weights that torch follows: use backend='array'."
+                )
+            self._has_force_gradient, self.tensors = False, system.layered.tensors
+            self.work = system.layered.n_weights
+            self._compile = partial(_layered_code, system.layered)
         else:
             raise ValueError(
                 f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change them, "
@@ -170,29 +177,9 @@ class SplittingLoops:
         return vars(self) | {"_ranges": self._ranges, "_system": None}
 
     def kernel(self, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None) -> SplittingKernel:
-        """The loops of one scheme.
-
-        Parameters
-        ----------
-        scheme : Scheme
-        compensated : bool
-            Sum with Kahan's compensation, which lowers the growth of round-off, in runs.
-        ranges
-            Of positions: see `functions`.
-
-        Raises
-        ------
-        ValueError
-            If a function in H has no compiled form.
-        """
+        """The loops of one scheme, with Kahan's `compensated` sums; for `ranges` of positions see `functions`."""
         kernel = SplittingKernel(self, scheme, compensated, ranges)
         kernel._functions()  # so that what has no compiled form is refused here, and not by a run
-        return kernel
-
-    def damped_kernel(self, scheme: Scheme, step: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> DampedKernel:
-        """The loops of one scheme on a system with friction; single steps are made by `step(y, h)` on arrays."""
-        kernel = DampedKernel(self, scheme, step)
-        kernel._functions()
         return kernel
 
     def takes_values(self, level: int, ranges: Ranges | None = None, varied: bool = False) -> bool:
@@ -210,11 +197,6 @@ class SplittingLoops:
         """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
 
         Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
-
-        Raises
-        ------
-        ValueError
-            If the system has no such kicks.
         """
         variant = (level, compensated, monomials, varied, ranges)
         if variant not in self._variants:
@@ -305,7 +287,7 @@ class SplittingLoops:
         time too, that of a step h that begins at t0. Those of `varied` loops have room for the values of any kicks.
         """
         if self.friction:
-            table = _with_friction(table, self.friction)
+            table = _damped(table, self.friction)
         if self.driven:
             return table.timed_rows(self.values, h, t0)
         return table.rows(self.values if varied or self.takes_values(table.level, ranges) else ())
@@ -324,33 +306,52 @@ class SplittingLoops:
     ) -> np.ndarray:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
 
-        Parameters
-        ----------
-        table : StageTable
-            For h = 1, as coefficients (m, K) of polynomials: the kicks of row i are Σ_k kicks[:, k] x[i]^k. In a batch
-            K is 1 or at least 3.
-        x : ndarray of shape (N,)
-        h : ndarray of shape (N,)
-        y : ndarray of shape (N, 2d)
-        monomials
-            Of the polynomials, where kicks have them.
-        t : float or ndarray of shape (N,)
-            When the steps of a driven system begin.
-        varied : bool
-            True if the values of its parameters follow each state in its row.
-        ranges
-            Of positions: see `functions`.
-        rows : ndarray, optional
-            `rows` of the table, where the caller keeps them.
+        These are, for h = 1, polynomials Σ_k table[:, k] x[i]^k; in a batch K is 1 or at least 3. The steps of a driven
+        system begin at t. If `varied`, the values of its parameters follow each state in its row. `rows` are those of
+        the table, where the caller keeps them.
         """
-        y = given(y)
-        out = np.empty((len(y), 2 * self.ndof))
-        x, h = given(x), given(h)
-        t = given(np.broadcast_to(t, h.shape)) if self.driven else h
+        y, x, h = given(y), given(x), given(h)
         functions = self.functions(table.level, False, monomials, varied, ranges)
+        if self.friction:
+            return self._damped_rows(functions, table, x, h, y, np.broadcast_to(t, h.shape), varied)
+        out = np.empty((len(y), 2 * self.ndof))
+        t = given(np.broadcast_to(t, h.shape)) if self.driven else h
         rows = self.rows(table, varied=varied, ranges=ranges) if rows is None else rows
         functions.step_rows(rows, x, h, t, y, out)
         return out
+
+    def _damped_rows(
+        self,
+        functions: SplittingRollouts,
+        table: StageTable,
+        x: np.ndarray,
+        h: np.ndarray,
+        y: np.ndarray,
+        t: np.ndarray,
+        varied: bool,
+    ) -> np.ndarray:
+        """`step_rows` with friction, whose numbers are no polynomials: by one table, or one of its own for each row."""
+        alike = not varied and (h == h[:1]).all() and (t == t[:1]).all()
+        rows = slice(0, 1 if alike else len(y))
+        own, m = table.valued(x[rows], h[rows]).damped(self.friction), len(table.drifts)
+        values: Sequence[Any] = [*np.tile(y[:, 2 * self.ndof :].T, m)] if varied else self.values
+        if self.driven:
+            numbers = own.timed_rows(values, np.tile(h[rows], m), np.tile(t[rows], m))
+        else:
+            numbers = own.with_constants(values if varied or self.takes_values(table.level) else ())
+        if not alike:
+            return functions.own_steps(numbers, y[:, : 2 * self.ndof])
+        out = np.empty_like(y)
+        functions.mapped(numbers, y, out)
+        return out
+
+
+def _layered_code(layered: LayeredPotential, level: int, compensated: bool, monomials: Monomials) -> Any:
+    if compensated:
+        raise ValueError("`compensated` sums are not compiled for weights that torch follows: leave it out.")
+    from sympflow.kernels.layered_splittings import LayeredCode
+
+    return LayeredCode(layered)
 
 
 class SplittingKernel(Kernel):
@@ -360,7 +361,7 @@ class SplittingKernel(Kernel):
         self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None
     ) -> None:
         self.loops, self.scheme, self.compensated, self._ranges = loops, scheme, compensated, ranges
-        self._width = 2 * loops.ndof * (1 + compensated)
+        self._width, self.tensors = 2 * loops.ndof * (1 + compensated), loops.tensors
 
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         """The numbers of a run whose steps are h, as the loops read them; of a driven system from a time t0 on."""
@@ -425,22 +426,8 @@ class VariedKernel(SplittingKernel):
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         lengths, times = (np.broadcast_to(np.asarray(x, dtype=np.float64), len(y)) for x in (h, t))
-        scheme, rows = self.scheme, self._with_values(y)
-        if self.loops.friction:
-            return Steps(self._damped_step(lengths, rows, times))
-        table, given = step_table(scheme), (scheme.monomials, times)
-        return Steps(self.loops.step_rows(table, lengths, lengths, rows, *given, varied=True))
-
-    def _damped_step(self, h: np.ndarray, rows: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Runs of one step: numbers with friction are no polynomials in h, and most rows have one h and t."""
-        code, out = self._functions(), np.empty((len(rows), 2 * self.loops.ndof))
-        moments, which = np.unique(np.stack([h, t]), axis=1, return_inverse=True)
-        for k, (length, time) in enumerate(moments.T.tolist()):
-            index = np.flatnonzero(which.reshape(-1) == k)
-            batch = Batch.whole(rows[index], 1, np.ones(1, dtype=np.int64), out.shape[1])
-            code.run(self.table(length, time), batch)
-            out[index] = batch.out[:, 0]
-        return out
+        table, rows, of_kicks = step_table(self.scheme), self._with_values(y), self.scheme.monomials
+        return Steps(self.loops.step_rows(table, lengths, lengths, rows, of_kicks, times, varied=True))
 
     def _rows(self, task: Task) -> np.ndarray | None:
         if len(task.y0) % len(self._values):
@@ -457,33 +444,6 @@ class VariedKernel(SplittingKernel):
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)
 
 
-class DampedKernel(SplittingKernel):
-    """The compiled loops of one scheme on a system with friction; its tables hold exponentials, not powers, of steps.
-
-    A step by itself, of a length of its own for each state, is made by array operations.
-    """
-
-    def __init__(self, loops: SplittingLoops, scheme: Scheme, step: Callable[..., np.ndarray]) -> None:
-        super().__init__(loops, scheme)
-        self._step = step
-
-    def table(self, h: float, t0: float = 0.0) -> np.ndarray:
-        table = _damped_stages(self.scheme, h, self.loops.friction)
-        if self.loops.driven:
-            return table.timed_rows(self.loops.values, h, t0)
-        return table.rows(self.loops.values if self.loops.takes_values(table.level) else ())
-
-    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        y, h = np.asarray(y, dtype=np.float64), np.asarray(h, dtype=np.float64)
-        return Steps(self._step(y, h, t) if self.loops.driven else self._step(y, h))
-
-
 @lru_cache(maxsize=256)
-def _damped_stages(scheme: Scheme, h: float, friction: Friction) -> StageTable:
-    return _with_friction(run_table(scheme, h), friction)
-
-
-def _with_friction(table: StageTable, friction: Friction) -> StageTable:
-    """A table with the rows of a drift with friction."""
-    mean, decay = friction.factors(table.drifts)
-    return replace(table, more=np.concatenate([mean.T, decay.T]))
+def _damped(table: StageTable, friction: Friction) -> StageTable:
+    return table.damped(friction)

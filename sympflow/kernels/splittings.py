@@ -42,22 +42,11 @@ EARLY = -4  # when momenta are known before the positions, in cycles
 
 @dataclass(frozen=True)
 class Splitting:
-    """The kicks and drifts of one system, of a level, with what else they have.
+    """The kicks and drifts of one separable system, of a level, with what else they have.
 
-    Attributes
-    ----------
-    symbols : SymbolicHamiltonian
-        Separable; its parameters are numbers of a table.
-    level, monomials
-        Of the kicks: see `sympflow.schemes.Scheme`.
-    compensated : bool
-        True if states have the errors of compensated sums.
-    friction : int, optional
-        Dimensions of Γ.
-    driving : Driving, optional
-        Of `symbols` with letters for what depends on the time.
-    ranges
-        Intervals of one position in which kicks are polynomials, equal but for rounding; its values are then in V.
+    States may have the errors of compensated sums; `friction` are the dimensions of Γ; of a driven system `symbols`
+    have letters for what depends on the time. In `ranges` of one position kicks are polynomials, equal but for
+    rounding; the values of parameters are then in V, else numbers of a table.
     """
 
     symbols: SymbolicHamiltonian | TracedHamiltonian
@@ -281,14 +270,7 @@ class NearShape(Shape):
 
 
 class WithinRange:
-    """A stage in two ways: as a polynomial for positions in a range, exact for others; the same for all lanes.
-
-    Attributes
-    ----------
-    near : Stage
-    table : callable
-        From the constants of a run to the numbers that both read.
-    """
+    """A stage in two ways: as a polynomial for positions in a range, exact for others; the same for all lanes."""
 
     def __init__(self, near: Stage, exact: Stage, low: float, high: float) -> None:
         self.near, self._exact, self._low, self._high = near, exact, low, high
@@ -373,14 +355,7 @@ def shared(key: Any, make: Callable[[], Any]) -> Any:
 
 
 class SplittingCode(SplittingRollouts):
-    """The compiled functions of splitting schemes on one symbolic system.
-
-    Parameters
-    ----------
-    splitting : Splitting
-    chunked : bool, optional
-        See `Rollouts`; by default where stages are not polynomials.
-    """
+    """The compiled functions of splitting schemes on one system; `chunked` by default if no polynomials."""
 
     def __init__(self, splitting: Splitting, chunked: bool | None = None) -> None:
         self._splitting = splitting
@@ -572,15 +547,18 @@ class SplittingCode(SplittingRollouts):
     def prepared(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The numbers (m, size) that the code reads, of a table (n, m) of given ones, and the kinds (m,) of columns."""
         if self.timed:
-            return np.ascontiguousarray(table.T), self._kinds_of(table)
+            return self.columns(table)
         key = table.tobytes()
         found = self._tables.get(key)
         if found is None:
             if len(self._tables) >= MOST_TABLES:
                 self._tables.clear()
-            kinds = self._kinds_of(table)
-            found = self._tables[key] = self._entries(table, kinds), kinds
+            found = self._tables[key] = self.columns(table)
         return found
+
+    def columns(self, table: np.ndarray) -> Columns:
+        kinds = self._kinds_of(table)
+        return np.ascontiguousarray(self._entries(table, kinds)), kinds
 
     def _kinds_of(self, table: np.ndarray) -> np.ndarray:
         kinds = np.zeros(table.shape[1], dtype=np.int64)
@@ -600,8 +578,10 @@ class SplittingCode(SplittingRollouts):
                 entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
         return entries
 
-    def own_entries(self, table: np.ndarray, values: np.ndarray) -> Columns:
+    def own_entries(self, table: Any, values: np.ndarray) -> Columns:
         """The numbers of the columns of trajectories with their own values of the parameters."""
+        if isinstance(table, tuple):
+            return super().own_entries(table, values)
         kinds, n = self._kinds_of(table), len(table) - self._own
         rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
         return np.moveaxis(self._entries(rows, kinds, (len(values),)), -1, 0), kinds

@@ -29,17 +29,9 @@ __all__ = ["Driving", "SymbolicLetters", "driven_form", "letters_of_time"]
 class Driving:
     """A system whose H depends on t, written with parameters that change from stage to stage.
 
-    Attributes
-    ----------
-    form : SymbolicHamiltonian
-        H with letters for what depends on t alone. Its `parameters` are those that stay as they are, then the letters.
-    time : Symbol
-    letters : mapping of Symbol to Expr
-        Those of V, as functions of t and of the parameters that stay.
-    means : mapping of Symbol to (Expr, Expr)
-        Those of T, means over the time of a drift: a function of t, and its integral over a `DURATION` from t on.
-    samples : mapping of str to Samples
-        Of the sampled functions, by their names in expressions.
+    The parameters of `form` are those that stay, then `letters`, which are functions of t and of these, then `means`
+    over the time of a drift: a function of t, and its integral over a `DURATION` from t on. `samples` are by their
+    names.
     """
 
     form: SymbolicHamiltonian
@@ -67,12 +59,7 @@ class Driving:
         return values
 
     def check(self) -> None:
-        """Refuse what has no compiled form.
-
-        Raises
-        ------
-        ValueError
-        """
+        """Refuse what has no compiled form, by a ValueError."""
         letters = [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
         for f in (self.form.V, self.form.T, *with_letters(letters)[0]):
             check_recorded(f)
@@ -83,10 +70,7 @@ class Driving:
 def driven_form(symbols: SymbolicHamiltonian) -> Driving:
     """The driven form of a separable H that depends on t, with the parameters that it has.
 
-    Raises
-    ------
-    ValueError
-        If T is no sum of products of functions of t and of p, of which those of t have elementary integrals.
+    A ValueError if T is no sum of products of functions of t and of p, of which those of t have elementary integrals.
     """
     t = symbols.time
     assert t is not None
@@ -120,22 +104,8 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
 class SymbolicLetters:
     """Expressions of a symbolic system with letters for what depends on the time and on parameters alone.
 
-    Parameters
-    ----------
-    symbols : SymbolicHamiltonian
-    expressions : sequence of Expr
-        In its symbols.
-
-    Attributes
-    ----------
-    expressions : list of Expr
-        In q, p, the parameters and the letters: the `given` symbols.
-    letters : dict of Symbol to Expr
-
-    Raises
-    ------
-    ValueError
-        If a function in them has no compiled form.
+    The `expressions` are in q, p, the parameters and the letters: the `given` symbols. A ValueError names a function in
+    them that has no compiled form.
     """
 
     def __init__(self, symbols: SymbolicHamiltonian, expressions: Sequence[sp.Expr]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
+    from sympflow.hamiltonian.friction import Friction
     from sympflow.hamiltonian.system import HamiltonianSystem
 
 __all__ = [
@@ -71,33 +72,56 @@ class StageTable:
             return self.packed
         rows = self._with_values.get(values)
         if rows is None:
-            rows = np.concatenate([self.packed, self._constant(values)])
+            rows = self.with_constants(values)
             self._with_values.clear()  # systems with other values come one after the other
             self._with_values[values] = rows
         return rows
 
-    def timed_rows(self, values: tuple[float, ...], h: float, t0: float) -> np.ndarray:
+    def with_constants(self, values: Sequence[Any]) -> np.ndarray:
+        """`packed`, and rows of these values."""
+        return np.concatenate([self.packed, self._constant(values)]) if values else self.packed
+
+    def timed_rows(self, values: Sequence[Any], h: Any, t0: Any) -> np.ndarray:
         """`rows`, before the values the times of the kicks, that of step 0 and the step of the time."""
         clock = self._constant((t0, self.direction * h))
         return np.concatenate([self.packed, self.kick_times[None], clock, self._constant(values)])
 
-    def _constant(self, values: tuple[float, ...]) -> np.ndarray:
+    def _constant(self, values: Sequence[Any]) -> np.ndarray:
         """Rows of numbers that are the same for all stages."""
         rows = np.zeros((len(values), *self.packed.shape[1:]))
-        (rows if rows.ndim == 2 else rows[..., 0])[:] = np.reshape(values, (-1, 1))
+        for row, value in zip(rows if rows.ndim == 2 else rows[..., 0], values, strict=True):
+            row[:] = value
         return rows
 
     @cached_property
     def _with_values(self) -> dict[tuple[float, ...], np.ndarray]:
         return {}
 
-    def scaled(self, h: float) -> StageTable:
+    def valued(self, x: np.ndarray, h: np.ndarray) -> StageTable:
+        """The numbers of steps of lengths h (N,) by the polynomials of x (N,): of each stage all rows, (m N,)."""
+        numbers, times = (evaluated(c, x).reshape(*c.shape[:-2], -1) for c in (self.numbers, self.kick_times))
+        return replace(self, numbers=numbers, times=times).scaled(np.tile(h, len(self.drifts)))
+
+    def damped(self, friction: Friction) -> StageTable:
+        """The table with the rows of drifts with friction."""
+        parts = (part.T.reshape(-1, *self.drifts.shape) for part in friction.factors(self.drifts.ravel()))
+        return replace(self, more=np.concatenate([*parts]))
+
+    def scaled(self, h: Any) -> StageTable:
         """The numbers of steps h, of those for h = 1; those that are 0 stay 0 even where hⁿ is not finite."""
         powers = (1, 1, *([3] * len(self.numbers) if self.level == POLYNOMIAL else (3, 5)))[: len(self.numbers)]
         with np.errstate(over="ignore", invalid="ignore"):
-            factors = np.array([np.float64(h) ** n for n in powers])[:, None]
+            factors = np.array([np.asarray(h, dtype=float) ** n for n in powers]).reshape(len(powers), -1)
             numbers = np.where(self.numbers == 0, 0.0, factors * self.numbers)
         return replace(self, numbers=numbers, times=None if self.times is None else h * self.times)
+
+
+def evaluated(coefficients: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Polynomials (…, K) at each x (N,): (…, N)."""
+    total = np.zeros((*coefficients.shape[:-1], len(x)))
+    for k in range(coefficients.shape[-1] - 1, -1, -1):
+        total = total * x + coefficients[..., k, None]
+    return total
 
 
 # the numbers of a scheme ------------------------------------------------------------------------------------------
@@ -163,14 +187,9 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
 
 @dataclass(frozen=True)
 class Kick:
-    """A kind of kick.
+    """A kind of kick: its `numbers`, the rows 1, 2, … of a table, and the `powers` of the step with which they grow.
 
-    Attributes
-    ----------
-    numbers : tuple of str
-        Its numbers, the rows 1, 2, … of a table. A kick applies where the last one is not 0, else one with fewer.
-    powers : tuple of int
-        The powers of the step length with which they grow.
+    A kick applies where the last one is not 0, else one with fewer.
     """
 
     numbers: tuple[str, ...]
@@ -194,12 +213,7 @@ MOST_COUPLED = 6
 
 
 def check_damping(system: HamiltonianSystem, in_memory: bool) -> None:
-    """Refuse a damping matrix that compiled loops do not take.
-
-    Raises
-    ------
-    ValueError
-    """
+    """Refuse a damping matrix that compiled loops do not take, by a ValueError."""
     if system.damping is not None and system.damping.ndim == 2 and (in_memory or system.ndof > MOST_COUPLED):
         raise ValueError(
             f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "

@@ -21,7 +21,7 @@ from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
 from sympflow.compiler.functions import dot, fma, summed
 from sympflow.compiler.machine import address, host
 from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
-from sympflow.hamiltonian.formulas import evaluator
+from sympflow.hamiltonian.formulas import TracedHamiltonian, evaluator
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -40,32 +40,15 @@ BLOCKS = 2048  # of lanes, some milliseconds, between two looks at the clock
 
 
 class TableLoops:
-    """The compiled errors of labels for one system, one sequence of maps and one kind of kicks.
+    """The compiled errors of labels for one system, a sequence of `kicks` (True) and drifts, and one kind of kicks.
 
-    Parameters
-    ----------
-    symbols : SymbolicHamiltonian
-        Separable, with T = ½ pᵀM⁻¹p; its values of parameters are those of the loops.
-    kicks : sequence of bool
-        The sequence: True for a kick, False for a drift.
-    level, monomials
-        Of the kicks: see `sympflow.schemes.Scheme.level`.
-    friction : Friction, optional
-
-    Attributes
-    ----------
-    drifts : ndarray of int
-        Where the numbers of drifts stand among those of all stages.
-
-    Raises
-    ------
-    ValueError
-        If a function in H has no counterpart in compiled code, or the code would be too long.
+    The system is separable, with T = ½ pᵀM⁻¹p. `drifts` tells where their numbers stand among those of all stages. A
+    ValueError if a function in H has no counterpart in compiled code, or the code would be too long.
     """
 
     def __init__(
         self,
-        symbols: SymbolicHamiltonian,
+        symbols: SymbolicHamiltonian | TracedHamiltonian,
         kicks: Sequence[bool],
         level: int,
         monomials: Monomials,
@@ -76,7 +59,9 @@ class TableLoops:
         self.kicks, self.friction = np.array(kicks, dtype=np.int64), friction
         self.values = np.array([*form.values, 0.0], dtype=np.float64)
         self._driven = symbols.time is not None
-        self._inverse_mass = np.array(symbols.inverse_mass, dtype=np.float64)
+        mass = form.inverse_mass
+        assert mass is not None
+        self._inverse_mass = np.array([[mass[i, j] for j in range(d)] for i in range(d)], dtype=np.float64)
         damping = tuple(tuple(map(float, row)) for row in friction.matrix(d)) if friction else None
         self._maps = _maps(form, level, monomials, damping)
         sizes = [self._maps.terms if kick else 1 for kick in kicks]
@@ -222,7 +207,11 @@ def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def table_loops(
-    symbols: SymbolicHamiltonian, kicks: Sequence[bool], level: int, monomials: Monomials, friction: Friction
+    symbols: SymbolicHamiltonian | TracedHamiltonian,
+    kicks: Sequence[bool],
+    level: int,
+    monomials: Monomials,
+    friction: Friction,
 ) -> TableLoops | None:
     """The loops; None of a system that has no compiled form, or one too long."""
     if symbols.samples:
@@ -235,7 +224,10 @@ def table_loops(
 
 @lru_cache(maxsize=64)
 def _maps(
-    form: SymbolicHamiltonian, level: int, monomials: Monomials, friction: tuple[tuple[float, ...], ...] | None
+    form: SymbolicHamiltonian | TracedHamiltonian,
+    level: int,
+    monomials: Monomials,
+    friction: tuple[tuple[float, ...], ...] | None,
 ) -> _Maps:
     return _Maps(form, level, monomials, friction)
 
@@ -244,7 +236,11 @@ class _Maps:
     """The kicks and drifts of a system, with what their derivatives need, and the functions that are made of them."""
 
     def __init__(
-        self, form: SymbolicHamiltonian, level: int, monomials: Monomials, friction: Sequence[Sequence[float]] | None
+        self,
+        form: SymbolicHamiltonian | TracedHamiltonian,
+        level: int,
+        monomials: Monomials,
+        friction: Sequence[Sequence[float]] | None,
     ) -> None:
         assert form.inverse_mass is not None
         self.form, self.level, self.monomials, self.friction = form, level, monomials, friction

@@ -21,7 +21,7 @@ from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import Carry, Task, run_states
+from sympflow.kernels.protocol import RunCheckpoint, Task, run_states
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import Shape, Splitting, SplittingCode, shared
@@ -41,17 +41,10 @@ LOG_2 = float(np.log(2.0))
 class TangentRun(NamedTuple):
     """Deviation vectors along N orbits.
 
-    Attributes
-    ----------
-    growth : ndarray of shape (N, k, n + 1)
-        Logarithms of the lengths of the vectors, 0 at the start, after the n counts of steps that were to be saved, and
-        at the end of the orbit. NaN where the orbit has ended before.
-    spread : ndarray of shape (N, n + 1)
-        Of the vectors, as the function that was given tells it.
-    n_steps : ndarray of int64 of shape (N,)
-        The steps of each orbit.
-    whole : ndarray of bool of shape (N,)
-        False where something was not finite any more; then `n_steps` is the last step after which all was.
+    `growth` (N, k, n + 1) are logarithms of the lengths of the vectors, 0 at the start, after the n counts of steps
+    that were to be saved and at the end, NaN where the orbit has ended before; `spread` (N, n + 1) is what the function
+    that was given tells of them; `n_steps` (N,) are the steps of each orbit. `whole` (N,) is False where something was
+    not finite any more; then `n_steps` is the last step after which all was.
     """
 
     growth: np.ndarray
@@ -155,13 +148,7 @@ def _place(i: int, j: int) -> int:
 class TangentCode(SplittingCode):
     """The compiled functions of a splitting with k vectors: states are [q, p, w₁ …], then exponents of the vectors.
 
-    Parameters
-    ----------
-    splitting : Splitting
-    vectors : int
-        k.
-    grows : bool
-        True if vectors are rescaled, by powers of two, whose exponents are part of the state.
+    These are there if it `grows`: vectors are rescaled, by powers of two.
     """
 
     def __init__(self, splitting: Splitting, vectors: int, grows: bool) -> None:
@@ -263,25 +250,11 @@ class TangentKernel:
         scale: np.ndarray | None = None,
         threads: int | None = None,
     ) -> TangentRun:
-        """`n_steps` steps of length h of every row of `y0`.
+        """`n_steps` steps of length h of every row of `y0` (N, 2d), with vectors `w0` (k, 2d) at the start of each.
 
-        Parameters
-        ----------
-        h : float
-        y0 : ndarray of shape (N, 2d)
-        w0 : ndarray of shape (k, 2d)
-            The vectors at the start of each orbit.
-        n_steps : int
-        save : ndarray of int64, sorted, in 1 … n_steps
-            The steps after which growth and spread are kept.
-        spread : callable, optional
-            From vectors (M, 2d, k), multiplied by `scale`, to numbers (M,); NaN without.
-        limit : float
-            An orbit ends where the spread is below it, which is looked at after every 256 steps.
-        scale : ndarray of shape (2d,), optional
-            Lengths are those of scale·w; 1 by default.
-        threads : int, optional
-            The default is as many as pay.
+        Growth and spread are kept after the steps of `save`, 1 … n_steps. ``spread(W)`` is of vectors (M, 2d, k),
+        multiplied by `scale` (2d,), as are lengths; an orbit ends where it is below the `limit`, which is looked at
+        every 256 steps.
         """
         N, k, n = len(y0), self.vectors, self._code.n_out
         start = np.zeros((N, n))
@@ -297,7 +270,7 @@ class TangentKernel:
         table = self._loops.rows(run_table(self._scheme, h), h)
         width = self._width
 
-        def follow(looks: np.ndarray, rows: np.ndarray, carry: Carry) -> np.ndarray:
+        def follow(looks: np.ndarray, rows: np.ndarray, carry: RunCheckpoint) -> np.ndarray:
             """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
             work = table.shape[1] * self._code.n_out / 2
             task = Task(0.0, start[rows], int(looks[-1]), looks, carry, threads=threads)
@@ -327,7 +300,7 @@ class TangentKernel:
 
         size = max(64, AT_ONCE // (n * some))
         for first in range(0, N, size):
-            rows, carry = np.arange(first, min(first + size, N)), Carry()
+            rows, carry = np.arange(first, min(first + size, N)), RunCheckpoint()
             for i in range(0, len(looks), some):
                 ended = follow(looks[i : i + some], rows, carry)
                 if ended.any():
@@ -346,13 +319,7 @@ def _looks(save: np.ndarray, n_steps: int, limit: float) -> np.ndarray:
 
 
 def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool) -> TangentCode:
-    """The compiled functions of splittings of a system with k vectors, made once.
-
-    Raises
-    ------
-    ValueError
-        If there are none, with the reason.
-    """
+    """The compiled functions of a system with k vectors, made once; a ValueError says why there are none."""
     codes, key = _CODES.setdefault(system, {}), (level, monomials, vectors, grows)
     if key not in codes:
         codes[key] = _lacks(system)

@@ -20,6 +20,7 @@ from sympflow.compiler.control import INT, Type, Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
 from sympflow.kernels.runs import BLOCK
+from sympflow.kernels.stages import evaluated
 from sympflow.kernels.threads import NEVER, threads_for
 
 __all__ = ["Member", "SharedRollouts", "Team", "meet"]
@@ -33,13 +34,7 @@ _I32 = Type("i32")
 
 
 class Team:
-    """So many threads.
-
-    Parameters
-    ----------
-    threads : int
-        One, where threads cannot leave a core.
-    """
+    """So many threads; one, where threads cannot leave a core."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads if os.name == "posix" else 1
@@ -117,16 +112,9 @@ class Member:
 
 
 class SharedRollouts(SplittingRollouts):
-    """The compiled functions of systems of any size, whose states are in memory and which threads may share.
+    """Rollouts of systems of any size, whose states are in memory and which threads may share.
 
-    Attributes
-    ----------
-    work : int
-        About how many nanoseconds a stage takes.
-    pieces : int
-        Most threads that it is worth to share.
-    terms : int
-        Numbers of a kick.
+    A stage takes about `work` nanoseconds, it is worth `pieces` threads at most, a kick has so many `terms`.
     """
 
     lanes = 1
@@ -173,10 +161,11 @@ class SharedRollouts(SplittingRollouts):
         self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
     ) -> None:
         """One step of length ``h[i]`` from every row of `y`, by numbers that are polynomials of ``x[i]``."""
-        numbers = np.zeros((*table.shape[:2], len(h)))
-        for k in range(table.shape[2] - 1, -1, -1):
-            numbers = numbers * x + table[:, :, k, None]
         powers = np.array([1, 1, 3, 5])[: len(table)]
-        tables = (numbers * h ** powers[:, None, None]).transpose(2, 0, 1)
-        for i, each in enumerate(tables):
-            self.mapped(each, y[i : i + 1], out[i : i + 1])
+        out[:] = self.own_steps((evaluated(table, x) * h ** powers[:, None, None]).reshape(len(table), -1), y)
+
+    def own_steps(self, table: np.ndarray, y: np.ndarray) -> np.ndarray:
+        out, tables = np.empty_like(y), table.reshape(len(table), -1, len(y))
+        for i in range(len(y)):
+            self.mapped(tables[..., i], y[i : i + 1], out[i : i + 1])
+        return out

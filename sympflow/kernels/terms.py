@@ -8,7 +8,6 @@ however many there are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,16 +55,7 @@ def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
 
 
 class Family(NamedTuple):
-    """Terms Σ_n f(x = q[coordinates[n]], c = constants[n]).
-
-    Attributes
-    ----------
-    f : Expr
-        In the symbols x and c.
-    x, c : tuple of Symbol
-    coordinates : ndarray of int, shape (N, k)
-    constants : ndarray of shape (N, m)
-    """
+    """Terms Σ_n f(x = q[coordinates[n]], c = constants[n]), f in the symbols x and c."""
 
     f: sp.Expr
     x: tuple[sp.Symbol, ...]
@@ -179,22 +169,14 @@ def _constant(f: sp.Basic) -> _Tree | None:
 class Terms:
     """A function as the terms of each kind, whose derivatives are added up by loops over these.
 
-    Parameters
-    ----------
-    f : Expr
-    variables : sequence of Symbol
-    letters : sequence of Symbol
-        What else is in f, numbers of a stage.
-
-    Attributes
-    ----------
-    data : list of ndarray
-        How many terms each kind has, then the coordinates and the constants of each kind.
+    The `letters` are what else is in f, numbers of a stage. `data` has how many terms each kind has, then the
+    coordinates and the constants of each kind.
     """
 
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
         self._given = f, tuple(variables), tuple(letters)
         self._families, self._letters = families(f, variables), tuple(letters)
+        self._programs: dict[tuple[int, bool], list[Program]] = {}
         self.data = [np.array([len(family.coordinates) for family in self._families], dtype=np.int64)]
         for family in self._families:
             self.data += [family.coordinates.astype(np.int64), family.constants]
@@ -213,20 +195,12 @@ class Terms:
             )
         return self
 
-    @cached_property
-    def slopes(self) -> list[Program]:
-        """∇f of a term of each kind."""
-        return [self._derived(family, 0) for family in self._families]
-
-    @cached_property
-    def products(self) -> list[Program]:
-        """∇²f v."""
-        return [self._derived(family, 1) for family in self._families]
-
-    @cached_property
-    def bends(self) -> list[Program]:
-        """½ ∇³f(v, v)."""
-        return [self._derived(family, 2) for family in self._families]
+    def derivatives(self, times: int, bends: bool = False) -> list[Program]:
+        """Of a term of each kind ∇f, ∇²f v or ½ ∇³f(v, v), by the times along v; their own derivatives behind."""
+        key = times, bends
+        if key not in self._programs:
+            self._programs[key] = [self._derived(family, *key) for family in self._families]
+        return self._programs[key]
 
     def _derived(self, family: Family, times: int, bends: bool = False) -> Program:
         """∇f, that often differentiated along v, and divided by the factorial; with its own derivatives."""
@@ -246,11 +220,6 @@ class Terms:
         found = traced(slopes, *names)(*made.states)
         return made.finish([made.written(made.number(y)) for y in found]).body
 
-    @cached_property
-    def hessians(self) -> list[Program]:
-        """∇f, and ∇²f row by row."""
-        return [self._derived(family, 0, True) for family in self._families]
-
     def add(
         self,
         data: Sequence[Value],
@@ -259,16 +228,9 @@ class Terms:
         letters: Sequence[Any],
         targets: Callable[[list[Value]], list[tuple[Rows, Value]]],
     ) -> None:
-        """Add derivatives of the terms of each kind to numbers in memory.
+        """Add derivatives of the terms of each kind to numbers in memory: from the addresses of the arrays in `data`.
 
-        Parameters
-        ----------
-        data : sequence of Value
-            Addresses of the arrays in `data`.
-        given : sequence of Rows
-            What the coordinates of a term are numbers of.
-        targets : callable
-            From the places of a term's coordinates to where its derivatives go.
+        The coordinates of a term are numbers of `given`; ``targets(places)`` are where its derivatives go.
         """
         code, type = given[0].code, given[0].type
         for k, (family, program) in enumerate(zip(self._families, derivatives, strict=True)):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,9 +25,13 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
 from sympflow.integrators.steppers import compiled_loops
-from sympflow.metrics.orbits import Orbits, checked_orbits
-from sympflow.show.cards import Card, Shown, numbers
+from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
+from sympflow.show.cards import Card, numbers
+from sympflow.show.pictures import curves_figure
 from sympflow.systems.given import given_system
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ALIGNED = 1e-12
 """Below this SALI and GALI an orbit is chaotic for sure, and ends: what is left is rounding."""
@@ -38,7 +42,7 @@ LOG_2 = float(np.log(2.0))
 
 
 @dataclass(frozen=True, repr=False)
-class Indicator(Shown):
+class Indicator(OfOrbits):
     """A chaos indicator of each orbit, at its end and at the times that were asked for.
 
     Attributes
@@ -70,10 +74,11 @@ class Indicator(Shown):
         facts = {"value": numbers(self.value), "t_end": numbers(self.t_end), "status": numbers(self.status)}
         return Card("Indicator of chaos", facts, self.message)
 
-    @property
-    def success(self) -> bool:
-        """True if no orbit failed."""
-        return bool(np.all(np.asarray(self.status) >= 0))
+    def drawn(self) -> Figure:
+        if len(self.t):
+            curves = self.history.reshape(-1, len(self.t))
+            return curves_figure(self.t, curves, ("t", "indicator"), "Indicator of chaos")
+        return of_many("indicator", self.value, "give `t_eval` to see it over time")
 
 
 def lyapunov(
@@ -398,7 +403,7 @@ def _by_arrays(orbits: Orbits, w0: np.ndarray, scale: np.ndarray, times: np.ndar
         run.spread[rows, column] = _spread(scaled(W[rows]), kind)
         run.elapsed[rows, column] = elapsed[rows]
 
-    for t, h, move in orbits.integrator.pushing(orbits.system, orbits.t_span, orbits.rows):
+    for t, h, move in orbits.integrator.jvp_steps(orbits.system, orbits.t_span, orbits.rows):
         ends = t + h - t0
         if n:
             due = running & (position < n)
@@ -472,7 +477,7 @@ def _reported(run: _Run, orbits: Orbits, times: np.ndarray, kind: int, below: fl
         first = int(np.argmax(run.status < 0))
         message = (
             f"{n_failed} of {len(values)} orbits ceased to be finite, the first of them (index {first}) after t = "
-            f"{orbits.t_span[0] + run.elapsed[first, -1]:.17g}. Reduce `dt`, or end `t_span` earlier."
+            f"{orbits.t_span[0] + run.elapsed[first, -1]:.15g}. Reduce `dt`, or end `t_span` earlier."
         )
     elif n_aligned:
         message = f"{n_aligned} of {len(values)} orbits ended early: the index fell below {below:g}."

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,11 +14,14 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
-from sympflow.integrators.impulses import landings
+from sympflow.integrators.impulses import landings, pieces_of
 from sympflow.integrators.registry import naming_plugin
-from sympflow.metrics.orbits import Orbits, checked_orbits
-from sympflow.show.cards import Card, Shown, numbers
+from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
+from sympflow.show.cards import Card, numbers
 from sympflow.systems.given import given_system
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WINDOW = 256  # steps between which orbits that have left are put aside
 MOST_VALUES = 1 << 21  # numbers of states that are held at a time
@@ -28,7 +31,7 @@ Outside = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, repr=False)
-class Escapes(Shown):
+class Escapes(OfOrbits):
     """When and where orbits left a region.
 
     Attributes
@@ -52,10 +55,8 @@ class Escapes(Shown):
         facts = {"time": numbers(self.time), "state": numbers(self.state), "status": numbers(self.status)}
         return Card("Escapes", facts, self.message)
 
-    @property
-    def success(self) -> bool:
-        """True if no orbit failed."""
-        return bool(np.all(np.asarray(self.status) >= 0))
+    def drawn(self) -> Figure:
+        return of_many("time of escape", self.time, "it is `time`")
 
 
 def escape_times(
@@ -197,7 +198,7 @@ def escapes(orbits: Orbits, region: Outside, backend: str) -> tuple[np.ndarray, 
             f"`method` {integrator.name!r} has no fixed steps of the states, after which escapes are looked for: use "
             "a splitting method such as 'kahan_li8', or 'gauss_legendre6'."
         )
-    told, _ = landings(integrator, orbits.system, *orbits.t_span, able=False)
+    told, _ = landings(integrator, orbits.system, *orbits.t_span)
     if told:
         warn(told, RuntimeWarning)
     rows = orbits.rows
@@ -212,43 +213,44 @@ def _escapes(
     integrator: FixedStep, orbits: Orbits, rows: np.ndarray, region: Outside, backend: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     system, (t0, t1) = orbits.system, orbits.t_span
-    grid = Grid(t0, t1, integrator.step_length(system))
     time, state = np.full(len(rows), np.inf), np.full(rows.shape, np.nan)
     status = np.zeros(len(rows), dtype=np.int64)
     began = ~_inside(region, rows)
     time[began], state[began], status[began] = t0, rows[began], 1
     where = np.flatnonzero(~began)
-    y, k = rows[where], 0
-    total = grid.n_steps + bool(grid.remainder)
-    while k < total and where.size:
-        n = min(WINDOW, grid.n_steps - k)
-        stepper = integrator.stepper(Problem(system, grid.time(k), t1, y, backend=backend))
-        with np.errstate(all="ignore"):
-            if n:
-                h = grid.h
-                states, _ = stepper.rollout(y, h, n, np.arange(n + 1), grid.time(k))
-            else:
-                n, h = 1, grid.remainder
-                states = np.stack([y, integrator.step(system, grid.time(k), y, h)])
-        finite = np.isfinite(states).all(-1)
-        left = ~finite
-        left[finite] = ~_inside(region, states[finite])
-        gone = left.any(0)
-        first = np.argmax(left, axis=0)
-        lanes = np.flatnonzero(gone)
-        before = states[first[lanes] - 1, lanes]
-        escaped = finite[first[lanes], lanes]
-        status[where[lanes]] = np.where(escaped, 1, -1)
-        time[where[lanes]] = np.nan
-        found = where[lanes[escaped]]
-        begin = grid.t0 + (k + first[lanes[escaped]] - 1) * grid.h
-        groups = [slice(None)] if system.autonomous else [slice(i, i + 1) for i in range(len(found))]
-        for i in groups:  # together, or each at its own time
-            if len(found[i]):
-                part, state[found[i]] = _located(integrator, system, begin[i][0], before[escaped][i], h, region)
-                time[found[i]] = begin[i] + part
-        y, where = states[-1, ~gone], where[~gone]
-        k += n
+    y = rows[where]
+    for start, end in pieces_of(integrator, system, t0, t1):
+        grid, k = Grid(start, end, integrator.step_length(system)), 0
+        total = grid.n_steps + bool(grid.remainder)
+        while k < total and where.size:
+            n = min(WINDOW, grid.n_steps - k)
+            stepper = integrator.stepper(Problem(system, grid.time(k), end, y, backend=backend))
+            with np.errstate(all="ignore"):
+                if n:
+                    h = grid.h
+                    states, _ = stepper.rollout(y, h, n, np.arange(n + 1), grid.time(k))
+                else:
+                    n, h = 1, grid.remainder
+                    states = np.stack([y, integrator.step(system, grid.time(k), y, h)])
+            finite = np.isfinite(states).all(-1)
+            left = ~finite
+            left[finite] = ~_inside(region, states[finite])
+            gone = left.any(0)
+            first = np.argmax(left, axis=0)
+            lanes = np.flatnonzero(gone)
+            before = states[first[lanes] - 1, lanes]
+            escaped = finite[first[lanes], lanes]
+            status[where[lanes]] = np.where(escaped, 1, -1)
+            time[where[lanes]] = np.nan
+            found = where[lanes[escaped]]
+            begin = grid.t0 + (k + first[lanes[escaped]] - 1) * grid.h
+            groups = [slice(None)] if system.autonomous else [slice(i, i + 1) for i in range(len(found))]
+            for i in groups:  # together, or each at its own time
+                if len(found[i]):
+                    part, state[found[i]] = _located(integrator, system, begin[i][0], before[escaped][i], h, region)
+                    time[found[i]] = begin[i] + part
+            y, where = states[-1, ~gone], where[~gone]
+            k += n
     return time, state, status
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,10 +14,14 @@ from sympflow.arguments import check_counts
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.grid import Grid
-from sympflow.metrics.orbits import Orbits, checked_orbits
-from sympflow.show.cards import Card, Shown, numbers
+from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits
+from sympflow.show.cards import Card, numbers
+from sympflow.show.pictures import curves_figure
 from sympflow.solver import solve
 from sympflow.systems.given import given_system
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MOST_SAMPLES = 1 << 16
 """Samples of an orbit, unless more are asked for: at every step, or at every few of a longer run."""
@@ -32,7 +36,7 @@ Signal = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, repr=False)
-class Frequencies(Shown):
+class Frequencies(OfOrbits):
     """The lines Σ_k a_k exp(iω_k (t − t0)) of signals along orbits.
 
     Attributes
@@ -56,10 +60,12 @@ class Frequencies(Shown):
         facts = {"frequencies": numbers(self.frequencies), "amplitudes": numbers(np.abs(self.amplitudes))}
         return Card("Frequencies", {**facts, "status": numbers(self.status)}, self.message)
 
-    @property
-    def success(self) -> bool:
-        """True if no orbit failed."""
-        return bool(np.all(np.asarray(self.status) >= 0))
+    def drawn(self) -> Figure:
+        n = self.frequencies.shape[-1]
+        lines, sizes = self.frequencies.reshape(-1, n), np.abs(self.amplitudes).reshape(-1, n)
+        if not np.isfinite(lines).any():
+            raise ValueError("no line was found: `message` says why.")
+        return curves_figure(lines, sizes, ("angular frequency", "amplitude"), "Frequencies", bars=True)
 
 
 def frequencies(

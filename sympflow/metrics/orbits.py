@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +17,52 @@ from sympflow.integrators.choosing import integrator_for
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import check_applies
+from sympflow.show.cards import Shown
+from sympflow.show.pictures import histogram_figure
+from sympflow.show.style import saved
 from sympflow.systems.given import given_system
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class OfOrbits(Shown):
+    """What was found of each orbit: it has a `status`, negative of orbits that failed, and a figure."""
+
+    status: Any
+
+    @property
+    def success(self) -> bool:
+        """True if no orbit failed."""
+        return bool(np.all(np.asarray(self.status) >= 0))
+
+    @abstractmethod
+    def drawn(self) -> Figure:
+        """Return the figure; a ValueError if there is nothing to draw."""
+
+    def preview(self) -> Figure | None:
+        try:
+            return self.drawn()
+        except ValueError:
+            return None
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
+        """Draw what was found. With a `path` (.png, .pdf or .svg) the figure is saved too; matplotlib is needed.
+
+        Raises
+        ------
+        ValueError
+            If there is nothing to draw: one number, or none that is finite.
+        """
+        return saved(self.drawn(), path)
+
+
+def of_many(name: str, values: Any, remedy: str) -> Figure:
+    """Return the histogram of a number of each orbit; a ValueError with the remedy where there are fewer than two."""
+    values = np.ravel(values)
+    if np.count_nonzero(np.isfinite(values)) < 2:
+        raise ValueError(f"there are not two orbits with a finite {name}, and a histogram needs them: {remedy}.")
+    return histogram_figure({name: values}, f"{len(values):,} orbits")
 
 
 class Orbits(NamedTuple):

@@ -112,6 +112,25 @@ def histogram_figure(values: dict[str, np.ndarray], title: str) -> Figure:
     return figure
 
 
+def curves_figure(x: np.ndarray, curves: np.ndarray, labels: tuple[str, str], title: str, bars: bool = False) -> Figure:
+    """Curves (N, n) over x, (n,) or (N, n), positive ones on a logarithmic scale; as bars where x is not in order."""
+    figure = new_figure(4.2, 3.3)
+    ax = figure.subplots()
+    curves = curves[:MOST_LINES]
+    _lines(
+        ax, np.broadcast_to(x, (len(x) if x.ndim > 1 else len(curves), x.shape[-1]))[: len(curves)], curves, "o" * bars
+    )
+    if bars:
+        ax.vlines(
+            np.ravel(x[: len(curves)]), np.nanmin(curves) / 10, np.ravel(curves), lw=0.8, color="#999999", zorder=1
+        )
+    if np.nanmin(curves, initial=np.inf) > 0 and np.isfinite(curves).any():
+        ax.set_yscale("log")
+    dress(ax, *labels)
+    figure.suptitle(filled(title, 4.0, 10), fontsize=10, color=TEXT)
+    return figure
+
+
 def points_figure(x: np.ndarray, y: np.ndarray, labels: tuple[str, str], title: str) -> Figure:
     """Points (N,) in a plane."""
     figure = new_figure(4.2, 3.8)

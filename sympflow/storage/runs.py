@@ -38,7 +38,7 @@ class Place:
     ----------
     steps : int
     running : ndarray
-        The running state of its loops: see `kernels.protocol.Carry`.
+        The running state of its loops: see `kernels.protocol.RunCheckpoint`.
     finite : ndarray of int
         The last finite step of each trajectory.
     state : ndarray of shape (..., K)

@@ -233,7 +233,7 @@ def _check_metrics(metrics: Sequence[str]) -> tuple[str, ...]:
     asked = (metrics,) if isinstance(metrics, str) else tuple(metrics)
     unknown = [m for m in asked if m not in METRICS]
     if unknown:
-        raise ValueError(f"`metrics` has no {unknown[0]!r}: choose from {', '.join(METRICS)}.")
+        raise ValueError(f"`metrics` has no {unknown[0]!r}: choose from {', '.join(METRICS)}; times are `t_span`.")
     return asked
 
 

@@ -13,20 +13,7 @@ NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
 
 
 def given_system(system: Any) -> HamiltonianSystem:
-    """Return the system that an argument `system` means.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem, str or sympy.Expr
-        A system; the name of a scene, such as "henon-heiles"; or H, as `HamiltonianSystem.from_sympy` takes it.
-
-    Raises
-    ------
-    ValueError
-        If there is no such scene, or the formula cannot be read.
-    TypeError
-        If it is anything else: the message says how a system is made of it.
-    """
+    """Return the system that an argument means: one, the name of a scene, or H as `from_sympy` takes it."""
     if isinstance(system, HamiltonianSystem):
         return system
     if isinstance(system, str):

@@ -84,18 +84,8 @@ def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSyste
 def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[..., HamiltonianSystem]:
     """The function that makes the system of a file; its parameters are those of the system, with their defaults.
 
-    Parameters
-    ----------
-    path : str or path
-        A .toml file; or a .py file, which is run, as `python file.py` would, but for its ``__main__`` part.
-    name : str, optional
-        What to take from a .py file: a HamiltonianSystem, or a function that returns one. It may be left out where the
-        file has one system only.
-
-    Raises
-    ------
-    ValueError
-        If the file is missing, cannot be run, or has no system of that name.
+    A .py file is run, as `python file.py` would, but for its ``__main__`` part; the name is that of a HamiltonianSystem
+    in it, or of a function that returns one, and may be left out where there is one only.
     """
     file = Path(path)
     if file.suffix == ".toml":

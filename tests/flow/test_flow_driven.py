@@ -10,7 +10,7 @@ import torch
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, SympFlow, solve
-from sympflow.training.table_step import ArrayForces, TableStep
+from sympflow.training.table_step import TableStep
 
 DT, T0, W = 0.4, 1.3, 2.7
 
@@ -132,24 +132,12 @@ def test_the_derivatives_of_a_step_by_its_numbers(damping, level):
     step = TableStep(driven(damping=damping), ("drift", "kick", "drift", "kick", "drift"), level)
     rng = np.random.default_rng(0)
     c, y, t = 0.4 * rng.normal(size=(step.n_coefficients, 4)), 0.3 * rng.normal(size=(2, 4)), 3 * rng.random(4)
-    for derivatives in (step._forward, step._backward):
-        at, J = derivatives(c, y, lambda: None, t)
-        np.testing.assert_allclose(at, step(c, y, t0=t), atol=1e-14)
-        for k in range(len(c)):
-            e = np.zeros_like(c)
-            e[k] = 1e-6
-            np.testing.assert_allclose(J[k], (step(c + e, y, t0=t) - step(c - e, y, t0=t)) / 2e-6, atol=1e-8)
-
-
-def test_forces_of_arrays_are_those_of_symbols(system):
-    """They are differences in t, as of a system of plain functions, or of samples."""
-    step, arrays = (TableStep(system, ("drift", "kick", "drift", "kick", "drift"), 1) for _ in range(2))
-    arrays._forces = ArrayForces(system, 1)
-    rng = np.random.default_rng(1)
-    c, y, t = 0.4 * rng.normal(size=(step.n_coefficients, 4)), 0.3 * rng.normal(size=(2, 4)), 3 * rng.random(4)
-    for name in ("_forward", "_backward"):
-        for one, other in zip(*(getattr(s, name)(c, y, lambda: None, t) for s in (step, arrays)), strict=True):
-            np.testing.assert_allclose(one, other, atol=1e-8)
+    at, J = step.with_jacobian(c, y, t0=t)
+    np.testing.assert_allclose(at, step(c, y, t0=t), atol=1e-14)
+    for k in range(len(c)):
+        e = np.zeros_like(c)
+        e[k] = 1e-6
+        np.testing.assert_allclose(J[k], (step(c + e, y, t0=t) - step(c - e, y, t0=t)) / 2e-6, atol=1e-7)
 
 
 def test_a_drive_given_by_samples_is_fitted(plain):

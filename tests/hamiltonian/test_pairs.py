@@ -62,7 +62,7 @@ class TestFunctions:
         q = system.y0[: system.ndof, None] + 0.01 * rng.standard_normal((system.ndof, 3))
         v = rng.standard_normal((2, *q.shape))
         compiled, arrays = PairForces(system.local, 1), ArrayForces(system, 1)
-        for name, given in (("values", (q,)), ("along", (q, v)), ("all", (q,))):
+        for name, given in (("values", (q,)), ("along", (q, v))):
             found, known = (getattr(forces, name)(*given) for forces in (compiled, arrays))
             for one, other in zip(found, known, strict=True):
                 scale = np.abs(other).max()  # of differences, in the slope of the gradient

@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 
 import sympflow
 from sympflow import HamiltonianSystem, get, solve
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 made = HamiltonianSystem.from_sympy
 SCENE = {"time": "t", "t_span": (0.3, 2.3), "dt": 0.05}
@@ -89,10 +89,10 @@ def test_a_run_that_is_cut_goes_on_at_its_time():
     composition = method.composed(COPIES)
     kernel, start = composition.kernel(False), composition.lift(np.stack([COPIES.y0, 1.1 * COPIES.y0]))
     whole = kernel.run(0.05, start, 9, np.array([4, 9]), t0=0.3).states
-    carry = Carry()
+    carry = RunCheckpoint()
     pieces = [kernel.run(0.05, start, n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]
     np.testing.assert_array_equal(np.concatenate(pieces, axis=1), whole)
-    one, carry = kernel.run(0.05, start[0], 9, np.array([4, 9]), t0=0.3).states, Carry()
+    one, carry = kernel.run(0.05, start[0], 9, np.array([4, 9]), t0=0.3).states, RunCheckpoint()
     pieces = [kernel.run(0.05, start[0], n, np.array([n]), carry=carry, t0=0.3).states for n in (4, 9)]
     np.testing.assert_array_equal(np.concatenate(pieces), one)
 

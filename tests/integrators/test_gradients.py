@@ -197,3 +197,95 @@ def test_dense_output_has_the_gradients_of_outputs():
         state = sol.y[:, 0] if sol.sol is None else sol.sol(1.234)
         found.append(torch.autograd.grad(state.sum(), y)[0])
     torch.testing.assert_close(*found, rtol=1e-13, atol=0)
+
+
+class Coordinates(torch.nn.Module):
+    """V of an angle and a distance, with a term that is known."""
+
+    def __init__(self):
+        super().__init__()
+        self.layers = torch.nn.ModuleList([torch.nn.Linear(3, 7, bias=False), torch.nn.Linear(7, 5)])
+        self.end = torch.nn.Linear(5, 2)
+
+    def forward(self, q):
+        x = torch.stack([torch.sin(q[..., 0]), torch.cos(q[..., 0]), q[..., 1]], -1)
+        for layer in self.layers:
+            x = torch.nn.functional.silu(layer(x))
+        a = self.end(x)
+        return a[..., 0] * a[..., 1] + 0.5 * (q**2).sum(-1)
+
+
+def network(kind):
+    torch.manual_seed(2)
+    linear, tanh = torch.nn.Linear, torch.nn.Tanh
+    made = {
+        "two layers": lambda: torch.nn.Sequential(linear(2, 9), tanh(), linear(9, 8), tanh(), linear(8, 1)),
+        "one layer": lambda: torch.nn.Sequential(linear(2, 1)),
+        "coordinates": Coordinates,
+    }[kind]().double()
+    return made, lambda q: made(q).reshape(q.shape[:-1])
+
+
+@pytest.mark.parametrize("kind", ["two layers", "one layer", "coordinates"])
+@pytest.mark.parametrize(("method", "run"), [("verlet", RUNS[0]), ("kahan_li8", RUNS[2]), ("verlet", RUNS[3])])
+@pytest.mark.parametrize("batch", [(), (3, 7)])
+def test_weights_of_a_network_in_H(kind, method, run, batch):
+    net, V = network(kind)
+    system = HamiltonianSystem(V, ndof=2, mass=[1.0, 2.0])
+    y0, found = start(system, batch), []
+    for backend in ("compiled", "array"):
+        y = torch.tensor(y0, requires_grad=True)
+        sol = solve(system, method, y0=y, backend=backend, **run)
+        assert sol.stats["backend"] == {"compiled": "compiled", "array": "torch"}[backend]
+        gradients = torch.autograd.grad(weighted(sol), [y, *net.parameters()], allow_unused=True)
+        found.append([sol.y.detach(), *(g for g in gradients if g is not None and g.abs().max() > 0)])
+    for compiled, expected in zip(*found, strict=True):
+        torch.testing.assert_close(compiled, expected, rtol=0, atol=1e-12 * float(expected.abs().max()))
+    np.testing.assert_array_equal(solve(system, method, y0=y0, **run).y, found[0][0].numpy())
+
+
+def test_weights_are_arguments():
+    """A step of an optimizer changes the run, and nothing is compiled again; what is not followed is refused."""
+    net, V = network("two layers")
+    system, y0 = HamiltonianSystem(V, ndof=2), start(CUBIC, (3,))
+    solve(system, "verlet", (0, 1), y0, dt=0.1)
+    with torch.no_grad():
+        net[2].weight *= 1.5
+    again = solve(system, "verlet", (0, 1), y0, dt=0.1)
+    np.testing.assert_array_equal(again.y, solve(HamiltonianSystem(V, ndof=2), "verlet", (0, 1), y0, dt=0.1).y)
+    net[2] = torch.nn.Linear(9, 8).double()
+    with pytest.raises(ValueError, match=r"^`potential` has another value than when it was traced"):
+        solve(system, "verlet", (0, 1), y0, dt=0.1)
+
+
+def test_networks_that_are_no_chain_run_as_arrays():
+    net, V = network("two layers")
+    system = HamiltonianSystem(lambda q: V(q) + V(q + 0.1), ndof=2)
+    sol = solve(system, "verlet", (0, 1), torch.tensor(start(system, ())), dt=0.1)
+    assert sol.stats["backend"] == "torch"
+    assert "its layers are no chain" in repr(system)
+    assert torch.autograd.grad(sol.y.sum(), net[0].weight)[0].abs().max() > 0
+
+
+def test_second_derivatives_by_weights_through_two_runs():
+    net, V = network("two layers")
+    system, found = HamiltonianSystem(V, ndof=2), []
+    for backend in ("compiled", "array"):
+        middle = solve(system, "verlet", (0, 0.5), torch.tensor(start(system, (2,))), dt=0.1, backend=backend).y[
+            ..., -1
+        ]
+        end = solve(system, "verlet", (0, 0.5), middle, dt=0.1, t_eval=[0.5], backend=backend).y
+        first = torch.autograd.grad((end**2).sum(), [p for p in net.parameters() if p.numel() > 1], create_graph=True)
+        found.append(torch.autograd.grad(sum((g**2).sum() for g in first), net[2].weight)[0])
+    torch.testing.assert_close(*found, rtol=1e-11, atol=1e-14)
+
+
+def test_rows_that_become_infinite_add_nothing_to_derivatives_by_weights():
+    net, _ = network("two layers")
+    system = HamiltonianSystem(lambda q: net(q)[..., 0] ** 2 - (q**4).sum(-1), ndof=2)
+    y0 = np.array([[0.1, 0.0, 0.2, 0.1], [0.0, 30.0, 0.0, 30.0], [0.0, 0.1, 0.3, 0.0]])
+    found = []
+    for rows in ([0, 1, 2], [0, 2]):
+        sol = solve(system, "verlet", (0, 2), torch.tensor(y0[rows]), dt=0.1, diagnose=False)
+        found.append(torch.autograd.grad(sol.y[0].sum() + sol.y[-1].sum(), net[0].weight)[0])
+    torch.testing.assert_close(*found, rtol=1e-13, atol=0)

@@ -169,6 +169,15 @@ def test_two_bodies_on_a_line_do_not_pass_each_other():
     assert "passed q1 - q2 = 0" in sol.message
 
 
+@pytest.mark.parametrize("backend", ["array", "compiled"])
+@pytest.mark.parametrize("method", ["verlet", "chin4a", "gauss_legendre4"])
+def test_where_no_piece_holds_there_is_no_force(method, backend):
+    system = HamiltonianSystem.from_sympy("p**2/2 + Piecewise((q**2, q < 1))")
+    sol = sf.solve(system, method, (0, 2), [0.5, 2.0], dt=0.1, backend=backend)
+    assert sol.status == -1
+    assert sol.y[0].max() < 1.2
+
+
 def test_a_start_without_h_is_told():
     system = HamiltonianSystem.from_sympy("p**2/2 + log(q)")
     sol = sf.solve(system, "verlet", (0, 1), [[1.0, 0.0], [-1.0, 0.0]], dt=0.03)

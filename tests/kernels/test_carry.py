@@ -6,7 +6,7 @@ import pytest
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.registry import build
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.systems import henon_heiles
 
 SYSTEM = henon_heiles()
@@ -24,7 +24,7 @@ CASES = [
 
 
 def in_pieces(run, h, y0, save):
-    carry, states, before = Carry(), [], -1
+    carry, states, before = RunCheckpoint(), [], -1
     for cut in CUTS:
         piece = run(h, y0, cut, save[(save > before) & (save <= cut)], carry=carry)
         states.append(piece.states)
@@ -56,7 +56,7 @@ def test_what_has_ended_stays_ended():
     kernel = build("verlet", {"dt": 0.1}).own_stepper(Problem(system, 0.0, 1.0, np.ones(2))).kernel
     y0, save = np.array([[1.0, 1.0], [1e-3, 0.0]]), np.array([200])
     for start in (y0[0], y0):
-        whole, carry = kernel.run(0.1, start, 200, save), Carry()
+        whole, carry = kernel.run(0.1, start, 200, save), RunCheckpoint()
         first = kernel.run(0.1, start, 100, save[:0], carry=carry)
         then = kernel.run(0.1, start, 200, save, carry=carry)
         np.testing.assert_array_equal(np.where(np.less(first.n_finite, 100), first.n_finite, 200), whole.n_finite)

@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from sympflow import HamiltonianSystem, doubled, solve, systems
 from sympflow.integrators.tableaux import FIXED
 from sympflow.kernels.explicit_loops import compiled_field, explicit_kernel
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 
 made, EPS = HamiltonianSystem.from_sympy, np.finfo(float).eps
 T, CHAIN = np.linspace(0, 9, 30), range(1, 20)
@@ -56,7 +56,7 @@ def test_rows_pieces_and_single_steps_give_the_same_bits(name):
     system, rng, save = SYSTEMS[name], np.random.default_rng(0), np.array([0, 1, 7, 30])
     kernel, t = explicit_kernel(system, FIXED["rk4"]), {} if system.autonomous else {"t0": 0.5}
     y0 = system.y0 * (1 + 0.1 * rng.random((11, 2 * system.ndof)))
-    batch, carry = kernel.run(0.02, y0, 30, save, **t).states, Carry()
+    batch, carry = kernel.run(0.02, y0, 30, save, **t).states, RunCheckpoint()
     assert np.array_equal(batch, [kernel.run(0.02, y, 30, save, **t).states for y in y0])
     pieces = [kernel.run(0.02, y0, n, s, carry=carry, **t).states for n, s in ((7, save[:3]), (30, save[3:]))]
     assert np.array_equal(batch, np.concatenate(pieces, axis=1))

@@ -7,7 +7,7 @@ import pytest
 
 from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.kernels import lattices
-from sympflow.kernels.protocol import Carry
+from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.stages import single_table
 from sympflow.kernels.threads import at_most
@@ -252,7 +252,7 @@ def test_a_run_in_pieces_has_the_bits_of_one(compensated, pieces):
     for threads in (1, 2):
         with at_most(threads):
             whole = kernel.run(0.05, y0, 90, np.array([20, 90])).states
-            carry = Carry()
+            carry = RunCheckpoint()
             parts = [kernel.run(0.05, y0, n, np.array([n]), carry).states[0] for n in (20, 90)]
         np.testing.assert_array_equal(np.stack(parts), whole)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sympflow import systems
-from sympflow.kernels.protocol import Carry, Task, run_states
+from sympflow.kernels.protocol import RunCheckpoint, Task, run_states
 from sympflow.kernels.splittings import Splitting, SplittingCode
 from sympflow.kernels.stages import run_table, single_table, step_table
 from sympflow.schemes import scheme_named
@@ -41,7 +41,7 @@ def test_states_in_memory_run_as_those_in_registers(name, compensated):
     y0[5] = 40.0  # leaves to infinity
     save, found = np.array([0, 3, 1500, 2000]), []
     for code in (SplittingCode(splitting), InMemory(splitting)):
-        carry, pieces = Carry(), []
+        carry, pieces = RunCheckpoint(), []
         for some, end in ((save[:2], 40), (save[2:], 2000)):
             task = Task(0.1, y0, end, some, carry, threads=1)
             run = run_states(partial(code.run, table), task, code.n_values, 1)
@@ -61,7 +61,7 @@ def test_runs_without_outputs_reach_their_end():
     code = SplittingCode(Splitting(systems.henon_heiles().symbols.parametric, 0))
     values = systems.henon_heiles().symbols.parametric.values
     table, y0 = run_table(scheme_named("verlet"), 0.1).rows(values), np.full((37, 4), 0.1)
-    carry = Carry()
+    carry = RunCheckpoint()
     run = run_states(partial(code.run, table), Task(0.1, y0, 50, np.zeros(0, int), carry, threads=1), 4, 1)
     assert (run.n_finite == 50).all()
     assert np.isfinite(carry.running).all()

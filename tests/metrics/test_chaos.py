@@ -175,7 +175,7 @@ def test_the_end_of_an_orbit_is_its_last_finite_step(function):
     for found in both_ways(function, system, "verlet", (0, 10), y0, dt=0.1):
         assert found.status.tolist() == [-1, 0, -1]
         assert np.all((np.array(ends) - 0.5 < found.t_end) & (found.t_end <= np.array(ends) + 1e-12))
-        assert f"after t = {found.t_end[0]:.17g}" in found.message
+        assert f"after t = {found.t_end[0]:.15g}" in found.message
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_vectors_of_large_systems_are_moved_by_the_derivative_of_the_step(name, 
     rng = np.random.default_rng(3)
     y, W = rng.normal(size=(2, 2 * system.ndof)), rng.normal(size=(2, 2 * system.ndof, 3))
     h = np.array([0.1, -0.2])
-    moved = integrator.pushed(system, 0.0, y, h, W)
+    moved = integrator.jvp(system, 0.0, y, h, W)
     expected = forward_tangent(lambda x, s: integrator.step(system, 0.0, x, s), y, h)[1] @ W
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-12)
 

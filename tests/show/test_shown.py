@@ -41,7 +41,13 @@ RESULTS = {
         ["20"],
     ),
     "trajectories": (lambda: Trajectories.read([(T, np.stack([np.sin(T), np.cos(T)]))]), ["1 trajectories", "21"]),
-    "indicator": (lambda: sympflow.lyapunov(HH, "verlet", (0, 5)), ["value", "reached"]),
+    "indicator": (lambda: sympflow.lyapunov(HH, "verlet", (0, 5), t_eval=[1, 2, 5]), ["value", "reached"]),
+    "indicators": (lambda: sympflow.sali(HH, "verlet", (0, 5), HH.domain.sample(20)), ["(20,)"]),
+    "frequencies": (lambda: sympflow.frequencies(HH, "verlet", (0, 200), n=3), ["frequencies", "amplitudes"]),
+    "escapes": (
+        lambda: sympflow.escape_times(HH, "verlet", (0, 20), HH.domain.sample(20), outside=0.4),
+        ["time", "state"],
+    ),
 }
 
 
@@ -90,6 +96,14 @@ def test_showing_warns_of_nothing():
 
 def test_h_is_typeset():
     assert r"\frac{p_{1}^{2}}{2}" in HH._repr_html_()
+
+
+@pytest.mark.parametrize("found", [sympflow.lyapunov, sympflow.escape_times])
+def test_one_number_is_not_drawn(found):
+    result = found(HH, "verlet", (0, 5))
+    assert result.preview() is None
+    with pytest.raises(ValueError, match="not two orbits with a finite"):
+        result.plot()
 
 
 def test_systems_list_what_users_need():

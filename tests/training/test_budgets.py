@@ -23,7 +23,6 @@ from sympflow.training.losses import Loss
 from sympflow.training.points import Labels
 from sympflow.training.session import OutOfTime, Session
 from sympflow.training.table_fit import TableFit, TableRun
-from sympflow.training.table_step import ArrayForces, SymbolicForces, TableStep
 
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 FLOW = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
@@ -326,23 +325,7 @@ def test_primed_flows_of_functions_of_arrays_are_fitted_and_run(what):
         flow(flow.dt, torch.tensor(y0, requires_grad=True))
 
 
-@pytest.mark.parametrize("force_gradient", [True, False])
-def test_tangents_are_the_derivatives_of_a_step(force_gradient):
-    """Forward, with products, as backward, with Hessians: of all kinds of forces."""
-    sequence = ["drift", "kick"] * 2
-    system = HamiltonianSystem.from_sympy("(p1**2 + 2*p2**2)/2 + cos(q1)*q2**2 + q1**4/4", domain=HH.domain)
-    y = HH.domain.sample(5, 0).T
-    for forces in (SymbolicForces(system.symbols, int(force_gradient), ()), ArrayForces(system, int(force_gradient))):
-        step = TableStep(system, sequence, int(force_gradient))
-        step._forces = forces
-        c = np.random.default_rng(0).normal(0, 0.3, (step.n_coefficients, 5))
-        forward, backward = step._forward(c, y, lambda: None), step._backward(c, y, lambda: None)
-        for one, other in zip(forward, backward, strict=True):
-            np.testing.assert_allclose(one, other, atol=1e-8)
-        np.testing.assert_allclose(forward[0], step(c, y), atol=1e-14)
-
-
-def test_many_degrees_of_freedom_are_fitted_by_tangents(monkeypatch):
+def test_many_degrees_of_freedom_are_fitted():
     """A chain of twenty, given by a gradient and its products."""
     d = 20
 
@@ -361,7 +344,6 @@ def test_many_degrees_of_freedom_are_fitted_by_tangents(monkeypatch):
     q = chain.domain.sample(starts.FEWER_SAMPLES, starts.SEED)[:, :d]
     exact = np.sqrt(np.linalg.eigvalsh(chain.potential_hessian(q)).max(-1))
     assert omega == pytest.approx(np.quantile(exact, starts.QUANTILE), rel=0.05)
-    monkeypatch.setattr(TableStep, "_backward", None)
     flow = SympFlow.primed(chain, 2, dt=0.25)
     few = {"restarts": 1, "steps": 8, "points": 4, "reference_states": 4, "label_times": 2, "progress": False}
     assert train(chain, flow=flow, **few).figures["missed_share"] < 1e-3

@@ -108,7 +108,7 @@ def test_derivatives_by_the_table(system, force_gradient, first):
 
     for k in range(y.shape[1]):
         expected = torch.func.jacfwd(executed)(torch.tensor(c[:, k]), torch.tensor(y[:, k]))
-        np.testing.assert_allclose(J[:, :, k].T, expected.numpy(), rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(J[:, :, k].T, expected.numpy(), rtol=1e-7, atol=1e-8)  # by differences
 
 
 FEW = PrimedFit(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
