@@ -29,6 +29,8 @@ DRIVEN = (
     "Forces or stiffnesses of the angular frequency {} would leave much less: the data look driven, by an H(q, p, t). "
     "Pass drive={} to `learn`."
 )
+PER_NUMBER = 4
+"""Values of half of the trajectories that there are at least for a number of a fit with a drive."""
 FREQUENCIES = 1000
 """Halves of the angular frequency π over the longest time, up to which that of a drive is looked for."""
 
@@ -67,8 +69,6 @@ def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str, d
         found.append((rest, TURNED.format(_said(theta[-turned.shape[2] :]))))
     rest, theta = _left(np.concatenate([X, np.moveaxis(drags(x.T)[0], -1, 0)], 2), v, scales)
     found.append((rest, DRAG.format(_said(theta[-d:]))))
-    rest, frequency = _driven(X, smooth, scales, polynomial_drive(scales))
-    found.append((rest * left, DRIVEN.format(*2 * [f"{frequency:.5g}"])))
     if d > 1:
         pairs = [*range(0, 2 * d, 2), *range(1, 2 * d, 2)]
         with np.errstate(all="ignore"):
@@ -88,6 +88,8 @@ def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str, d
                 f"The second half looks like velocities, of masses {said}: pass velocity_mass=[…], by which p = M v.",
             )
         )
+    rest, frequency = _driven(X, smooth, scales, polynomial_drive(scales))
+    found.append((rest * left, DRIVEN.format(*2 * [f"{frequency:.5g}"])))
     least = min(found)[0]
     best = next(one for one in found if one[0] <= ALIKE * least)
     if best[0] < BETTER * left:
@@ -158,7 +160,7 @@ def _driven(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> 
     One trajectory cannot tell a drive from its own motion: infinite.
     """
     first = smooth.owner % 2 == 0
-    if first.all() or 2 * first.sum() < X.shape[2]:
+    if first.all() or first.sum() * X.shape[1] < PER_NUMBER * (X.shape[2] + drive.n):
         return np.inf, 0.0
     frequency, v = drive_frequency(X, smooth, scales, drive), smooth.slopes
     fits = [(A, _left(A[first], v[first], scales)[1]) for A in (_with_drive(X, smooth, drive, frequency), X)]

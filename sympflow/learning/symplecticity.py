@@ -194,7 +194,7 @@ def best_by_increments(
         plain += [Reading(models[k], turned, math.inf, *PAIRS) for k in squares]
     plain = [compared(reading) for reading in plain if not stop()]
     least, freest = (min((reading.share for reading in some), default=math.inf) for some in (plain, found))
-    kinds = {kind: [r for r in plain if r.said == kind] for kind, _ in (FRICTION, TURNED_SAID, DRAG_SAID, DRIVE, PAIRS)}
+    kinds = {kind: [r for r in plain if r.said == kind] for kind, _ in (FRICTION, TURNED_SAID, DRAG_SAID, PAIRS, DRIVE)}
     for some in kinds.values():  # the plainest that is about as good as the best
         likeliest = min(some, key=lambda reading: reading.share, default=None)
         if likeliest is not None and likeliest.share <= min(PLAINER * least, PLAINER * freest):
