@@ -140,8 +140,8 @@ class Splitting(FixedStep):
         orbit. Elsewhere a step is then dt·2B/(c − V(q)).
     compensated : bool
         True to sum with Kahan's compensation, which slows the growth of round-off over many steps. Compiled only, for
-        the splitting "kinetic". The sums begin anew with each piece of a run that is executed in pieces: with events,
-        within SciPy's `solve_ivp`, and where the metrics execute it again.
+        the splitting "kinetic". The sums begin anew with each piece of a run that is executed in pieces: within SciPy's
+        `solve_ivp`, and where the metrics execute it again.
     splitting : str
         The parts: "kinetic" | potential; "linear" | rest, the exact flow of the quadratic part of H in place of the
         drifts, with the kicks filtered ("mollified") or the implicit midpoint rule's angles ("midpoint"); "kepler", the
