@@ -121,9 +121,8 @@ def test_collocation_is_symplectic():
     assert pytest.approx(J, abs=1e-12) == A.T @ J @ A
     exact, tolerance = Method(Gauss(3), 0.5), np.full(2, 1e-3)
     rough = Method(Gauss(3).within(tolerance), 0.5)
-    ends = [
-        method.over(model, np.array([0.5, 0.5, 0.4]), x.copy(), None, np.array([2.0]), np.zeros(1))[0] for method in (exact, rough)
-    ]
+    theta, zero = np.array([0.5, 0.5, 0.4]), np.zeros(1)
+    ends = [method.over(model, theta, x.copy(), None, zero + 2, zero)[0] for method in (exact, rough)]
     assert 0 < np.abs(ends[1] - ends[0]).max() < 1e-3 * tolerance.max()
     assert rough.stepper == exact.stepper  # by which a checkpoint finds it
 
