@@ -195,12 +195,12 @@ class LatticeHamiltonian(LocalHamiltonian):
                 kept.append(x)
         return [size * x for x in kept]
 
-    @property
+    @cached_property
     def poles(self) -> Poles | None:  # type: ignore[override]
         return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:
-        if self.poles is None:
+        if self.poles is None or not self.poles.watched:
             return ""
         nearest = LatticePoles(self).nearest(q)
         return f"{nearest} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
