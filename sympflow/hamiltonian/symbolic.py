@@ -73,6 +73,15 @@ class Kick:
         return concatenate([q, p])
 
 
+def _evaluation(name: str, order: int) -> Callable[..., Array]:
+    """Return a method: an expression, its gradient or its Hessian at arrays (..., n), and at times."""
+
+    def evaluate(self: SymbolicHamiltonian, x: Array, *t: Array) -> Array:
+        return self._derivative(name, order)(x, *t)
+
+    return evaluate
+
+
 class SymbolicHamiltonian(Definition):
     """H(q, p) as a SymPy expression; its derivatives; array functions of them.
 
@@ -341,49 +350,27 @@ class SymbolicHamiltonian(Definition):
 
     # array functions, state y = [q, p] on the last axis -------------------------------------------
 
-    def hamiltonian(self, y: Array, *t: Array) -> Array:
-        return self._scalar("H")(y, *t)
+    hamiltonian = _evaluation("H", 0)
+    hessian = _evaluation("H", 2)
+    time_derivative = _evaluation("Ht", 0)
+    potential = _evaluation("V", 0)
+    potential_gradient = _evaluation("V", 1)
+    potential_hessian = _evaluation("V", 2)
+    curvature = _evaluation("W", 0)
+    curvature_gradient = _evaluation("W", 1)
+    kinetic = _evaluation("T", 0)
+    kinetic_gradient = _evaluation("T", 1)
+    kinetic_hessian = _evaluation("T", 2)
 
     def gradient(self, y: Array, *t: Array) -> Array:
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
             return concatenate([self.potential_gradient(q, *t), self.kinetic_gradient(p, *t)])
-        return self._vector("H")(y, *t)
-
-    def hessian(self, y: Array, *t: Array) -> Array:
-        return self._matrix("H")(y, *t)
-
-    def time_derivative(self, y: Array, t: Array) -> Array:
-        """∂H/∂t: (..., 2d) to (...)."""
-        return self._scalar("Ht")(y, t)
+        return self._derivative("H", 1)(y, *t)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
         """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
         return self._function(name, lambda: expressions, assemble)
-
-    def potential(self, q: Array, *t: Array) -> Array:
-        return self._scalar("V")(q, *t)
-
-    def potential_gradient(self, q: Array, *t: Array) -> Array:
-        return self._vector("V")(q, *t)
-
-    def potential_hessian(self, q: Array, *t: Array) -> Array:
-        return self._matrix("V")(q, *t)
-
-    def curvature(self, q: Array, *t: Array) -> Array:
-        return self._scalar("W")(q, *t)
-
-    def curvature_gradient(self, q: Array, *t: Array) -> Array:
-        return self._vector("W")(q, *t)
-
-    def kinetic(self, p: Array, *t: Array) -> Array:
-        return self._scalar("T")(p, *t)
-
-    def kinetic_gradient(self, p: Array, *t: Array) -> Array:
-        return self._vector("T")(p, *t)
-
-    def kinetic_hessian(self, p: Array, *t: Array) -> Array:
-        return self._matrix("T")(p, *t)
 
     def drifted(self, p: Array, t: Array, s: Array) -> Array:
         """`drift` for times t and durations s, numbers or (...): (..., d) to (..., d)."""
@@ -418,14 +405,14 @@ class SymbolicHamiltonian(Definition):
     def _variables(self, name: str) -> tuple[sp.Symbol, ...]:
         return {"V": self.q, "T": self.p, "W": self.q, "drift": self.p}.get(name, self.q + self.p)
 
-    def _scalar(self, name: str) -> Callable[..., Array]:
-        return self._function(name, lambda: [getattr(self, name)], lambda values, like: assemble(values, like)[..., 0])
+    def _derivative(self, name: str, order: int) -> Callable[..., Array]:
+        """A function of arrays: an expression, its gradient or its Hessian, by the order."""
 
-    def _vector(self, name: str) -> Callable[..., Array]:
-        return self._function(name + "'", lambda: gradient(getattr(self, name), self._variables(name)), assemble)
+        def expressions() -> list[sp.Expr]:
+            f, x = getattr(self, name), self._variables(name)
+            return [f] if order == 0 else gradient(f, x) if order == 1 else list(hessian(f, x))
 
-    def _matrix(self, name: str) -> Callable[..., Array]:
-        return self._function(name + "''", lambda: list(hessian(getattr(self, name), self._variables(name))), _square)
+        return self._function(name + "'" * order, expressions, (_single, assemble, _square)[order])
 
     def _function(
         self,
@@ -478,6 +465,10 @@ class SymbolicHamiltonian(Definition):
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
         return {}
+
+
+def _single(values: Sequence[Array], like: Array) -> Array:
+    return assemble(values, like)[..., 0]
 
 
 def _square(values: Sequence[Array], like: Array) -> Array:
