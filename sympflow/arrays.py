@@ -313,6 +313,13 @@ def full_of_nan(y: Array) -> Array:
     return np.full_like(y, np.nan)
 
 
+def rows_of_nan(n: int, y: Array) -> Array:
+    """Return NaN for n states such as y, (n, ...), of an array with the n as its last axis but one in memory."""
+    if is_tensor(y):
+        return y.new_full((n, *y.shape), np.nan)
+    return np.moveaxis(np.full((*y.shape[:-1], n, y.shape[-1]), np.nan, dtype=y.dtype), -2, 0)
+
+
 def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
     """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives.
 

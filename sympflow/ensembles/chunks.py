@@ -126,7 +126,7 @@ class Chunk:
                 f"`t_eval` is needed: each orbit has steps of its own with method {self.integrator.name!r}. Give the "
                 "times to report."
             )
-        return Grid(*self.t_span, length).outputs(None, 1)[0]
+        return Grid(*self.t_span, length).outputs(None, 1)
 
     def windows(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), one window after another.

@@ -18,14 +18,10 @@ QUANTILE, CONFIDENCE = 0.95, 0.99  # of the energy errors, and that its limit is
 
 
 def upper_limit(values: np.ndarray, quantile: float = QUANTILE, confidence: float = CONFIDENCE) -> float:
-    """Return an upper confidence limit of a quantile of the values, of any distribution: an order statistic.
+    """Return an upper confidence limit of a quantile of |values|, of any distribution: an order statistic [1]_.
 
-    The k-th smallest of n values is above the quantile with the probability that a binomial number of n draws, each
-    with the probability `quantile`, is less than k. Fewer than 90 values have no such limit at 95 and 99 %: the
-    largest is returned. What is not finite counts as infinite.
+    Of fewer than 90 values it is the largest. What is not finite counts as infinite.
 
-    References
-    ----------
     .. [1] W. J. Conover, Practical Nonparametric Statistics, 3rd ed., 1999, section 3.2.
     """
     from scipy.stats import binom

@@ -73,11 +73,7 @@ def _largest_nearby(
     rng: np.random.Generator,
     numbers: int,
 ) -> np.ndarray:
-    """The largest value of a function of (t, x) at each time, from its values (J, n) at states x (n, 2d) of Ω.
-
-    From the worst states of each time by random steps in Ω, ever shorter, of which the best are kept; of fewer states
-    and steps where the function handles many `numbers` for each.
-    """
+    """The largest value of a function of (t, x) at each time, by ever shorter random steps from the worst states."""
     few = SEARCHED // (OFFSPRING * len(t) * numbers)
     worst = np.argsort(values, axis=1)[:, -max(1, min(WORST, few)) :]
     best, found = x[worst], np.take_along_axis(values, worst, 1)  # (J, W, 2d), (J, W)
@@ -151,11 +147,7 @@ def _one_step_error(flow: Any, system: HamiltonianSystem, x: np.ndarray) -> Quan
 def _energy_errors(
     flow: Any, system: HamiltonianSystem, domain: Domain, x: np.ndarray, t_end: float
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """The largest |H − H0| of each orbit in Ω up to t_end, the same relative, how many left Ω.
-
-    Looked at are all steps, and between every two of them one time at another fraction of Δt: there an output is a
-    shorter step, whose error is its own.
-    """
+    """The largest |H − H0| of each orbit in Ω up to t_end, the same relative, how many left Ω."""
     steps = int(t_end / flow.dt * (1 + 1e-12))
     piece = max(1, min(steps, SAVED_VALUES // (2 * x.size)))
     y = x.astype(str(flow.dtype).removeprefix("torch."))
@@ -180,11 +172,7 @@ def _energy_errors(
 
 @torch.no_grad()
 def _orbit(flow: Any, system: HamiltonianSystem, y: np.ndarray, done: int, n: int) -> np.ndarray:
-    """The states at 0, 1, …, n steps of Δt, and one between every two: (2n + 1, N, 2d), in order of time.
-
-    Over all steps, of which so many are done, the fractions of a step in between fill (0, 1) evenly. The flow runs in
-    its compiled loops where it has them, as in `sympflow.solve`.
-    """
+    """The states at 0, 1, …, n steps of Δt, and at one time between every two: (2n + 1, N, 2d)."""
     k = np.arange(n)
     between = flow.dt * (k + (done + k + 1) * GOLDEN % 1) - k * flow.dt
     lengths = np.broadcast_to(between[:, None], (n, len(y))).astype(y.dtype)

@@ -34,20 +34,7 @@ if TYPE_CHECKING:  # a flow needs it only to be compiled
 
 
 class ClockPotential(Potential):
-    """Σ_k c_k t^(3+2k) B^(k+1)/(k+1), B the last momentum.
-
-    Parameters
-    ----------
-    ndof : int
-        d + 1, that of the transformed system.
-    terms : int
-        How many c_k.
-
-    Attributes
-    ----------
-    numbers : (terms,)
-        c_k.
-    """
+    """Σ_k c_k t^(3+2k) B^(k+1)/(k+1), B the last momentum, of d + 1 degrees of freedom; `numbers` are the c_k."""
 
     def __init__(
         self, ndof: int, terms: int, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None

@@ -56,25 +56,10 @@ class FreeTable(nn.Module):
 
 
 class Coefficients(FreeTable):
-    """c_i(τ) = Σ_k c_ik τ^(e_k), i = 1 … n: a column of a splitting table, and how it enters, as t^m c_i(t/Δt).
+    """c_i(τ) = Σ_k c_ik τ^(e_k), i = 1 … n: a column of a splitting table, which enters as t^power c_i(t/Δt).
 
     In a palindrome, c_i = c_{n+1−i}. With a `total`, Σ c_i(0) = total for every value of the parameters; if that holds
-    `always`, Σ c_i(τ) = total at every τ.
-
-    Parameters
-    ----------
-    n : int
-    exponents : tuple of int
-        e_k ≥ 0, the first of them 0.
-    dt : float
-        Δt.
-    power : int
-        m.
-    palindromic : bool
-    total : float, optional
-    always : bool
-    present : sequence of int, optional
-        The i of the c_i that are not always 0; the default is all.
+    `always`, Σ c_i(τ) = total at every τ. Only the c_i that are `present` are not always 0; by default all are.
     """
 
     def __init__(
@@ -119,11 +104,10 @@ class Coefficients(FreeTable):
 
 
 class Column(FreeTable):
-    """c_i(τ) = c_i0 + τ² Σ_k c_ik T_{k−1}(2τ² − 1), i = 1 … n, c_i = c_{n+1−i}; it enters as t^m c_i(t/Δt).
+    """c_i(τ) = c_i0 + τ² Σ_k c_ik T_{k−1}(2τ² − 1), c_i = c_{n+1−i}; it enters as t^m c_i(t/Δt).
 
-    They are for ranges of t in which fast modes turn often. As even polynomials in τ they make a palindrome of such
-    maps time-reversible; Chebyshev's T_k keep them well conditioned at the degrees that a filter needs whose argument
-    runs over several periods.
+    Even polynomials make a palindrome time-reversible; Chebyshev's T_k keep the high degrees of filters well
+    conditioned.
     """
 
     def __init__(

@@ -467,13 +467,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
     # arguments ----------------------------------------------------------------------------------------------
 
     def _checked_time(self, t: Any, x: Any) -> float | Tensor:
-        """Return `t` as a finite float or tensor; `x` is checked to be a state for this flow.
-
-        Raises
-        ------
-        ValueError, TypeError
-            If one of them has the wrong type, shape, dtype or device, or t is not finite.
-        """
+        """Return `t` as a finite float or tensor; `x` is checked to be a state for this flow."""
         if not isinstance(x, Tensor):
             raise TypeError(f"`x` must be a torch tensor, not {type(x).__name__}: use torch.as_tensor(x).")
         if x.dtype != self.dtype:
@@ -582,15 +576,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
 
 
 def start_time(t0: Any, x: Tensor, period: float | None) -> Tensor:
-    """Return the time of states x (..., 2d) of a driven system in double precision, (), or of the batch's shape.
-
-    For states of less precision it is reduced by the period, without which it would be rounded as they are.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If it is missing, no finite real number, or of another shape, or there is no period to reduce it by.
-    """
+    """Return the time of states x (..., 2d) of a driven system in float64; for float32 reduced by the period."""
     if t0 is None:
         raise TypeError("`t0` is missing, the time of `x`: the system of the flow is driven, as in flow(t, x, t0=0.0).")
     try:
@@ -637,15 +623,7 @@ def _where(active: Tensor, step: Callable[[Tensor, Tensor], Tensor], t: Tensor, 
 
 
 def whole_steps(t: float, dt: float) -> tuple[int, float]:
-    """Return k = ⌊t/Δt⌋ and r = t − kΔt ∈ [0, Δt) for t ≥ 0.
-
-    k is an integer count, robust to rounding: a multiple of Δt up to rounding counts as one, 0.3/0.1 is 3.
-
-    Raises
-    ------
-    ValueError
-        If k would exceed ten million.
-    """
+    """Return k = ⌊t/Δt⌋ and r = t − kΔt for t ≥ 0; a multiple of Δt up to rounding counts as one, 0.3/0.1 is 3."""
     ratio = t / dt
     if ratio > MAX_STEPS:
         raise _too_many_steps(t, dt)
@@ -657,10 +635,7 @@ def whole_steps(t: float, dt: float) -> tuple[int, float]:
 
 
 def whole_steps_of_each(t: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-    """Return the same for a tensor of times t ≥ 0, each to the rounding of its dtype: integer k and float64 r.
-
-    Gradients flow through r to t.
-    """
+    """Return the same for a tensor of times t ≥ 0, each to the rounding of its dtype; gradients flow through r."""
     eps = torch.finfo(t.dtype).eps if t.is_floating_point() else 0.0
     t = t.to(torch.float64)
     ratio = t.detach() / dt

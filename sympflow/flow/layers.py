@@ -73,10 +73,7 @@ class Layer(nn.Module):
 
 
 class Binding:
-    """The system whose functions a flow evaluates; shared by copies of the flow, stored in no file.
-
-    `made` tells the use of them, for messages; `parts` are those that the flow is split into.
-    """
+    """The system whose functions a flow evaluates, shared by its copies; `made` is its use, for messages."""
 
     def __init__(self, system: HamiltonianSystem | None, made: str, parts: Any = None) -> None:
         self._system, self._made, self._parts = system, made, parts

@@ -138,10 +138,7 @@ class MLPFlow(FlowMap):
 
 
 def matching_widths(ndof: int, target: int) -> tuple[int, ...] | None:
-    """Widths of the hidden layers of an MLPFlow of `target` parameters within 2 %, None if there are none.
-
-    Two layers of about the same width if there are such, else any two, else one.
-    """
+    """Widths of one or two hidden layers of an MLPFlow of `target` parameters within 2 %, None if there are none."""
     d = ndof
 
     def count(widths: tuple[int, ...]) -> int:

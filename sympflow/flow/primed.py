@@ -56,24 +56,12 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     A palindromic one has even polynomials b, γ, c, a, and its kernel reads the same backwards, which makes K
     time-reversible: continued to negative t by its formulas, K_{−t} = K_t⁻¹. With a processor ψ̄ is conjugate to it.
-
-    Parameters
-    ----------
-    ndof : int
-    shape : PrimedShape
-    dt : float
-        Δt.
-    system : HamiltonianSystem, optional
-        Without it the flow has a `scheme`, but no values.
-    dtype, device
-        Of the parameters.
+    Without a system the flow has a `scheme`, but no values.
 
     Attributes
     ----------
-    kicks, drifts : Coefficients
-        b and a of the kernel.
-    gradients, curvatures : Coefficients or None
-        γ and c, one for each kick.
+    kicks, drifts, gradients, curvatures : Coefficients, or None
+        b, a, γ and c of the kernel.
     polynomials : ModuleList of Coefficients, or None
         e_m, one column for each monomial.
     processor_kicks, processor_drifts, processor_gradients, processor_curvatures, processor_polynomials
@@ -259,10 +247,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         return Tables(self.substeps, len(self.shape.outer), self.dt, self.monomials)
 
     def scheme(self, t: float | None = None) -> Scheme:
-        """ψ̄_t as a splitting scheme of step t, for t ∈ (0, Δt]; the default is Δt.
-
-        Its coefficients depend on t, and so it has no classical order.
-        """
+        """ψ̄_t as a splitting scheme of step t ∈ (0, Δt], by default Δt; it has no classical order."""
         return self.tables.scheme("primed", self._time_of_scheme(t))
 
     def kernel_scheme(self, t: float | None = None) -> Scheme:
@@ -318,16 +303,12 @@ class PrimedFlow(PrimedKnown, SystemFlow):
             self.domain = self.domain.of(system)
 
     def transferred(self, system: HamiltonianSystem) -> Self:
-        """Return an untrained flow of another system, with the numbers of this one.
+        """Return an untrained flow of another system with the numbers of this one, to start `train` from.
 
-        They are a start for ``train(system, flow=flow.transferred(system))``. As they are they need not be near the
-        exact flow of that system, with friction for instance. The numbers know the potential and dt, not the size: of a
-        lattice they serve any other one of the same terms: `solve` takes the flow as it is.
-
-        Raises
-        ------
-        ValueError
-            If the system has not as many degrees of freedom and is no lattice of the same terms, or has no such flow.
+        They need not be near the exact flow of that system, with friction for instance. The numbers know the potential
+        and dt, not the size: of a lattice they serve any other one of the same terms: `solve` takes the flow as it is.
+        A ValueError if the system has not as many degrees of freedom and is no lattice of the same terms, or has no
+        such flow.
         """
         check_system(system)
         check_for_flows(system, self.takes_friction, self.takes_driving)
@@ -379,10 +360,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     @torch.no_grad()
     def take_over(self, other: PrimedFlow) -> None:
-        """Take the numbers of another flow with as many kicks: those of a longer Δt as they are at this one's.
-
-        Polynomials take over force gradients.
-        """
+        """Take the numbers of a flow with as many kicks, of a longer Δt as they are at this one's."""
         shorter = min(self.dt / other.dt, 1.0)
         theirs = {
             name: to_numpy(column.table).astype(float) * shorter ** np.array(column.exponents, float)

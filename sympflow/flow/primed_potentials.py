@@ -113,10 +113,7 @@ def _gradient_columns(U: Term, system: HamiltonianSystem, x: Tensor) -> Tensor:
 
 
 def _gradient_and_change(U: Term, system: HamiltonianSystem, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
-    """∇U on columns (d, N), or with the times (d + 1, N), and its derivative along dx.
-
-    Numba functions end at ∇²V·v: what lacks is a difference.
-    """
+    """∇U on columns (d, N), or with the times (d + 1, N), and its derivative along dx; of Numba a difference."""
     gradient = partial(_gradient_columns, U, system)
     if U not in (FORCE_GRADIENT, CURVATURE) or system.numba_functions is None:
         return jvp(gradient, x, dx)
@@ -157,10 +154,7 @@ class PolynomialTerm:
 
 
 class PrimedDrift(Drift):
-    """The drift of a system over a time s = t a(t/Δt); with friction the exact flow of q' = M⁻¹p, p' = −Γp.
-
-    Of a driven system the positions are (d + 1, N), with the time as the last, which the drift moves by s.
-    """
+    """The drift of a system over s = t a(t/Δt), with friction its exact flow; driven, it moves the times by s."""
 
     def __init__(self, ndof: int, binding: Binding, time: Factor) -> None:
         super().__init__(PrimedPotential(ndof, binding, [(KINETIC, time)]))
@@ -227,10 +221,7 @@ def _each(s: Time) -> Time:
 
 
 class PrimedPotential(Potential):
-    """V(t, x) = Σ_j c_j(t) U_j(x), with U_j functions of the system and c_j(0) = 0, and perhaps a polynomial.
-
-    Of a driven system, U_j(q, t), x is (d + 1, N), the positions and the times, and gradients are those by q.
-    """
+    """V(t, x) = Σ_j c_j(t) U_j(x), U_j functions of the system, and a polynomial; driven, x has the times below."""
 
     def __init__(
         self,

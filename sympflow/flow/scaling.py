@@ -17,25 +17,11 @@ class _Units(NamedTuple):
 
 
 class Scaling(_Units):
-    """Units of q, p and t in which the states of a domain are of size one.
+    """Units of q, p and t in which the states of a domain are of size one, and its centers.
 
-    The change of variables q/s_q, p/s_p multiplies dq∧dp by 1/(s_q s_p), a constant where all the products agree
-    (it is conformal-symplectic then); a potential written in such units is a potential all the same, so a SympFlow
-    is symplectic whatever the scaling.
-
-    Parameters
-    ----------
-    q, p : sequence of d floats
-        Spread (standard deviation) of each coordinate and momentum over the domain.
-    t : float
-        Unit of time, Δt.
-    q_center, p_center : sequence of d floats, optional
-        Mean of each over the domain, 0 by default; it enters the first biases at initialisation.
-
-    Raises
-    ------
-    ValueError
-        If a length differs, a unit is not positive, or a number is not finite.
+    The change of variables q/s_q, p/s_p multiplies dq∧dp by 1/(s_q s_p), a constant where all the products agree; a
+    potential written in such units is a potential all the same, so a SympFlow is symplectic whatever the scaling. A
+    ValueError if a length differs, a unit is not positive, or a number is not finite.
     """
 
     def __new__(

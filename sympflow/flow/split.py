@@ -43,13 +43,7 @@ FILTERED = ("oscillator", "hyperbolic")
 
 
 class KeptMaps:
-    """The maps of a flow of fixed numbers, the same objects for the same step, and what they cost.
-
-    Attributes
-    ----------
-    placement : tuple
-        Dtype and device of the numbers: asked once, as torch answers slowly.
-    """
+    """The maps of fixed numbers, the same objects for the same step, and what they cost; `placement` is asked once."""
 
     def __init__(
         self, make: Callable[[np.ndarray], list[SubFlow]], coefficients: list[SubFlow], dt: float, like: Tensor
@@ -128,39 +122,11 @@ class SplitLayer(Layer):
 
 
 class SplitFlow(SystemFlow):
-    """A palindromic SympFlow of the exact flows of a system's parts; made by `SympFlow.split`.
+    """A palindromic, time-reversible SympFlow of the exact flows of a system's parts; made by `SympFlow.split`.
 
-    Time-reversible: continued to negative t by its formulas, ψ̄_{−t} = (ψ̄_t)⁻¹.
-
-    Parameters
-    ----------
-    ndof : int
-    sequence : sequence of int
-        The part that each map is of, 0 for the linear one; it must read the same backwards.
-    kinds : sequence of str
-        Of the parts 1, 2, …: "kick" for a potential, else "shear".
-    classes : sequence of str
-        Kinds of the distinct frequencies, see `LinearPart.kinds`.
-    terms : int
-        Basis functions of each coefficient.
-    filters : bool
-    gradients : sequence of int
-        Which of the kicks carry a force gradient, counted from 0; the same from either end.
-    dt : float
-        Δt.
-    expressions : sequence of str, optional
-        The parts, where they are not those that are detected.
-    system : HamiltonianSystem, optional
-        Without it the flow has maps, but no values.
-    dtype, device
-        Of the parameters.
-
-    Attributes
-    ----------
-    linear : ModuleList of Column
-        s_f, for each frequency, of the linear maps.
-    weights, filters, gradients : ModuleList of Column
-        w, φ (for each frequency) and γ of the other parts, part by part.
+    `sequence` names the part of each map, 0 for the linear one, and `classes` the kinds of the distinct frequencies.
+    The columns are s_f of the linear maps in `linear`, and w, φ (for each frequency) and γ in `weights`, `filters` and
+    `gradients`, part by part. Without a system the flow has maps, but no values.
     """
 
     MADE = "made of the parts of a system"

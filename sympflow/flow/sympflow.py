@@ -642,13 +642,7 @@ class SystemFlow(SympFlow):
         return self._binding.system if self._binding.known else None
 
     def bind(self, system: HamiltonianSystem) -> Self:
-        """Give a flow that was loaded from a file the functions of its system; itself.
-
-        Raises
-        ------
-        ValueError
-            If it is not the system that the flow was made for.
-        """
+        """Give a flow that was loaded from a file its system; a ValueError if it was made for another one."""
         self.check_system(system)
         self._take(system)
         return self
@@ -681,15 +675,7 @@ def _pairs_of_layers(
     potential: Callable[[tuple[float, ...], tuple[float, ...]], Potential],
     features: int,
 ) -> nn.ModuleList:
-    """Return pairs of a kick and a drift, with potentials made of a unit and a center of q or p.
-
-    `features` is the number of further inputs of each network.
-
-    Raises
-    ------
-    ValueError
-        If an argument is not admissible, or the networks would take more memory than there is.
-    """
+    """Return pairs of a kick and a drift, with potentials made of a unit and a center of q or p; all is checked."""
     pairs = plain(pairs)
     if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 1:
         raise ValueError(f"`pairs` must be a positive integer, the number of kick–drift pairs; got {pairs!r}.")

@@ -91,10 +91,7 @@ class PrimedShape:
         return _alternating(self.first, 2 * self.processor + 1 if self.processor else 0)
 
     def columns(self, sequence: Sequence[Kind], total: float | None, make: MakeColumn) -> Columns:
-        """Return columns of the numbers of K, whose kicks and drifts have a `total` of 1, or of χ.
-
-        Each is ``make(name, n, exponents, power, mirrored, total, …)``.
-        """
+        """Return columns of K, of a `total` of 1, or of χ: ``make(name, n, exponents, power, mirrored, total, …)``."""
         if not sequence:
             return Columns()
         powers, mirrored = range(0, self.degree, 2 if self.palindromic else 1), self.palindromic and total is not None
@@ -194,10 +191,7 @@ class Columns(NamedTuple):
 
 @dataclass(frozen=True)
 class Substep:
-    """A kick or a drift of the flow: its coefficient, and those of a kick's other terms.
-
-    These are a force gradient and a curvature, or one for each monomial of a polynomial.
-    """
+    """A kick or a drift: its coefficient, and those of a kick's other terms, γ and c or one for each monomial."""
 
     kind: Kind
     weight: Entry
@@ -253,11 +247,7 @@ class Tables:
         return self.kept((part, t, back), make)
 
     def polynomials(self, back: bool) -> StageTable:
-        """The stages of ψ̄_t or of its inverse for all t, as coefficients of polynomials (m, K).
-
-        Kicks and drifts are divided by t, gradients and polynomials in q by t³, curvatures by t⁵. They multiply the
-        powers 0 … K−1 of `variable`; K is at least 3, by zeros if need be.
-        """
+        """The stages of ψ̄_t or of its inverse for all t, over their powers of t: coefficients (m, K) by `variable`."""
 
         from sympflow.kernels.stages import StageTable
 

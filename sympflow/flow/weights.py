@@ -76,10 +76,7 @@ def checksum(tensors: Mapping[str, Tensor]) -> str:
 
 
 class Contents:
-    """The values of tensors in some modules' dictionaries, read from memory in microseconds.
-
-    A tensor's version counter misses edits through `.data`, and a new tensor may stand in the dictionary.
-    """
+    """The values of tensors in some modules' dictionaries, edits through `.data` included, read in microseconds."""
 
     def __init__(self, tensors: Iterable[Mapping[str, Tensor | None]]) -> None:
         self._tensors = [d for d in tensors if d]

@@ -68,7 +68,7 @@ class PairsHamiltonian(LocalHamiltonian):
                 f"`cutoff` {self.cutoff:g} is longer than half the box, {self.box.min() / 2:g}: a body would meet "
                 "another and its image. Take a shorter one, or a larger `box`."
             )
-        self.params = _checked_params(params)
+        self.params = checked_params(params)
         self._read(potential, {"m": self.masses, **self._checked_bodies(bodies)})
         mass = np.repeat(1 / self.inertia, self.dim)
         self.inverse_mass = None if (mass == 1).all() else mass
@@ -157,7 +157,7 @@ class PairsHamiltonian(LocalHamiltonian):
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
         other = copy.copy(self)
-        other.params = _checked_params({**self.params, **values})
+        other.params = checked_params({**self.params, **values})
         other.constants = (*other.params.values(), *self.constants[len(self.params) :])
         for name in ("bond_length", "written"):
             vars(other).pop(name, None)
@@ -350,8 +350,13 @@ class PairsHamiltonian(LocalHamiltonian):
                 sums = f.swapaxes(-1, -2).reshape(-1, len(pairs.i)) @ like(_incidence(self.n_bodies), f)
                 out = out + sums.reshape(*lead, dim, self.n_bodies).swapaxes(-1, -2)
                 continue
-            out = _added(_added(out, pairs.i, f), pairs.j, -f)
+            f, g = self._both_ends(f, pairs)
+            out = _added(_added(out, pairs.i, f), pairs.j, -g)
         return out.reshape(*out.shape[:-2], self.ndof)
+
+    def _both_ends(self, f: Array, pairs: Pairs) -> tuple[Array, Array]:
+        """What the first and the second bodies of pairs feel of these values (..., P, dim)."""
+        return f, f
 
     def _pairs(self, *arrays: Array) -> Iterator[Pairs]:
         """The pairs that interact, in pieces that fit into memory; with a cut-off those of any state of a batch."""
@@ -494,7 +499,7 @@ def _checked_box(box: Any, dim: int) -> np.ndarray | None:
     return lengths
 
 
-def _checked_params(params: Any) -> dict[str, float]:
+def checked_params(params: Any) -> dict[str, float]:
     if not isinstance(params, Mapping | None):
         raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
     checked = {}

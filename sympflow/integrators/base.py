@@ -29,7 +29,7 @@ from sympflow.integrators.contract import (
     start_of,
 )
 from sympflow.integrators.grid import Grid
-from sympflow.integrators.grid_runs import GridRun
+from sympflow.integrators.grid_runs import grid_run
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.steppers import ArraySteps, Stepper, rollout
 from sympflow.kernels.protocol import RunCheckpoint
@@ -128,7 +128,7 @@ class FixedStep(Integrator):
         return states, finite, library_name(problem.y0)
 
     def run(self, problem: Problem) -> Outcome:
-        return GridRun(self, problem).outcome()
+        return grid_run(self, problem).outcome()
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         stepper, chunk, y = self.stepper(Problem(system, *t_span, y0)), 256, y0

@@ -369,7 +369,7 @@ class PhysicalRun:
         single = problem.y0.ndim == 1
         times = problem.t_eval
         if times is None and not single:  # the trajectories take different steps: report on a common grid
-            times = Grid(problem.t0, problem.t1, self.clock.dt).outputs(None, problem.save_every)[0]
+            times = Grid(problem.t0, problem.t1, self.clock.dt).outputs(None, problem.save_every)
         N = len(self.start)
         wanted = np.empty(0) if times is None else (times - problem.t0).astype(self.start.dtype)
         out = np.full((len(wanted), N, 2 * self.d), np.nan, dtype=self.start.dtype)
@@ -526,7 +526,7 @@ def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
     if times is None:
         if y0.ndim == 1:
             return None
-        times = Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)[0]
+        times = Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)
     sign = 1.0 if problem.t1 > problem.t0 else -1.0
     elapsed = sign * (times - problem.t0)
     if not len(elapsed) or not elapsed[-1]:

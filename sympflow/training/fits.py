@@ -614,13 +614,7 @@ def said(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def from_keywords(options: Mapping[str, Any], kind: str, by: str | None, flow: FlowMap | None) -> tuple[Fit, Solver]:
-    """The fit and the solver, named `by` the keyword `optimizer`, of a new flow of a kind, or of a given one.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If they do not take a keyword, or its value.
-    """
+    """The fit and the solver, named `by` the keyword `optimizer`, of a new flow of a kind, or of a given one."""
     searches = by in (None, GaussNewton.name)
     made = KINDS[kind] if flow is None else LossFit
     if searches and flow is not None:

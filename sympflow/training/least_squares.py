@@ -74,10 +74,7 @@ class LinearModel(ABC):
 def damped_step(
     model: LinearModel, cost: Callable[[Any, int], float], before: float, damping: Damping, tries: int
 ) -> tuple[Any, float] | None:
-    """The point after a step that lowers the cost from `before`, and the cost there; None if no step of so many does.
-
-    `cost` takes a point and the number of the try; it is not finite where a point is not admissible.
-    """
+    """The point after one of so many `tries` that lowers the cost from `before`, and the cost there; else None."""
     for attempt in range(tries):
         found = model.trial(damping.value)
         if found is not None:
@@ -109,10 +106,7 @@ def descend(
     gain: float,
     stop: Stop,
 ) -> tuple[Any, str]:
-    """Levenberg and Marquardt's steps from x, of which `costs` has the cost; the end, and why it is one.
-
-    An OutOfTime that is raised within ends it as `stop` does.
-    """
+    """Levenberg and Marquardt's steps from x, of which `costs` has the cost; the end, and its reason."""
     try:
         for _ in range(iterations):
             if stop():
@@ -157,12 +151,7 @@ def levenberg_marquardt(
     damping: float = FIRST_DAMPING,
     stop: Stop = never,
 ) -> Minimum:
-    """Minimize ‖r(x)‖².
-
-    A step solves min ‖J s + r‖² + λ‖D s‖² by QR factorizations, never by normal equations; D holds the largest norms
-    that the columns of J had. The step is bent by the geodesic acceleration of [3]_, which follows the curved valleys
-    of such problems.
-    """
+    """Minimize ‖r(x)‖² by QR factorizations, steps bent by the geodesic acceleration of [3]_."""
 
     scale = np.zeros(len(x))
 
@@ -253,11 +242,8 @@ def put_weights(parameters: Sequence[Tensor], x: Tensor) -> None:
 class GaussNewtonSteps:
     """Levenberg–Marquardt on the residuals of a flow, one accepted step at a time; it trains networks best.
 
-    A step s minimizes ‖J s + r‖² + λ‖D s‖², D the largest norms that the columns of J have had, so that λ bounds
-    the condition number: by the normal equations where it is large, else by a QR factorization of J. To r belongs a
-    tiny multiple of the weights: a neuron that is saturated at all points may else run off to a step of any slope,
-    which no held-out point sees, but an orbit meets after some ten thousand steps. The steps end where `PATIENCE` of
-    them on the same points lower the loss by less than 1 %, or none does.
+    To r belongs a tiny multiple of the weights: a neuron that is saturated at all points may else run off to a step of
+    any slope. The steps end where `PATIENCE` of them on the same points lower the loss by less than 1 %, or none does.
     """
 
     needs_residuals: ClassVar[bool] = True
@@ -333,10 +319,7 @@ class GaussNewtonSteps:
 
 
 class _Normal(LinearModel):
-    """A linear model in torch, with the pull to 0, by Cholesky's factors of JᵀJ + λD².
-
-    Where λ is small, by a QR factorization of J, once, and one of its triangle for each λ.
-    """
+    """A linear model in torch by Cholesky's factors of JᵀJ + λD²; where λ is small, by one QR factorization of J."""
 
     def __init__(
         self, x: Tensor, r: Tensor, J: Tensor, scale: Tensor | None, residuals: Callable[[Tensor], Tensor]

@@ -23,22 +23,13 @@ Terms = tuple[Tensor | None, Tensor | None, Tensor | None]
 
 @dataclass(frozen=True)
 class Loss:
-    """L = w_1 L1 + w_2 L2 + w_3 L3; the first two need no data.
+    """L = w_1 L1 + w_2 L2 + w_3 L3 [1]_; the first two need no data, and one of weight 0 is not evaluated.
 
     L1 = mean ‖d/dt ψ̄_t(x) − J∇H(ψ̄_t(x))‖², the residual of the flow; L2 = mean (𝓗(ψ̄)(t, x) − H(x))², Hamiltonian
     matching, less its mean over x at each t, as 𝓗 is defined up to a function of t; L3 = mean ‖ψ̄_t(x) − φ_H,t(x)‖² at
     labelled points. All are divided by the units of the scaling: x by its spread over Ω, t by Δt, H by action / Δt.
     Of a driven system x is a state at t0, and the field and H are those at t0 + t.
 
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    scaling : Scaling
-    residual_weight, matching_weight, label_weight : float
-        w_1, w_2, w_3; a loss of weight 0 is not evaluated.
-
-    References
-    ----------
     .. [1] P. Canizares, D. Murari, C.-B. Schönlieb, F. Sherry, Z. Shumaylov, Hamiltonian matching for symplectic
        neural integrators, 2024, section 2.3.
     """
@@ -127,10 +118,7 @@ class Objective:
         return torch.cat([block.residuals() for block in self._blocks()])
 
     def linearized(self) -> tuple[Tensor, Tensor]:
-        """The residuals (m,) and their Jacobian (m, n) by the parameters, in the order of `flow.parameters()`.
-
-        The next call may overwrite the Jacobian.
-        """
+        """The residuals (m,) and their Jacobian (m, n) by the parameters, which the next call may overwrite."""
         rows = [block.linearized(self.check) for block in self._blocks()]
         if len(rows) == 1:
             return rows[0]
@@ -161,10 +149,7 @@ class Objective:
 
 @dataclass(frozen=True)
 class _Block:
-    """A loss that counts: its weight, its function of the flow and points, the points, one a row.
-
-    With `times`, the shape of the points, the values at each of the times are taken less their mean.
-    """
+    """A loss that counts, its points one a row; with `times`, their shape, values at each time are less their mean."""
 
     weight: float
     flow: FlowMap
@@ -283,11 +268,7 @@ def jacobian(
     arguments: tuple[Tensor, ...],
     check: Callable[[], None] = lambda: None,
 ) -> tuple[Tensor, Tensor]:
-    """function(flow, *arguments) of N points, (N, ...), and its derivatives by the n parameters, (N, ..., n).
-
-    By reverse mode for each point, a sweep for each of its values; where these are more than the parameters, by
-    forward mode. `check` is called before each block of points, and may raise to end it.
-    """
+    """function(flow, *arguments) of N points, (N, ...), and its derivatives by the n parameters, (N, ..., n)."""
     evaluation = _Evaluation(flow, function)
     parameters = {name: w.detach() for name, w in evaluation.named_parameters()}
 

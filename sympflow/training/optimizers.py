@@ -115,15 +115,10 @@ class LBFGSSteps:
 class BFGSSteps:
     """BFGS with Oren and Luenberger's self-scaling, limited to growth of the inverse Hessian B: 20 iterations a step.
 
-    A B that has learnt the curvature far from the minimum is soon forgotten. On residual losses of small networks it
-    gets orders of magnitude further than limited-memory BFGS [2]_. The line search is SciPy's, for the strong Wolfe
-    conditions.
+    A B that has learnt the curvature far from the minimum is soon forgotten, so that on small networks it gets orders
+    of magnitude further than limited-memory BFGS [1]_. The line search is SciPy's, for the strong Wolfe conditions.
 
-    References
-    ----------
-    .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2006, chapter 6.
-    .. [2] J. F. Urbán, P. Stefanou, J. A. Pons, Unveiling the optimization process of physics informed neural
-       networks, J. Comput. Phys. 523 (2025) 113656.
+    .. [1] J. F. Urbán, P. Stefanou, J. A. Pons, J. Comput. Phys. 523 (2025) 113656.
     """
 
     finished: str | None = None

@@ -48,19 +48,9 @@ class Stream(IntEnum):
 
 @dataclass(frozen=True)
 class Points:
-    """Collocation points.
+    """Collocation points: t (N,), x (N, 2d) of the residual, few times (m, 1) with many states each of the matching.
 
-    Attributes
-    ----------
-    t, x : (N,), (N, 2d)
-        Of the residual loss L1.
-    matching_t, matching_x : (m, 1), (m, n, 2d)
-        Of the matching loss L2: few times with many states each.
-    labels : (n,), (n, 2d), (n, 2d), or None
-        Times, states and where the exact flow takes them, of the loss L3; of a driven system also the times t0 (n,) of
-        the states.
-    t0, matching_t0 : (N,), (m, 1), or None
-        The times of the states x, and of the matching_x, of a driven system.
+    Labels are times, states and where the exact flow takes them; of a driven system all have times t0 of the states.
     """
 
     t: Tensor
@@ -126,10 +116,7 @@ def start_times(
 
 
 class PointSource:
-    """Draws the points of a step: uniform in Ω, and in [0, Δt] one time from each of equal cells.
-
-    Of a driven `system` states are at random times t0, see `start_times`.
-    """
+    """Draws the points of a step, uniform in Ω and one time from each of equal cells; driven, at random times t0."""
 
     def __init__(
         self,
@@ -204,17 +191,9 @@ class _WithWork:
 
 @dataclass(frozen=True)
 class Labels:
-    """φ_H,t(x) of N states at J times.
+    """φ_H,t(x) (J, N, 2d) of N states x at J ascending times t; of a driven system the states are at times t0 (N,).
 
-    Attributes
-    ----------
-    t : (J,), ascending, positive
-    x : (N, 2d)
-    y : (J, N, 2d)
-    t0 : (N,) or None
-        The times of the states x, of a driven system: then y are the states at t0 + t.
-    work : (J, N) or None
-        ∫ ∂H/∂t dt from t0 to t0 + t, of a driven system without friction.
+    `work` is ∫ ∂H/∂t dt (J, N) from t0, of a driven system without friction.
     """
 
     t: np.ndarray
@@ -232,10 +211,7 @@ class Labels:
         deadline: Deadline | None = None,
         t0: np.ndarray | None = None,
     ) -> Labels:
-        """Make labels by DOP853 at rtol = 1e-13, all states in one integration from each time to the next.
-
-        States whose solution ends before the last time are left out.
-        """
+        """Make labels by DOP853 at rtol = 1e-13; states whose solution ends before the last time are left out."""
         width, field = x.shape[1], system
         if t0 is not None and system.conservative:
             x, field = np.concatenate([x, np.zeros((len(x), 1))], axis=1), _WithWork(system)  # type: ignore[assignment]
@@ -289,10 +265,7 @@ class Labels:
 
 @np.errstate(all="ignore")
 def _fast_part(system: HamiltonianSystem, x: np.ndarray, t: float, t0: np.ndarray | None) -> str:
-    """The states whose velocity would carry them across all others in the time t, in words that go on.
-
-    With a box without them; none where there is no such box. `t0` are the times of the states of a driven system.
-    """
+    """The states that would cross all others in the time t, in words that go on, with a box without them."""
     velocity = np.asarray(system.vector_field(x) if t0 is None else system.vector_field(x, t0))
     fast = ~(np.abs(velocity) * t <= np.ptp(x, axis=0)).all(1)
     box = box_without(x[~fast], x[fast])
@@ -305,11 +278,7 @@ def _fast_part(system: HamiltonianSystem, x: np.ndarray, t: float, t0: np.ndarra
 
 
 def box_without(good: np.ndarray, bad: np.ndarray) -> tuple[list[float], list[float]] | None:
-    """The corners, to two digits or three, of a box of states (n, 2d) with none of the bad ones and many good ones.
-
-    From the box around all of them sides are cut off, each time the piece that holds the largest share of the bad less
-    that of the good. None where nothing is bad, or less than a tenth of the good are left.
-    """
+    """The corners, rounded, of a box of states (n, 2d) with none of the bad ones and a tenth of the good; else None."""
     if not (len(good) and len(bad)):
         return None
     low, high = np.minimum(good.min(0), bad.min(0)), np.maximum(good.max(0), bad.max(0))
@@ -347,10 +316,7 @@ def step_errors(difference: np.ndarray) -> dict[str, float]:
 
 @np.errstate(all="ignore")
 def shares_missed(difference: np.ndarray, labels: Labels, unit: np.ndarray) -> tuple[float, float]:
-    """The share that is missed of what a step of Δt moves a state: mean of all states over mean, median over median.
-
-    They are 1 for the identity, and the same in all units of q, p and t; infinite if anything is not a number.
-    """
+    """The share that is missed of what a step of Δt moves a state: mean over mean, median over median; 1 for x ↦ x."""
     error, moved = (np.linalg.norm(v / unit, axis=-1) for v in (difference, labels.y[-1] - labels.x))
     return _share(error.mean(), moved.mean()), _share(np.median(error), np.median(moved))
 

@@ -175,11 +175,7 @@ class Run(ABC):
         return flow
 
     def _compared(self) -> dict[str, float]:
-        """Figures of what the flow is worth, with a warning where that is nothing.
-
-        That is where it misses, in the mean over held-out states, a tenth or more of what a step moves them, or as much
-        as one Verlet step.
-        """
+        """Shares missed by the flow and by a Verlet step, with a warning where the flow is worth nothing."""
         missed, verlet = self.missed(), self.missed_by_verlet()
         if missed is None:
             return {}

@@ -30,11 +30,7 @@ class OutOfTime(Exception):
 
 
 class Interruption:
-    """A context in which Ctrl-C asks for an end where there is something to return, and raises where there is not.
-
-    A second one raises KeyboardInterrupt in any case. In another thread than the main one, or where the program has a
-    handler of its own, nothing is changed.
-    """
+    """A context in which Ctrl-C asks for an end once it is `armed`; before that, and twice, it raises."""
 
     def __init__(self) -> None:
         self.armed = self.asked = False
@@ -106,10 +102,8 @@ class Session:
     ) -> Generator[Any]:
         """Yield `function(common, item)` of each item in order, done by the pool; the function is one of a module.
 
-        Where the pool is this thread alone, and the work is compiled code for the most part, `threads` share it, as
-        many as there are cores. What a piece of work does itself by `each` it does alone. While the pool works Ctrl-C
-        raises KeyboardInterrupt here; threads see that it asked for the end. After that, or when workers do not answer
-        soon after the deadline, as while they start, this thread does the rest.
+        Where the pool is this thread alone, `threads` share the work. While others work Ctrl-C raises KeyboardInterrupt
+        here; after that, or where workers do not answer soon after the deadline, this thread does the rest.
         """
         ended = self.interruption.asked or deadline.left <= 0
         n_threads = min(available_cores(), len(items)) if threads else 1

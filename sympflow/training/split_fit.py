@@ -150,10 +150,7 @@ class SplitProblem:
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1))
 
     def _unit(self, energy: float) -> np.ndarray:
-        """The units of the errors: the spread over Ω, but for an oscillator what changes its energy as H varies.
-
-        A fast mode that is hardly excited would else count as much as the slow ones that carry the energy.
-        """
+        """The units of the errors: the spread over Ω, but for an oscillator what changes its energy as H varies."""
         spread = self.z.std(0)
         unit = np.where(spread > 0, spread, 1.0)
         linear, d = self.parts.linear, self.parts.ndof
@@ -245,10 +242,7 @@ class SplitProblem:
     # all times ----------------------------------------------------------------------------------------------
 
     def whole(self, u: np.ndarray, stop: Stop) -> Minimum:
-        """The polynomials, put through the numbers followed from the least time up, then fitted to all labels.
-
-        Where that path ends far from the best numbers at Δt, these are followed down instead.
-        """
+        """The polynomials, put through numbers followed from time to time, then fitted to all labels."""
         last = len(self.t) - 1
         followed = self.follow(self.equal(self.t[0]), range(last + 1), stop)
         if np.linalg.norm(self.residuals(followed[last], last)) > WORSE * np.linalg.norm(self.residuals(u, last)):

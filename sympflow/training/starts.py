@@ -34,11 +34,7 @@ ITERATIONS, FEWER_SAMPLES = 40, 100  # of the power method, beyond them
 def default_primed(
     system: HamiltonianSystem, domain: Domain | None = None, dt: float | None = None, phase: float = PHASE
 ) -> PrimedFit:
-    """Three kicks and a processor of six, with Δt such that ω Δt is about 1; for a given Δt as many kicks as it needs.
-
-    ω is the fastest frequency of the linearized motion, √ of the largest eigenvalue of M⁻¹∇²V, that 99 % of the states
-    of the domain stay below. The processor costs nothing over a long run, and is larger than the kernel for that.
-    """
+    """Three kicks and a processor of six, with ω Δt about 1; for a given Δt as many kicks as it needs."""
     omega = frequency(system, system.domain if domain is None else domain)
     if dt is None:
         return PrimedFit(_rounded(phase / omega), stages=3, processor=6)
@@ -48,10 +44,7 @@ def default_primed(
 
 @np.errstate(all="ignore")  # of states at which H is not defined
 def frequency(system: HamiltonianSystem, domain: Domain | None) -> float:
-    """The fastest frequency of the linearized motion that 99 % of the states of the domain stay below.
-
-    At least that of the drive, of a driven system with a period.
-    """
+    """The fastest linearized frequency that 99 % of the states of the domain stay below, and at least the drive's."""
     if domain is None:
         raise ValueError(f"`domain` is not known for the system {system.name!r}: pass one.")
     d, large = system.ndof, system.ndof > DENSE and system.quadratic_kinetic
@@ -135,11 +128,7 @@ def _rates(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
 
 
 def warn_of_domain(system: HamiltonianSystem, domain: Domain) -> None:
-    """Warn of a domain where H is not defined in part of it, or the motion far faster than at half of its states.
-
-    Δt is made for the fastest ones. The warning names a box without that part or, where orbits come to it from
-    elsewhere, a sublevel of the energy.
-    """
+    """Warn of a domain where H is not defined in part of it, or the motion far faster than at half of its states."""
     y = domain.sample(SEVERAL_SAMPLES, SEED)
     with np.errstate(all="ignore"):
         defined = np.isfinite(system.hamiltonian(y, start_times(system, 0.0, len(y), SEED, Stream.SCALING)))

@@ -117,10 +117,7 @@ class TableRun(SearchRun):
         deadline: Deadline | None = None,
         made_runs: MadeRuns | None = None,
     ) -> TableRun:
-        """A run for labels made on the spot, or for the `data` of the options.
-
-        `made_runs` gives the `runs` of a flow.
-        """
+        """A run for labels made on the spot, or the `data` of the fit; `made_runs` gives the `runs` of a flow."""
         deadline = Session().deadline if deadline is None else deadline
         fractions = FRACTIONAL_TIMES
         options: Resolved = fit.resolved
@@ -313,10 +310,7 @@ class TableRun(SearchRun):
         return super().remarks(reason) | kept | ({} if self.runs is None else self.runs.record)
 
     def _keep_better(self, session: Session) -> np.ndarray:
-        """Go back to where the run began, or to `tried`, if that is nearer to the exact flow at the held-out states.
-
-        The differences from it, of the one or the other.
-        """
+        """Go back to the start, or `tried`, if that is nearer to the exact flow; the differences at held-out states."""
         if session.cut and self.tried is not None:
             self.given = Table(self.tried).parameters()
             self.at_start = differences(self.tried, self.step, self.held_out)
@@ -380,10 +374,7 @@ def _check_memory(points: int, fit: Resolved, numbers: int, ndof: int) -> None:
 
 
 def energy_slope(system: HamiltonianSystem, labels: Labels, weight: float) -> np.ndarray | None:
-    """∇H at the labels (J, N, 2d), divided by the spread of H over Ω: `TableFit`; None if it is to count nothing.
-
-    Of a driven system the gradient of E + H, (J, N, 2d + 1), where there is E: the error of the balance counts.
-    """
+    """∇H at the labels (J, N, 2d), driven that of E + H, over the spread of H; None if it is to count nothing."""
     spread = float(np.std(system.hamiltonian(labels.x, labels.t0)))
     if not (weight > 0 and 0 < spread < math.inf):
         return None
@@ -439,10 +430,7 @@ class Problem:
         return self
 
     def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
-        """Least squares from θ; a thorough one goes on where little is gained, as along a narrow curved valley.
-
-        The residuals at θ are evaluated even past the deadline, so that starts can be compared.
-        """
+        """Least squares from θ, evaluated even past the deadline; a thorough one goes on where little is gained."""
         at_start = self.residuals(theta)
         return levenberg_marquardt(
             lambda x: at_start if x is theta else self.residuals(x, deadline.check),
@@ -615,9 +603,7 @@ class TableFit(Problem):
 class Table:
     """A primed flow's parameters θ as one vector, and its table at any t as an affine function of them.
 
-    The coefficients are those of `TableStep`: of each map in order, then the force gradients of the kicks, then their
-    curvatures, or of each monomial in turn. One of the processor stands in two places, χ and with the opposite sign
-    χ⁻¹.
+    The coefficients are those of `TableStep`; one of the processor stands in χ and with the opposite sign in χ⁻¹.
     """
 
     def __init__(self, flow: PrimedFlow) -> None:
@@ -646,10 +632,7 @@ class Table:
         return self._assembled(self._unbound(), np.array([t]))
 
     def frozen_parameters(self, coefficients: np.ndarray) -> np.ndarray:
-        """The parameters of `frozen` at Δt by which the table is the given one (n,), or nearest to it.
-
-        Each column by itself and in powers of τ: beside Δt, coefficients in Δt⁵ are lost in rounding in SI units.
-        """
+        """The parameters of `frozen` at Δt of the nearest table to (n,), each column by itself and in powers of τ."""
         return np.concatenate(
             [
                 np.linalg.lstsq(

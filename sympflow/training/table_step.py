@@ -35,30 +35,10 @@ Product = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class TableStep:
     """The map of kicks p += w F(q) + g ∇²V v − c ∇(½ v·∇²V v), v = M⁻¹∇V(q), and drifts q += a M⁻¹p of a system.
 
-    Arrays are feature-major: states y (2d, P). A coefficient is a row of P numbers, one a state, so that states may
-    be at different times: c (n, P), or (n, 1). The states of a driven system begin at times t0 (P,); those at the end
-    have a row more, E, unless there is friction.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        Separable, with T = ½ pᵀM⁻¹p.
-    sequence : sequence of "kick" or "drift"
-    level : int
-        What the kicks have beside the force: nothing, g, g and c, or a polynomial.
-    monomials
-        Of the polynomial.
-    compiled : bool
-        Compile the step and its derivatives, where the system has symbols, or the forces of bodies in pairs.
-
-    Attributes
-    ----------
-    balanced : bool
-        True if E is a row of the states at the end.
-    order : ndarray of int
-        Where the coefficients of one map after the other stand.
-    loops : TableLoops or None
-        What is compiled.
+    Arrays are feature-major: states y (2d, P). A coefficient is a row of P numbers, one a state, so that states may be
+    at different times: c (n, P), or (n, 1), in the places `order` one map after the other. The states of a driven
+    system begin at times t0 (P,); those at the end have a row more, E, if `balanced`, without friction. `loops` is what
+    is compiled.
     """
 
     def __init__(
@@ -117,10 +97,7 @@ class TableStep:
     def __call__(
         self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None, t0: np.ndarray | None = None
     ) -> np.ndarray:
-        """The step: coefficients c in the order of the sequence, then of each further term those of the kicks.
-
-        `check` is called at each kick, or once where the step is compiled, and may raise to end it.
-        """
+        """The step: coefficients in the order of the sequence, then of each further term; `check` may raise."""
         if self.loops is not None and c.shape[1] == 1:
             check()
             return self.loops.steps(c[self.order].T, y, t0, 2 * self.ndof + self.balanced)[0]
@@ -241,11 +218,7 @@ def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), 
 
 
 class ArrayForces:
-    """From the functions of a system of arrays; derivatives of ∇V that it does not have are differences.
-
-    The derivative of G(q) = ∇²V(q) v(q), v = M⁻¹∇V, is ∇²V M⁻¹∇²V and a difference of ∇²V along v. Positions of a
-    driven system are (d + 2, P), with t and s.
-    """
+    """The terms by the functions of a system; derivatives of ∇²V along v = M⁻¹∇V, and of C, are differences."""
 
     def __init__(self, system: HamiltonianSystem, level: int, monomials: Monomials = ()) -> None:
         self._given = system, level, monomials
@@ -301,10 +274,7 @@ def _curvature(system: HamiltonianSystem, rows: np.ndarray) -> np.ndarray:
 
 
 def _row_functions(system: HamiltonianSystem) -> tuple[Callable[[np.ndarray], np.ndarray], Product]:
-    """∇V of rows (..., P, d), and ∇²V·v of rows and v: of Numba functions in one compiled loop each.
-
-    Where a gradient was given without products, these are differences of it along v.
-    """
+    """∇V of rows (..., P, d), and ∇²V·v of rows and v, by differences of ∇V where it is not given."""
 
     def slopes(rows: np.ndarray) -> np.ndarray:
         return -system.force(rows)

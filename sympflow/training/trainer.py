@@ -440,11 +440,7 @@ def _with_defaults(system: HamiltonianSystem, domain: Domain, fit: PrimedFit) ->
 def _new_primed(
     system: HamiltonianSystem, domain: Domain, fit: PrimedFit, solver: Solver, session: Session
 ) -> tuple[PrimedFlow, PrimedFlow | None]:
-    """A new primed flow, and the one that was fitted in a trial if there were any.
-
-    Where nothing is said of the flow and its fit, trials choose it; of a run to go on with it is that one's, if it is
-    one of those that are tried.
-    """
+    """A new primed flow, and the one of a trial if trials chose it; of a run to go on with that one's shape."""
     given = set(fit.given())
     if not given & set(fit.OF_FLOW) and trials.can_try(system):
         hurried = session.time_budget is not None and session.time_budget < SHORT_BUDGET

@@ -76,15 +76,10 @@ def can_try(system: HamiltonianSystem) -> bool:
 def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | None = None) -> Trial:
     """The flow that gains most: that of `default_primed`, or one with a longer Δt, curvature terms or another shape.
 
-    Of each the table at Δt is fitted in less than a second, and followed along held-out orbits. Where its energy error
-    (of a system with friction: the difference from the energy along the exact orbit) is e, the work of a classical
-    scheme of order p is in proportion to e^(−1/p); so the flow gains most whose kicks take the least time in a unit of
-    time, times e^(1/p), p = 6. What kicks take is estimated in cycles of the processor: the choice is the same on every
-    machine. Curvature terms are tried with the best Δt, unless they make kicks twice as dear; then `SHAPES` with kicks
-    of the better kind, about as many in a unit of time as at that Δt and at the next shorter one. Where all errors are
-    above `GOAL` the flow with the smallest counts, and those with up to twice that. At last up to three whose work is
-    nearly the least are compared by their energy errors in longer runs. If the time of the `session` for trials is
-    over, it is the best so far, with a RuntimeWarning.
+    Each is fitted at Δt and followed along held-out orbits. Its work is the cycles of its kicks in a unit of time,
+    times e^(1/6) of its energy error e, as a scheme of order 6: the same choice on every machine. Curvature terms are
+    tried with the best Δt, unless they make kicks twice as dear, then `SHAPES` with kicks of the better kind. Where all
+    errors are above `GOAL` the least count. At last up to three with nearly the least work are compared in longer runs.
     """
     from sympflow.kernels.approximations import position_ranges
     from sympflow.kernels.splitting_loops import splitting_loops
@@ -187,10 +182,7 @@ def _long_work(
 
 
 def long_errors(flows: Sequence[PrimedFlow], system: HamiltonianSystem, domain: Domain) -> list[float]:
-    """The relative energy error of each flow in long runs, the median over held-out orbits; ∞ where one ends early.
-
-    All runs are of one length, 2048 times the longest Δt.
-    """
+    """The median relative energy error of each flow in runs of 2048 times the longest Δt; ∞ where one ends early."""
     orbits, errors = states(domain, ORBITS, SEED, Stream.REFERENCE), []
     H = system.hamiltonian(orbits)
     scale = np.abs(H) if system.energy_scale is None else system.energy_scale
@@ -244,10 +236,7 @@ def shaped(start: Resolved) -> list[PrimedFit]:
 
 
 def dividing(dt: float) -> float:
-    """The Δt nearest to dt that divides a power of ten, 10ᵏ/n with n ≤ 10: round times are on its grid.
-
-    An output there takes C kicks, one between steps 2C + S more, and the gain of a flow hardly depends on Δt.
-    """
+    """The Δt nearest to dt that divides a power of ten, 10ᵏ/n with n ≤ 10, so that outputs at round times are cheap."""
     unit = 10.0 ** math.floor(math.log10(dt))
     return min((10 * unit / n for n in range(1, 11)), key=lambda t: abs(math.log(t / dt)))
 
@@ -268,11 +257,7 @@ def _trial_of(common: tuple[HamiltonianSystem, Domain, Deadline], start: PrimedF
 
 
 def trial(start: Resolved, system: HamiltonianSystem, domain: Domain, deadline: Deadline | None = None) -> Trial:
-    """A short fit of the flow at its Δt, with its relative energy error, the median over held-out orbits.
-
-    Infinite if there are no orbits, or the fit leads nowhere: where in the median it misses a tenth of what a step
-    moves a state. The energy alone would be kept best by the identity.
-    """
+    """A short fit at Δt, with its median relative energy error; infinite if it misses a tenth of what a step moves."""
     deadline = Session().deadline if deadline is None else deadline
     dt = start.dt
     fit = replace(start, points=POINTS, label_times=1, reference_states=ORBITS, seed=SEED)

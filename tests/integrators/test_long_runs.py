@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow.integrators import progress, windows
+from sympflow.integrators import grid_runs, progress
 from sympflow.integrators.contract import Interrupted
 from sympflow.solver import solve
 from sympflow.systems import henon_heiles
@@ -17,10 +17,10 @@ TIMES = np.array([0.0, 0.05, 3.3, 3.31, 12.345, 12.345, 39.9, 40.0])
 
 @pytest.fixture
 def short_windows(monkeypatch):
-    monkeypatch.setattr(windows, "ONE", 100)
-    monkeypatch.setattr(windows, "MANY", 300)
-    monkeypatch.setattr(windows, "ARRAY_STEPS", 30)
-    monkeypatch.setattr(windows.Pace, "took", lambda self, n: None)
+    monkeypatch.setattr(grid_runs, "ONE", 100)
+    monkeypatch.setattr(grid_runs, "MANY", 300)
+    monkeypatch.setattr(grid_runs, "ARRAY_STEPS", 30)
+    monkeypatch.setattr(grid_runs.Pace, "took", lambda self, n: None)
 
 
 class Told(list):

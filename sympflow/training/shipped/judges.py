@@ -41,10 +41,7 @@ Cost = Callable[[Any], float]
 
 
 def primed_cost(flow: PrimedFlow) -> float:
-    """A force gradient counts as 0.3 of a force, a curvature term as 0.4, each monomial of a polynomial as 0.05.
-
-    These shares were measured in the compiled loops for polynomial potentials.
-    """
+    """Forces, with 0.3 for a force gradient, 0.4 for a curvature term and 0.05 for a monomial, as was measured."""
     kernel = flow.kernel_scheme()
     beside = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations
     beside += OF_A_MONOMIAL * len(kernel.monomials) * kernel.force_evaluations
@@ -104,11 +101,7 @@ def _mean(values: np.ndarray) -> float | None:
 def one_step_errors(
     flow: FlowMap, system: HamiltonianSystem, x: np.ndarray, *, times: int = FRACTIONAL_TIMES, omega: float = 1.0
 ) -> tuple[float, float]:
-    """Means of ‖ψ̄_t(x) − φ_H,t(x)‖ over the states x (n, 2d): at Δt, and over as many times spread over (0, Δt).
-
-    A flow of which the second is far larger than the first is a map for Δt only. States are measured as [q, p/ω]; those
-    of a driven system are at random times t0.
-    """
+    """Means of ‖ψ̄_t(x) − φ_H,t(x)‖ over the states x (n, 2d), as [q, p/ω]: at Δt, and at times spread before it."""
     units = np.repeat([1.0, omega], system.ndof)
     t = flow.dt * (np.arange(times) + 0.5) / times
     begun = start_times(system, flow.dt, len(x), 0, Stream.REFERENCE)
@@ -125,12 +118,7 @@ def one_step_errors(
 
 @dataclass(frozen=True)
 class ByCertificate:
-    """The certificate over T = t_end, and from it the figures by which flows are chosen.
-
-    `energy_error_95` is an upper 99 % confidence limit of the 95 % quantile over Ω, so that a `tol` holds for other
-    states than those that were measured. The one-step error has a heavy tail where orbits come close to a singularity:
-    hence its median and its largest value beside the mean.
-    """
+    """The certificate over T = t_end, and from it the figures by which flows are chosen."""
 
     t_end: float = 1000.0
     cost: Cost = primed_cost
@@ -235,12 +223,7 @@ STIFF_STATES, STIFF_SEED = 20, 20_261_121  # of the energy figure, from a seed t
 
 @dataclass(frozen=True)
 class OfStiff:
-    """Largest energy errors over the system's interval, which is `t_end`; and a certificate of few states.
-
-    `orbit_energy_error` from y0 at every step, `between_steps` the largest at `PHASES` of 500 steps, relative; of
-    held-out states of Ω at every tenth step, `energy_error` and `energy_error_max` in units of H, the mean over the
-    states and the largest, and `energy_error_95`, the 95 % quantile, relative, by which a flow is chosen.
-    """
+    """Largest energy errors of y0 and of held-out states over the interval, and a certificate of few states."""
 
     domain: Callable[[HamiltonianSystem], Domain]
     cost: Cost = split_cost

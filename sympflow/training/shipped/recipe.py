@@ -95,11 +95,7 @@ def made(
     progress: bool | None = None,
     workers: Any = 1,
 ) -> Iterator[tuple[Recipe, FlowMap]]:
-    """The recipes and their flows, trained and judged, as they are made.
-
-    `earlier` gives, by a recipe and the name of the one that it comes after, a flow that was made before. `workers`
-    share the recipes, a number of them being processes: those that come after others when these are made.
-    """
+    """The recipes and their flows, trained and judged; those that come `after` others when these are made."""
     flows: dict[tuple[str, str], FlowMap] = {}
     left = list(recipes)
     with WorkerPool(workers) as pool:

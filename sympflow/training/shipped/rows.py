@@ -125,11 +125,7 @@ def driven_rung(
     seed: int = 1,
     first: str = "kick",
 ) -> Recipe:
-    """A primed flow of a driven system, judged by its energy balance; its minima are many, and starts are cheap.
-
-    So many that the rounding of other compiled code ends a search in another one: a fit again gives the same errors
-    within a few percent, not the same numbers.
-    """
+    """A primed flow of a driven system, judged by its energy balance; its minima are many, and starts are cheap."""
     shape = {"stages": stages, "processor": processor, "first": first}
     fit = PrimedFit(dt, **shape, curvature=True, seed=seed, energy_weight=1.0)  # type: ignore[arg-type]
     return Recipe(system().name, f"primed-{stages}-{dt:g}", system, fit, ByBalance(), GaussNewton(restarts=restarts))
@@ -173,11 +169,7 @@ def lattice_rung(
     first: str = "drift",
     density: tuple[float, float] = (0.02, 0.2),
 ) -> Recipe:
-    """A primed flow of a lattice of any n, fitted on a few sites, and judged on 256 at these energy densities.
-
-    Force gradients of a polynomial bond are polynomials of a higher degree: those of a processor of 12, one after the
-    other, spoil the rare states with much energy in a few sites, where Δt is long.
-    """
+    """A primed flow of a lattice of any n, fitted on a few sites, and judged on 256 at these energy densities."""
     many, name = partial(system, n=256), f"primed-{stages}-{dt:g}"
     shape = {"dt": dt, "stages": stages, "processor": processor, "first": first, "force_gradient": force_gradient}
     judge = ByCertificate(200.0, states=100, times=9, held_out=100)
@@ -199,11 +191,7 @@ def _at_density(system: HamiltonianSystem, density: tuple[float, float]) -> Doma
 
 
 def along_the_orbit(system: HamiltonianSystem, n: int = 10, span: float = 1e5 * YEAR, seed: int = 0) -> np.ndarray:
-    """States of the outer solar system at n random times in 1e5 years of its own orbit: (n, 2d).
-
-    Its domain holds each body near its own path at any phase, and an orbit from most of these states soon leaves it:
-    so energy errors over a long time are measured from where the planets will really be.
-    """
+    """States of the outer solar system at n random times in 1e5 years of its own orbit, which stays in Ω."""
     t = np.sort(np.random.default_rng(seed).uniform(0, span, n))
     return solve(system, "kahan_li8", (0.0, float(t[-1])), dt=200.0, t_eval=t).states
 
