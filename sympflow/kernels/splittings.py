@@ -469,7 +469,7 @@ class SplittingCode(SplittingRollouts):
         return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
     def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-        """From cotangents (m, size, N) of the numbers of columns to those of values (n, N), last in a table (…, m, N)."""
+        """From cotangents (m, size, N) of the numbers of columns to those of the values (n, N) that end a table."""
         if self.timed:
             return np.asarray(slopes[:, self.size - self._own :].sum(0))
         found = np.zeros((self._own, slopes.shape[2]))
