@@ -20,8 +20,7 @@ import numpy as np
 from measuring import fragments
 
 import sympflow
-from sympflow.integrators import base
-from sympflow.integrators.windows import first_window
+from sympflow.integrators import grid_runs
 
 SYSTEM = sympflow.systems.henon_heiles()
 DT, BATCH = 0.05, 1000
@@ -40,15 +39,15 @@ def run(y0: Any, n_steps: int, **how: Any) -> Any:
 
 def windows(n_steps: int, rounds: int) -> list[list[str]]:
     """Rows of times in one piece, in windows and with progress."""
-    rows = []
+    rows, in_windows = [], grid_runs.first_window
     many = SYSTEM.y0 + 0.02 * np.random.default_rng(0).standard_normal((BATCH, 4))
     for label, y0, n in (("one trajectory", SYSTEM.y0, n_steps), (f"{BATCH} trajectories", many, n_steps // 100)):
         run(y0, 10)  # compiled
         times: dict[str, list[float]] = {"piece": [], "windows": [], "progress": []}
         for _ in range(rounds):
-            base.first_window = lambda *run: 0
+            grid_runs.first_window = lambda *run: 0
             times["piece"].append(seconds(lambda y0=y0, n=n: run(y0, n)))
-            base.first_window = first_window
+            grid_runs.first_window = in_windows
             times["windows"].append(seconds(lambda y0=y0, n=n: run(y0, n)))
             times["progress"].append(seconds(lambda y0=y0, n=n: run(y0, n, progress=lambda done, total: None)))
         piece, cut, told = (min(times[name]) for name in ("piece", "windows", "progress"))

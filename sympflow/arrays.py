@@ -72,6 +72,13 @@ def moveaxis(y: Array, source: int, target: int) -> Array:
     return y.movedim(source, target) if is_tensor(y) else np.moveaxis(y, source, target)
 
 
+def expanded(y: Array, shape: tuple[int, ...]) -> Array:
+    """Return y broadcast to a shape: itself where it has that."""
+    if tuple(y.shape) == shape:
+        return y
+    return y.expand(shape) if is_tensor(y) else np.broadcast_to(y, shape)
+
+
 def masked(y: Array, mask: Any, value: float) -> Array:
     """Return y with a value where the mask, an array that broadcasts against it, is True."""
     if is_tensor(y):
@@ -304,6 +311,13 @@ def full_of_nan(y: Array) -> Array:
 
         return torch.full_like(y, np.nan, requires_grad=False)
     return np.full_like(y, np.nan)
+
+
+def rows_of_nan(n: int, y: Array) -> Array:
+    """Return NaN for n states such as y, (n, ...), of an array with the n as its last axis but one in memory."""
+    if is_tensor(y):
+        return y.new_full((n, *y.shape), np.nan)
+    return np.moveaxis(np.full((*y.shape[:-1], n, y.shape[-1]), np.nan, dtype=y.dtype), -2, 0)
 
 
 def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:

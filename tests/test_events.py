@@ -52,6 +52,16 @@ def zero_q(t, y):
     return y[0]
 
 
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [("verlet", {}), ("kahan_li8", {"compensated": True}), ("gauss_legendre4", {}), ("verlet", {"backend": "array"})],
+)
+def test_steps_with_events_are_those_without_bit_for_bit(method, options):
+    for t_eval in (None, np.linspace(0, 70, 31)):
+        found, plain = (solve(HH, method, (0, 70), dt=0.03, t_eval=t_eval, events=g, **options) for g in (zero_q, None))
+        np.testing.assert_array_equal(found.y, plain.y)
+
+
 @pytest.mark.parametrize("method", METHODS)
 class TestEveryMethod:
     def test_zeros_of_cos_t(self, method):

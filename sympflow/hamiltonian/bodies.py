@@ -17,6 +17,7 @@ from sympflow.arguments import check_kept, plain, real_number
 from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+from sympflow.hamiltonian.poles import PairsPoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 MOST_AXES = 3
@@ -68,7 +69,7 @@ class PairsHamiltonian(LocalHamiltonian):
                 f"`cutoff` {self.cutoff:g} is longer than half the box, {self.box.min() / 2:g}: a body would meet "
                 "another and its image. Take a shorter one, or a larger `box`."
             )
-        self.params = _checked_params(params)
+        self.params = checked_params(params)
         self._read(potential, {"m": self.masses, **self._checked_bodies(bodies)})
         mass = np.repeat(1 / self.inertia, self.dim)
         self.inverse_mass = None if (mass == 1).all() else mass
@@ -132,7 +133,7 @@ class PairsHamiltonian(LocalHamiltonian):
         self.columns = np.array([x for x, is_used in zip(columns.values(), used, strict=True) if is_used])
         self.columns = self.columns.reshape(-1, self.n_bodies)
         self.c, self.constants = c, tuple(self.params.values())
-        self._written = V
+        self.of_distance = V
         V = V.subs(r, sp.sqrt(self.s))
         if self.cutoff is not None:
             end = sp.Symbol("end", positive=True)
@@ -147,8 +148,8 @@ class PairsHamiltonian(LocalHamiltonian):
         columns = [*self.columns, *self.columns, *self.params.values()]
         letters_of = (*self.first, *self.second, *self.c[: len(self.params)])
         names = dict(zip(self.c, self.params, strict=False))
-        distance = [s for s in self._written.free_symbols if s.name == "r"]
-        check_continuous("potential", self._written, distance, dict(zip(letters_of, columns, strict=True)), names)
+        distance = [s for s in self.of_distance.free_symbols if s.name == "r"]
+        check_continuous("potential", self.of_distance, distance, dict(zip(letters_of, columns, strict=True)), names)
 
     def identity_parts(self) -> Any:
         made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
@@ -157,9 +158,9 @@ class PairsHamiltonian(LocalHamiltonian):
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
         other = copy.copy(self)
-        other.params = _checked_params({**self.params, **values})
+        other.params = checked_params({**self.params, **values})
         other.constants = (*other.params.values(), *self.constants[len(self.params) :])
-        for name in ("bond_length", "written"):
+        for name in ("bond_length", "written", "poles"):
             vars(other).pop(name, None)
         other._check_continuous()
         return other
@@ -292,6 +293,30 @@ class PairsHamiltonian(LocalHamiltonian):
         return density[..., 0]
 
     @property
+    def on_a_line(self) -> bool:
+        """True of bodies that would pass through each other to change places, so that differences have signs."""
+        return self.dim == 1 and self.box is None and not self.softening
+
+    @cached_property
+    def poles(self) -> Poles | None:  # type: ignore[override]
+        return PairsPoles(self) or None
+
+    def met(self, q: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]]:
+        """The ends i, j (P,) of pairs, their distances, or differences on a line, (..., P), and values of letters."""
+        for pairs in self._pairs(q):
+            x = pairs.x[0][..., 0] if self.on_a_line else np.sqrt(pairs.s)
+            yield pairs.i, pairs.j, x, pairs.letters
+
+    def values_of(
+        self, key: str, expressions: list[sp.Expr], x: sp.Symbol, distances: np.ndarray, letters: list[Any]
+    ) -> list[Any]:
+        """The values of expressions in a distance and the letters of two bodies."""
+        names = (x, *self.first, *self.second, *self.c)
+        with np.errstate(all="ignore"):
+            values = self._values(f"potential {key}", lambda: expressions, names, distances, *letters)
+        return [np.broadcast_to(value, distances.shape) for value in values]
+
+    @property
     def leaps(self) -> bool:  # type: ignore[override]
         """Bodies may meet at r = 0 without softening."""
         return not self.softening and self.n_bodies > 1
@@ -350,8 +375,13 @@ class PairsHamiltonian(LocalHamiltonian):
                 sums = f.swapaxes(-1, -2).reshape(-1, len(pairs.i)) @ like(_incidence(self.n_bodies), f)
                 out = out + sums.reshape(*lead, dim, self.n_bodies).swapaxes(-1, -2)
                 continue
-            out = _added(_added(out, pairs.i, f), pairs.j, -f)
+            f, g = self._both_ends(f, pairs)
+            out = _added(_added(out, pairs.i, f), pairs.j, -g)
         return out.reshape(*out.shape[:-2], self.ndof)
+
+    def _both_ends(self, f: Array, pairs: Pairs) -> tuple[Array, Array]:
+        """What the first and the second bodies of pairs feel of these values (..., P, dim)."""
+        return f, f
 
     def _pairs(self, *arrays: Array) -> Iterator[Pairs]:
         """The pairs that interact, in pieces that fit into memory; with a cut-off those of any state of a batch."""
@@ -407,11 +437,15 @@ class Pairs:
         self.local, self.i, self.j, self.x = local, i, j, x
         self.s = _dot(x[0], x[0]) + local.softening**2
 
+    @property
+    def letters(self) -> list[Any]:
+        """The values of the letters of V: (P,) of the bodies, and numbers."""
+        return [*(column[ends] for ends in (self.i, self.j) for column in self.local.columns), *self.local.constants]
+
     def values(self, k: int) -> Array:
         """2ᵏ times the k-th derivative of V by s, 0 beyond the cut-off: (..., P)."""
         local, s = self.local, self.s
-        columns = [column[ends] for ends in (self.i, self.j) for column in local.columns]
-        given = [like(x, s) for x in (*columns, *local.constants)]
+        given = [like(x, s) for x in self.letters]
         variables = (local.s, *local.first, *local.second, *local.c)
         with np.errstate(all="ignore"):  # bodies at one place
             value = local._values(f"potential {k}", lambda: [local.slopes[k]], variables, s, *given)[0] + 0 * s
@@ -494,7 +528,7 @@ def _checked_box(box: Any, dim: int) -> np.ndarray | None:
     return lengths
 
 
-def _checked_params(params: Any) -> dict[str, float]:
+def checked_params(params: Any) -> dict[str, float]:
     if not isinstance(params, Mapping | None):
         raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
     checked = {}

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -34,14 +35,21 @@ def dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
 
+def tail(z: Any, n: int, terms: int) -> Any:
+    """Σₖ (−z)ᵏ/(n + 2k)!, of so many terms, by Horner's rule, without a bias by the rounding of the first numbers."""
+    c: Any = 1.0 / math.factorial(n + 2 * terms - 2)
+    for k in range(terms - 2, -1, -1):
+        number = 1.0 / math.factorial(n + 2 * k)
+        rest = float(Fraction(1, math.factorial(n + 2 * k)) - Fraction(number))
+        c = number - (z * c - rest) if k < 2 and rest else number - z * c
+    return c
+
+
 def series(X: Any, beta: Any, terms: int) -> tuple[Any, Any, Any, Any]:
-    """G₀ to G₃ of a small βX², by Horner's rule."""
+    """G₀ to G₃ of a small βX²."""
     square = X * X
     z = square * beta
-    c2, c3 = (1.0 / math.factorial(n + 2 * terms - 2) for n in (2, 3))
-    for k in range(terms - 2, -1, -1):
-        c2, c3 = (1.0 / math.factorial(n + 2 * k) - z * c for n, c in ((2, c2), (3, c3)))
-    G2, G3 = square * c2, X * square * c3
+    G2, G3 = square * tail(z, 2, terms), X * square * tail(z, 3, terms)
     return 1.0 - beta * G2, X - beta * G3, G2, G3
 
 
@@ -115,12 +123,59 @@ def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta:
     return [-(a * inverse), t - mu * G3, -(mu * G1 * inverse * end), -(a * end), d, r * G1 + eta * G2]
 
 
-def moved(x: Sequence[Any], v: Sequence[Any], c: Sequence[Any]) -> tuple[Numbers, Numbers]:
-    """Positions and velocities by these coefficients."""
+def moved(x: Sequence[Any], v: Sequence[Any], c: Sequence[Any]) -> Numbers:
+    """Changes of positions and velocities by these coefficients."""
     f, g, df, dg = c
+    return [f * a + g * b for a, b in zip(x, v, strict=True)] + [df * a + dg * b for a, b in zip(x, v, strict=True)]
+
+
+def varied(
+    start: tuple[Sequence[Any], Sequence[Any]],
+    rates: Sequence[Any],
+    c: Sequence[Any],
+    known: tuple[Any, Any, Any, Any, Any, Any],
+    found: tuple[Any, Sequence[Any], Any],
+    late: Any = None,
+) -> Numbers:
+    """Changes of the rates of x and v over a motion with coefficients c, where those before are six numbers.
+
+    `known` are 1/r, η, β, ζ, μ, r at the start, `found` are X, its Stumpff functions, and a step d that is still to be
+    made from X; `late` is the rate of the time by β, where whole periods were left out.
+    """
+    (x, v), (inverse, eta, beta, zeta, mu, r), (X, (G0, G1, G2, G3), d) = start, known, found
+    dx, dv = rates[:3], rates[3:]
+    X, G1, G2, G3, G0 = X + d, G1 + d * G0, G2 + d * G1, G3 + d * G2, G0 - d * (beta * G1)
+    G4, G5 = next_two(X, beta, G2, G3)
+    r_rate = dot(x, dx) * inverse
+    eta_rate, beta_rate = dot(dx, v) + dot(x, dv), -2.0 * (mu * inverse * inverse * r_rate + dot(v, dv))
+    zeta_rate = -(beta * r_rate) - r * beta_rate
+    by_beta = 0.5 * (G3 - X * G2), G4 - 0.5 * (X * G3), 0.5 * (3.0 * G5 - X * G4)  # of G₁, G₂, G₃
+    time = 0.0 if late is None else late * beta_rate
+    slope = 1.0 / (r + (eta * G1 + zeta * G2))
+    X_rate = slope * (
+        time - (X * r_rate + G2 * eta_rate + G3 * zeta_rate + (eta * by_beta[1] + zeta * by_beta[2]) * beta_rate)
+    )
+    first, second, third = (a * X_rate + b * beta_rate for a, b in zip((G0, G1, G2), by_beta, strict=True))
+    end = (r_rate + (G1 * eta_rate + G2 * zeta_rate) + (eta * first + zeta * second)) * slope
+    relative, whole = r_rate * inverse, mu * inverse
+    turned = [
+        -(whole * (second - G2 * relative)),
+        time - mu * third,
+        -(whole * slope * (first - G1 * (relative + end))),
+        -(mu * slope * (second - G2 * end)),
+    ]
+    return [a + b for a, b in zip(moved(dx, dv, c), moved(x, v, turned), strict=True)]
+
+
+def next_two(X: Any, beta: Any, G2: Any, G3: Any) -> tuple[Any, Any]:
+    """G₄ and G₅."""
+    square = X * X
+    z = beta * square
+    short = apply("abs", z) < 1.0
+    small, large = where(short, z, 0.0), where(short, 1.0, beta)
     return (
-        [a + (f * a + g * b) for a, b in zip(x, v, strict=True)],
-        [b + (df * a + dg * b) for a, b in zip(x, v, strict=True)],
+        where(short, square * square * tail(small, 4, TERMS + 1), (0.5 * square - G2) / large),
+        where(short, X * square * square * tail(small, 5, TERMS + 1), (X * square * (1 / 6) - G3) / large),
     )
 
 
@@ -130,19 +185,32 @@ def kepler_flow(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any) -> tuple[Nu
     Ellipses, parabolas and hyperbolas of any eccentricity, as exactly as their conditioning allows; whole periods are
     left out first.
     """
+    new = [a + b for a, b in zip([*x, *v], kepler_changes(x, v, mu, t), strict=True)]
+    return new[:3], new[3:]
+
+
+def kepler_changes(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any, rates: Sequence[Any] = ()) -> Numbers:
+    """The changes of x and v by `kepler_flow`, and of their rates, where these are given."""
     square = dot(x, x)
     r = apply("sqrt", square)
     inverse, eta = 1.0 / r, dot(x, v)
     beta = 2.0 * mu * inverse - dot(v, v)
     bound = where(beta > 0.0, beta, 1.0)
     period = 2.0 * math.pi * mu / (bound * apply("sqrt", bound))
-    t = t - where(beta > 0.0, period * apply("floor", t / period + 0.5), 0.0)
+    left_out = where(beta > 0.0, period * apply("floor", t / period + 0.5), 0.0)
+    t = t - left_out
     sign = where(t < 0.0, 0.0 * t - 1.0, 1.0)
-    t, eta, zeta = t * sign, eta * sign, mu - beta * r
-    X = solved(*map(_still, (r, eta, zeta, beta, mu, t)))
-    f, g, df, dg, _, other = coefficients(X, stumpff(X, beta), r, inverse, eta, zeta, mu, t)
-    g = where(2.0 * apply("abs", t - g) < t, g, other)
-    return moved(x, v, [f, sign * g, sign * df, dg])
+    forward, along, zeta = t * sign, eta * sign, mu - beta * r
+    X = solved(*map(_still, (r, along, zeta, beta, mu, forward)))
+    G = stumpff(X, beta)
+    f, g, df, dg, d, other = coefficients(X, G, r, inverse, along, zeta, mu, forward)
+    g = where(2.0 * apply("abs", forward - g) < forward, g, other)
+    c = [f, sign * g, sign * df, dg]
+    if not rates:
+        return moved(x, v, c)
+    found = sign * X, (G[0], sign * G[1], G[2], sign * G[3]), sign * d
+    known = inverse, eta, beta, zeta, mu, r
+    return moved(x, v, c) + varied((x, v), rates, c, known, found, 1.5 * left_out / bound)
 
 
 def _still(x: Any) -> Any:

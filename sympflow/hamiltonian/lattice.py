@@ -73,7 +73,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
         other = copy.copy(self)
-        for name in ("_functions", "terms"):
+        for name in ("_functions", "terms", "poles"):
             vars(other).pop(name, None)
         other.params = checked_params({**self.params, **values}, self.shape)
         other._check_continuous()
@@ -91,7 +91,8 @@ class LatticeHamiltonian(LocalHamiltonian):
             )
         shape = tuple(min(n, m) for n, m in zip(shape, self.shape, strict=True)) if not self.uniform else shape
         other = copy.copy(self)
-        vars(other).pop("terms", None)
+        for name in ("terms", "poles"):
+            vars(other).pop(name, None)
         other._functions = self._functions  # of sites and bonds, whatever their number
         other.shape, other.boundary = shape, _checked_boundary(boundary, len(shape))
         other.ndof = math.prod(shape) * len(self.fields)
@@ -197,12 +198,12 @@ class LatticeHamiltonian(LocalHamiltonian):
                 kept.append(x)
         return [size * x for x in kept]
 
-    @property
+    @cached_property
     def poles(self) -> Poles | None:  # type: ignore[override]
         return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:
-        if self.poles is None:
+        if self.poles is None or not self.poles.watched:
             return ""
         nearest = LatticePoles(self).nearest(q)
         return f"{nearest} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
@@ -363,7 +364,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         K = transform.total(waves) + onsite if waves else np.broadcast_to(onsite, (*self.shape, F, F))
         linear = SpectralPart.of_matrices(transform, inverse_mass, np.ascontiguousarray(K), interval)
         rest = copy.copy(self)
-        for name in ("_functions", "terms"):
+        for name in ("_functions", "terms", "poles"):
             vars(rest).pop(name, None)
         rest.U, rest.bonds = U if U.free_symbols & set(self.x) else sp.S.Zero, bonds
         return linear, [RestOfLattice(rest)] if rest.U != 0 or bonds else []

@@ -44,6 +44,8 @@ class LocalHamiltonian(Definition, ABC):
     """1 of the momenta that count in H, 0 of those of bodies without mass (d,); None where all do."""
     frame: Any = None
     """The coordinates of planets about a star, of a system that knows its star: see `sympflow.hamiltonian.planets`."""
+    arrays_only: str = ""
+    """What in the system has no compiled kicks, "" if all has."""
     written: SymbolicHamiltonian | None = None
     """H in symbols, of a system so small that it is written out when symbols are asked for."""
     loops: str

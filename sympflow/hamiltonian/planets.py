@@ -7,16 +7,23 @@ which its motion is Kepler's with μ, and the rest of H, the interaction: a pote
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
+import sympy as sp
 
 from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, concatenate, like, masked, stack, to_numpy
-from sympflow.hamiltonian.bodies import PairsHamiltonian
+from sympflow.compiler.functions import apply
+from sympflow.compiler.program import Program, gradient, tangent, traced
+from sympflow.hamiltonian.bodies import Pairs, PairsHamiltonian, checked_params
+from sympflow.hamiltonian.formulas import evaluator
+from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
+from sympflow.hamiltonian.local import letters, parsed
+from sympflow.hamiltonian.recorded import NotRecorded
 
 COORDINATES = ("jacobi", "democratic")
 ELEMENTS = ("a", "e", "inc", "node", "peri", "M")
@@ -29,6 +36,8 @@ TIMES = {"s": 1.0, "day": 86_400.0, "year": 365.25 * 86_400.0}
 MASSES = {"kg": 6.67430e-11, "solar mass": SUN, "Jupiter mass": 1.2668653e17, "Earth mass": 3.986004e14}
 """Units in SI, masses times G: IAU 2012 B2, IAU 2015 B3, CODATA 2018."""
 
+PLACE = "x", "y", "z", "r"
+"""Names in an extra potential: the place of a body as seen from the star, and its distance."""
 FEWEST_STEPS = 20  # of a method in the shortest period
 MOON = 0.5  # of a Hill radius: bodies that are nearer may be bound
 
@@ -176,24 +185,49 @@ class Frame:
         new = kepler_flow([x[..., k] for k in axes], [v[..., k] for k in axes], like(self.mu, x), time)
         return stack(new[0]), stack(new[1])
 
-    def kick(self, x: Array, v: Array, t: Any) -> tuple[Array, Array]:
-        """Let the planets act on each other for a time t (...)."""
-        t, centre = t[..., None, None], 0 * x[..., 0, :]
+    def kick(self, x: Array, v: Array, t: Any, third: Any = None) -> tuple[Array, Array]:
+        """Let the planets act on each other for a time t (...), with `third` (...) times the force gradient too."""
+        t = t[..., None, None]
         share = like((self.masses[self.bodies] / self.masses[0])[:, None], x)
         if not self.jacobi:
             x = x + t / 2 * (share * v).sum(-2, keepdims=True)
-        q = self.absolute(x, centre) if self.jacobi else concatenate([0 * x[..., :1, :], x], -2)[..., self._places, :]
-        slope = self.local.potential_gradient(q.reshape(*q.shape[:-2], -1)).reshape(q.shape)
-        a = -slope / like(self.inertia[:, None], q)
-        a = self.relative(a)[0] if self.jacobi else a[..., self.bodies, :]
-        square = (x * x).sum(-1, keepdims=True)
-        v = v + t * (a + like(self.mu[:, None], x) * x / (square * square**0.5))
+        q = self._placed(x)
+        a = self._accelerations(q, x)
+        v = v + t * a
+        if third is not None:
+            v = v + third[..., None, None] * self._accelerations(q, x, a)
         if not self.jacobi:
             x = x + t / 2 * (share * v).sum(-2, keepdims=True)
         near = self.near(q)
         if near is not None:
             x = masked(x, near.any(-1)[..., None, None], math.nan)
         return x, v
+
+    def _placed(self, x: Array) -> Array:
+        """Places of the bodies, but for that of the centre, or vectors of these, of those of the planets."""
+        if self.jacobi:
+            return self.absolute(x, 0 * x[..., 0, :])
+        return concatenate([0 * x[..., :1, :], x], -2)[..., self._places, :]
+
+    def _accelerations(self, q: Array, x: Array, along: Array | None = None) -> Array:
+        """Accelerations by the interaction; along vectors of the planets, their derivative."""
+        flat = [u.reshape(*u.shape[:-2], -1) for u in ((q,) if along is None else (q, self._placed(along)))]
+        slope = self.local.potential_gradient(*flat) if along is None else self.local.hessian_vector(*flat)
+        a = -slope.reshape(q.shape) / like(self.inertia[:, None], q)
+        a = self.relative(a)[0] if self.jacobi else a[..., self.bodies, :]
+        square = (x * x).sum(-1, keepdims=True)
+        pull = like(self.mu[:, None], x) / (square * square**0.5)
+        if along is None:
+            return a + pull * x
+        return a + pull * (along - 3 * (x * along).sum(-1, keepdims=True) / square * x)
+
+    @property
+    def extra(self) -> tuple[Program, list[float]] | None:
+        """The program of the slope of an extra potential and the numbers behind the place, if there is one."""
+        local = self.local
+        if not isinstance(local, PlanetsHamiltonian) or local.extra is None:
+            return None
+        return local.extra_program(1), local.extra_values
 
     def near(self, q: Array) -> Array | None:
         """True for the pairs of planets with masses (..., P) that are nearer than `encounter`, as `pairs` has them."""
@@ -273,8 +307,18 @@ class PlanetsHamiltonian(PairsHamiltonian):
     """
 
     noun = "system of planets"
+    extra: sp.Expr | None = None
 
-    def __init__(self, masses: Any, G: float, y0: np.ndarray, coordinates: Any, encounter: Any) -> None:
+    def __init__(
+        self,
+        masses: Any,
+        G: float,
+        y0: np.ndarray,
+        coordinates: Any,
+        encounter: Any,
+        extra: Any = None,
+        params: Any = None,
+    ) -> None:
         if coordinates not in COORDINATES:
             raise ValueError(f"`coordinates` must be 'jacobi' or 'democratic'; got {coordinates!r}.")
         encounter = plain(encounter)
@@ -282,6 +326,93 @@ class PlanetsHamiltonian(PairsHamiltonian):
             raise ValueError(f"`encounter` must be positive, in Hill radii, or None for none; got {encounter!r}.")
         super().__init__("-G*m1*m2/r", masses, 3, None, None, None, {"G": G}, None)
         self.start, self.coordinates, self.encounter = y0, coordinates, encounter
+        self.columns = self.inertia[None]  # what bodies without mass feel is per unit mass
+        self._take_extra(extra, params)
+
+    def _take_extra(self, extra: Any, params: Any) -> None:
+        """Read the potential of each body about the star, and the values of its names."""
+        more = checked_params(params)
+        if extra is None:
+            if more:
+                raise ValueError("`params` are those of `extra`, which is not given: leave them out.")
+            return
+        self._letters = dict(zip(("G", "m", *more), letters("c", ("G", "m", *more)), strict=True))
+        names = {**{name: sp.Symbol(name, real=True) for name in PLACE}, **self._letters}
+        if len(names) < len(PLACE) + 2 + len(more):
+            taken = next(name for name in more if name in (*PLACE, "G", "m"))
+            raise ValueError(f"`params` gives a value to {taken!r}, which `extra` has already: rename it.")
+        self.extra = parsed("extra", extra, names, "-3*(G*m/(c*r))**2")
+        self._places = [names[name] for name in PLACE]
+        for name in more:
+            if self._letters[name] not in self.extra.free_symbols:
+                raise ValueError(f"`params` has {name!r}, which `extra` does not use: remove it.")
+        if not self.extra.free_symbols & {*self._places}:
+            raise ValueError(f"`extra` must depend on {', '.join(PLACE)}, the place of a body; got {self.extra}.")
+        self.params = {**self.params, **more}
+        self._check_continuous()
+        self.extra_program(2)  # refuses functions that are in no table
+
+    def _check_continuous(self) -> None:
+        if self.extra is not None:
+            values = dict(zip(self._letters.values(), self.extra_values, strict=True))
+            names = {letter: name for name, letter in self._letters.items()}
+            check_continuous("extra", self.extra, self._places, values, names)
+
+    @property
+    def extra_values(self) -> list[float]:
+        """The numbers that `extra_program` takes after the place."""
+        given = {**self.params, "m": float(self.masses[0])}
+        return [given[name] for name in self._letters]
+
+    def extra_program(self, order: int) -> Program:
+        """The extra potential of a body at x, y, z from the star, with order 0; its slope, and along vectors that.
+
+        The numbers are x, y, z, those of `extra_values`, and the vectors.
+        """
+        if order not in self._programs:
+            names = [*PLACE[:3], *self._letters, *(f"{name}{k}" for k in range(1, order) for name in PLACE[:3])]
+
+            def values(*numbers: Any) -> list[Any]:
+                x, end = numbers[:3], 3 + len(self._letters)
+                r = apply("sqrt", x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+                known = zip([*self._places, *self._letters.values()], [*x, r, *numbers[3:end]], strict=True)
+                found = [1.0 * evaluator(dict(known))(self.extra)]
+                if order:
+                    found = gradient(found[0], x)
+                for k in range(end, len(numbers), 3):
+                    found = tangent(found, x, numbers[k : k + 3])
+                return found
+
+            try:
+                self._programs[order] = traced(values, *names)
+            except NotRecorded as error:
+                raise ValueError(f"`extra` cannot be differentiated: {error} Write it with other functions.") from error
+        return self._programs[order]
+
+    @cached_property
+    def _programs(self) -> dict[int, Program]:
+        return {}
+
+    def _of_extra(self, order: int, *arrays: Array) -> Array:
+        """The numbers (..., n − 1, 1 or 3) that its program gives of arrays (..., d), per unit mass of a body."""
+        q, *vectors = (self._of_bodies(a) for a in arrays)
+        x, *along = (u[..., 1:, :] - u[..., :1, :] for u in (q, *vectors))
+        first, *more = ([u[..., k] for k in range(3)] for u in (x, *along))
+        flat = [a for vector in more for a in vector]
+        found = self.extra_program(order)(*first, *self.extra_values, *flat)
+        return stack([a + 0 * x[..., 0] for a in found])
+
+    def _with_extra(self, slopes: Array, *arrays: Array) -> Array:
+        """Slopes (..., d) with those of the extra potential, which pulls at the star in turn."""
+        if self.extra is None:
+            return slopes
+        found = self._of_extra(len(arrays), *arrays)
+        of_bodies = found * like(self.inertia[1:, None], found)
+        of_star = -(found * like(self.masses[1:, None], found)).sum(-2, keepdims=True)
+        return slopes + concatenate([of_star, of_bodies], -2).reshape(slopes.shape)
+
+    def identity_parts(self) -> Any:
+        return super().identity_parts() + ([] if self.extra is None else [self.extra])
 
     def _check_masses(self) -> None:
         """Do nothing: bodies may have no mass."""
@@ -295,51 +426,60 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return None if (self.masses > 0).all() else np.repeat(np.where(self.masses > 0, 1.0, 0.0), 3)
 
     @property
+    def arrays_only(self) -> str:  # type: ignore[override]
+        """The reason why methods of other splittings have no compiled kicks; "" if they have."""
+        if self.felt is not None:
+            return "bodies without mass"
+        return "" if self.extra is None else "an `extra` potential"
+
+    @property
     def is_few(self) -> bool:
-        return self.felt is None and super().is_few
+        return not self.arrays_only and super().is_few
 
-    @cached_property
-    def _heavy(self) -> tuple[np.ndarray, PairsHamiltonian]:
-        """The bodies that have a mass, and their part of H."""
-        heavy = np.flatnonzero(self.masses > 0)
-        return heavy, PairsHamiltonian("-G*m1*m2/r", self.masses[heavy], 3, None, None, None, self.params, None)
+    @property
+    def _all_at_once(self) -> bool:
+        return self.felt is None and super()._all_at_once
 
-    def _of_heavy(self, q: Array) -> Array:
-        x = q.reshape(*q.shape[:-1], self.n_bodies, 3)[..., self._heavy[0], :]
-        return x.reshape(*x.shape[:-2], 3 * len(self._heavy[0]))
+    def _ends(self, q: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        if self.felt is None:
+            yield from super()._ends(q, most)
+            return
+        heavy, light = np.flatnonzero(self.masses > 0), np.flatnonzero(self.masses == 0)
+        i, j = np.triu_indices(len(heavy), 1)
+        yield heavy[i], heavy[j]
+        size = max(1, most // len(heavy))
+        for k in range(0, len(light), size):
+            some = light[k : k + size]
+            yield np.tile(some, len(heavy)), np.repeat(heavy, len(some))
+
+    def _both_ends(self, f: Array, pairs: Pairs) -> tuple[Array, Array]:
+        return f, f * like(1.0 * (self.masses[pairs.i] > 0)[:, None], f)
 
     def potential(self, q: Array) -> Array:
-        return super().potential(q) if self.felt is None else self._heavy[1].potential(self._of_heavy(q))
+        total: Any = 0 * q[..., 0]
+        for pairs in self._pairs(q):
+            if (self.masses[pairs.i] > 0).all():
+                total = total + pairs.values(0).sum(-1)
+        if self.extra is not None:
+            V = self._of_extra(0, q)[..., 0]
+            total = total + (V * like(self.masses[1:], V)).sum(-1)
+        return total
 
     def potential_gradient(self, q: Array) -> Array:
-        if self.felt is None:
-            return super().potential_gradient(q)
-        return self._with_light(self._heavy[1].potential_gradient(self._of_heavy(q)), q)
+        return self._with_extra(super().potential_gradient(q), q)
 
     def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
-        if self.felt is None:
-            return super().hessian_vector(q, v, *t)
-        return self._with_light(self._heavy[1].hessian_vector(self._of_heavy(q), self._of_heavy(v)), q, v)
+        return self._with_extra(super().hessian_vector(q, v, *t), q, v)
 
-    def _with_light(self, heavy: Array, q: Array, v: Array | None = None) -> Array:
-        """Slopes of the bodies with mass, and per unit mass of all others; along v their derivatives."""
-        order, light = self._heavy[0], np.flatnonzero(self.masses == 0)
-        x = q.reshape(*q.shape[:-1], self.n_bodies, 3)
-        u = None if v is None else v.reshape(*v.shape[:-1], self.n_bodies, 3)
-        total: Any = 0 * (x if u is None else x + u)[..., light, :]
-        for j in order.tolist():
-            d = x[..., light, :] - x[..., j : j + 1, :]
-            square = (d * d).sum(-1)[..., None]
-            w = self.params["G"] * float(self.masses[j]) / (square * square**0.5)
-            if u is None:
-                total = total + w * d
-            else:
-                e = u[..., light, :] - u[..., j : j + 1, :]
-                total = total + w * (e - 3 * (d * e).sum(-1)[..., None] / square * d)
-        known = heavy.reshape(*heavy.shape[:-1], len(order), 3)
-        whole = concatenate([known + 0 * total[..., :1, :], total], -2)
-        whole = whole[..., np.argsort(np.concatenate([order, light])), :]
-        return whole.reshape(*whole.shape[:-2], self.ndof)
+    def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
+        return self._with_extra(super().third_derivative(q, v, w, *t), q, v, w)
+
+    def energy_density(self, y: Array, *t: Array) -> Array:
+        density = super().energy_density(y, *t)
+        if self.extra is None:
+            return density
+        V = self._of_extra(0, y[..., : self.ndof])[..., 0]
+        return density + concatenate([0 * V[..., :1], V * like(self.masses[1:], V)])
 
     @cached_property
     def frame(self) -> Frame:
@@ -358,8 +498,8 @@ class PlanetsHamiltonian(PairsHamiltonian):
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         other = super().with_params(values)
-        for name in ("frame", "_heavy"):
-            vars(other).pop(name, None)
+        other.constants = (other.params["G"],)
+        vars(other).pop("frame", None)
         return other
 
 

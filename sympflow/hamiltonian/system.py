@@ -396,6 +396,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
         units: str | Sequence[str] | None = None,
         coordinates: str = "jacobi",
         encounter: float | None = 1.0,
+        extra: str | sympy.Expr | None = None,
+        params: Mapping[str, float] | None = None,
         **scene: Unpack[SceneOptions],
     ) -> HamiltonianSystem:
         """Planets about a star: H = Σ_i |p_i|²/(2 m_i) − G Σ_{i<j} m_i m_j/r_ij, for methods of the splitting "kepler".
@@ -424,6 +426,13 @@ class HamiltonianSystem(Hamiltonian, Shown):
         encounter : float or None
             Two planets that come closer to each other than so many Hill radii end a run of the splitting "kepler", with
             status −1, their numbers and the time. None for no such end.
+        extra : str or sympy.Expr, optional
+            Φ, a further potential per unit mass of each body, Σ_i m_i Φ(q_i − q_0) in H, for kicks: an expression of
+            x, y, z and r, the place of a body as seen from the star, m, the star's mass, G, and the names of `params`.
+            ``"-3*(G*m/(c*r))**2"`` gives the precession of general relativity, and with z along the axis of the star
+            ``"J2*G*m*R**2*(3*z**2/r**2 - 1)/(2*r**3)"`` is its flattening. The star is pulled in turn.
+        params : mapping of str to float, optional
+            Values of other names in `extra`.
         name, domain, y0, t_span, dt, energy_scale, exact
             As for the class; `t_span` is by default a thousand of the longest periods, `dt` a twentieth of the
             shortest.
@@ -442,7 +451,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         from sympflow.hamiltonian.planets import PlanetsHamiltonian, checked_planets
 
         masses, G, y0 = checked_planets(masses, elements, scene.get("y0"), G, units)
-        local = PlanetsHamiltonian(masses, G, y0, coordinates, encounter)
+        local = PlanetsHamiltonian(masses, G, y0, coordinates, encounter, extra, params)
         span, dt = (0.0, 1000 * float(local.frame.periods.max())), local.frame.longest_step
         given = {name: value for name, value in scene.items() if value is not None} | {"y0": y0}
         return cls._of_pieces(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))

@@ -23,13 +23,14 @@ from sympflow.integrators.contract import (
     ENDED,
     Failure,
     Integrator,
+    Interrupted,
     Outcome,
     Problem,
     Steps,
     start_of,
 )
 from sympflow.integrators.grid import Grid
-from sympflow.integrators.grid_runs import GridRun
+from sympflow.integrators.grid_runs import grid_run
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.steppers import ArraySteps, Stepper, rollout
 from sympflow.kernels.protocol import RunCheckpoint
@@ -128,7 +129,7 @@ class FixedStep(Integrator):
         return states, finite, library_name(problem.y0)
 
     def run(self, problem: Problem) -> Outcome:
-        return GridRun(self, problem).outcome()
+        return grid_run(self, problem).outcome()
 
     def steps(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array) -> Steps:
         stepper, chunk, y = self.stepper(Problem(system, *t_span, y0)), 256, y0
@@ -250,7 +251,11 @@ class Recorder:
 
 def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch) -> Outcome:
     """Run an integrator that does not look for events itself: they are sought on its dense output afterwards."""
-    full = integrator.run(replace(problem, t_eval=None, save_every=1, dense_output=True, events=None))
+    stopped = False
+    try:
+        full = integrator.run(replace(problem, t_eval=None, save_every=1, dense_output=True, events=None))
+    except Interrupted as stop:
+        full, stopped = stop.outcome, True
     if full.sol is None:
         raise ValueError(
             f"`events` are located on the dense output, which method {integrator.name!r} does not give: use another "
@@ -275,4 +280,7 @@ def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch
             t, y = np.append(t, t_end), stack([*y, search.end[1]], axis=0)
     if search.end:
         full.status, full.message = 1, ENDED
-    return replace(full, t=t, y=y, sol=full.sol if problem.dense_output else None)
+    outcome = replace(full, t=t, y=y, sol=full.sol if problem.dense_output else None)
+    if stopped and not search.end:
+        raise Interrupted(outcome)
+    return outcome

@@ -29,28 +29,19 @@ from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, sc
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parts import ExactParts, SubFlow
     from sympflow.hamiltonian.planets import Frame
+    from sympflow.kernels.kepler import KeplerKernel
     from sympflow.kernels.protocol import Kernel, RunCheckpoint
     from sympflow.kernels.splitting_loops import SplittingLoops
+    from sympflow.kernels.tangents import TangentKernel
 
 _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()
 
 
 class Composition(ABC, ArraySteps):
-    """A scheme composed of the exact flows of the parts of one system.
+    """A scheme composed of the exact flows of the parts of one system; `method` is its name in messages.
 
-    A subclass may take options of its own: `parts`, `omega` or `corrector` of `Splitting`.
-
-    Parameters
-    ----------
-    method : str
-        The name of the method, for messages.
-    scheme : Scheme
-    system : HamiltonianSystem
-
-    Raises
-    ------
-    ValueError
-        If the splitting, or the scheme with it, does not apply to the system.
+    A subclass may take options of its own: `parts`, `omega` or `corrector` of `Splitting`. A ValueError says where the
+    splitting, or the scheme with it, does not apply to the system.
     """
 
     compensates: ClassVar[bool] = False
@@ -117,6 +108,13 @@ class Composition(ABC, ArraySteps):
     @abstractmethod
     def kernel(self, compensated: bool) -> Kernel:
         """The compiled loops; a ValueError says why there are none."""
+
+    def tangent_kernel(self, vectors: int) -> TangentKernel:
+        """The compiled loops with k deviation vectors; a ValueError says why there are none."""
+        raise ValueError(
+            f"`method` {self.method!r} has compiled deviation vectors on the splittings 'kinetic' and 'kepler' only: "
+            "use backend='auto'."
+        )
 
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
         """The same with the parameters of these names as numbers by which runs are differentiated."""
@@ -262,6 +260,11 @@ class KineticPotential(Composition):
 
     def kernel(self, compensated: bool) -> Kernel:
         return _splitting_loops()(self.system).kernel(self.scheme, compensated)
+
+    def tangent_kernel(self, vectors: int) -> TangentKernel:
+        from sympflow.kernels.tangents import tangent_kernel
+
+        return tangent_kernel(self.system, self.scheme, vectors)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
@@ -585,15 +588,16 @@ class KeplerInteraction(Composition):
     heliocentric ones it holds the motion of the star too, half before a kick and half after, which is of order 2.
     """
 
+    compensates: ClassVar[bool] = True
     doubts: ClassVar[bool] = True
     breakdown: ClassVar[Failure | None] = Failure.ENCOUNTER
 
     def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem, corrector: int | None = None) -> None:
         super().__init__(method, scheme, system)
-        if scheme.level:
+        if scheme.level > FORCE_GRADIENT:
             raise ValueError(
-                f"`splitting` 'kepler' has plain kicks, and the scheme of method {method!r} has force gradients: use "
-                "'leapfrog', 'aba864' or another scheme without them."
+                f"`splitting` 'kepler' has kicks with force gradients, and the scheme of method {method!r} has more: "
+                "use 'leapfrog', 'aba864' or 'chin4a'."
             )
         if system.friction:
             raise ValueError(f"`method` {method!r} does not take friction: use the splitting 'kinetic'.")
@@ -610,16 +614,23 @@ class KeplerInteraction(Composition):
             frame.check(method)
             known["kepler"] = frame
         self.frame: Frame = known["kepler"]
-        self.substeps = _paired([(s.kind, s.one) for s in scheme.substeps])
-        self.before: list[tuple[float, float]] = []
-        self.after: list[tuple[float, float]] = []
+        if scheme.level and not self.frame.jacobi:
+            raise ValueError(
+                f"`method` {method!r} has force gradients, which the interaction has in Jacobi's coordinates only: "
+                "make the system with coordinates='jacobi'."
+            )
+        self.substeps = _paired([(s.kind, s.one, s.three) for s in scheme.substeps])
+        self.before: list[tuple[float, float, float]] = []
+        self.after: list[tuple[float, float, float]] = []
         if corrector is not None:
             if [s[:2] for s in scheme.substeps] != [("drift", 0.5), ("kick", 1.0), ("drift", 0.5)]:
                 raise ValueError(
                     f"`corrector` goes with the steps of 'wisdom_holman', and method {method!r} makes other ones: "
                     "leave it out."
                 )
-            self.before, self.after = (_paired(corrector_maps(corrector, sign)) for sign in (1, -1))
+            self.before, self.after = (
+                _paired([(*m, 0.0) for m in corrector_maps(corrector, sign)]) for sign in (1, -1)
+            )
 
     def force_times(self) -> list[float]:
         return []
@@ -629,23 +640,45 @@ class KeplerInteraction(Composition):
 
     def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         maps = [*self.before, *self.substeps, *self.after]
-        kicks, drifts = [-b for b, _ in maps[::-1]], [-a for _, a in maps[::-1]]
-        back = zip([0.0, *kicks], [*drifts, 0.0], strict=True)
-        return self._moved(y, h, [*back], -1.0)
+        kicks, drifts = [(-b, -c) for b, _, c in maps[::-1]], [-a for _, a, _ in maps[::-1]]
+        back = [(b, a, c) for (b, c), a in zip([(0.0, 0.0), *kicks], [*drifts, 0.0], strict=True)]
+        return self._moved(y, h, back, -1.0)
 
-    def _moved(self, y: Array, h: Any, maps: Sequence[tuple[float, float]], sign: float = 1.0) -> Array:
+    def _moved(self, y: Array, h: Any, maps: Sequence[tuple[float, float, float]], sign: float = 1.0) -> Array:
         frame = self.frame
         h = like(np.asarray(h, dtype=float), y) if isinstance(h, int | float) else h
         x, v, Q, U = frame.into(y)
-        for kick, drift in maps:
-            if kick:
-                x, v = frame.kick(x, v, kick * h)
+        for kick, drift, third in maps:
+            if kick or third:
+                x, v = frame.kick(x, v, kick * h, third * h**3 if third else None)
             if drift:
                 x, v = frame.drift(x, v, drift * h)
         return frame.out(x, v, Q + sign * h[..., None] * U, U)
 
+    def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
+        n = y.shape[-1]
+        return self.jvp(y, h, np.broadcast_to(np.eye(n), (*y.shape, n)))
+
+    def jvp(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
+        y = to_numpy(y)
+        if y.dtype != np.float64 or not y.size:
+            return None
+        try:
+            kernel = self.kernel(False)
+            rows = y.reshape(-1, y.shape[-1])
+            lengths = np.broadcast_to(h, y.shape[:-1]).astype(float).ravel()
+            ends, vectors = kernel.jvp(lengths, rows, W.reshape(*rows.shape, -1))
+        except ValueError:
+            return None
+        return ends.reshape(y.shape), vectors.reshape(W.shape)
+
+    def tangent_kernel(self, vectors: int) -> TangentKernel:
+        from sympflow.kernels.kepler import KeplerTangents
+
+        return KeplerTangents(self.kernel(False), vectors)
+
     def longest_step(self) -> float:
-        kicks = sum(kick != 0 for kick, _ in self.substeps)
+        kicks = sum(kick != 0 for kick, *_ in self.substeps)
         return self.frame.longest_step * max(kicks, 1)
 
     def doubt(self, dt: float) -> str:
@@ -665,34 +698,34 @@ class KeplerInteraction(Composition):
             )
         return ""
 
-    def kernel(self, compensated: bool) -> Kernel:
+    def kernel(self, compensated: bool) -> KeplerKernel:
         from sympflow.kernels.kepler import KeplerKernel, KeplerLoops
 
         known = _KEPLER.setdefault(self.frame, {})
         if "loops" not in known:
             known["loops"] = KeplerLoops(self.frame)
-        return KeplerKernel(known["loops"], self.substeps, self.before, self.after)
+        return KeplerKernel(known["loops"], self.substeps, self.before, self.after, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         counts = scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
         processed = (n_saved if backend == "compiled" else 2 * n_steps) + 2 * n_extra
-        counts["force_evaluations"] += sum(kick != 0 for kick, _ in self.before) * processed
+        counts["force_evaluations"] += sum(kick != 0 for kick, *_ in self.before) * processed
         return counts
 
 
 _KEPLER: WeakKeyDictionary[Frame, dict[str, Any]] = WeakKeyDictionary()
 
 
-def _paired(maps: Sequence[tuple[str, float]]) -> list[tuple[float, float]]:
-    """Kicks, each with the drift after it."""
-    pairs: list[tuple[float, float]] = []
-    for kind, c in maps:
+def _paired(maps: Sequence[tuple[str, float, float]]) -> list[tuple[float, float, float]]:
+    """Kicks, each with the drift after it, and its force gradient."""
+    pairs: list[tuple[float, float, float]] = []
+    for kind, c, third in maps:
         if kind == "kick":
-            pairs.append((c, 0.0))
+            pairs.append((c, 0.0, third))
         elif pairs and not pairs[-1][1]:
-            pairs[-1] = pairs[-1][0], c
+            pairs[-1] = pairs[-1][0], c, pairs[-1][2]
         else:
-            pairs.append((0.0, c))
+            pairs.append((0.0, c, 0.0))
     return pairs
 
 

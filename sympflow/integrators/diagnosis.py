@@ -176,16 +176,15 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
     starts = to_numpy(problem.y0).reshape(-1, width)
     every = slice(None, None, max(1, n // LOOKED_AT))
     y = np.concatenate([starts[None], to_numpy(outcome.y).reshape(n, len(starts), width)[every]])
+    steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
     for each in poles.cancelling:
-        x = y[..., each.column] - each.at
-        about = np.fmin.reduce(x) <= 0
-        about &= np.fmax.reduce(x) >= 0
-        if not about.any():
-            continue
-        reach = float(np.fmax.reduce(np.abs(x[:, about]), axis=None))
-        steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
-        visited = y[:, about, each.column].ravel()
-        if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, visited) > LOST_DIGITS:
+        x = poles.visited(each, y).reshape(len(y), -1) - each.at
+        about = (np.fmin.reduce(x) <= 0) & (np.fmax.reduce(x) >= 0)
+        if about.any():
+            x = x[:, about]
+        sizes = np.abs(x)
+        near = float(np.fmax.reduce(sizes, axis=None) / steps if about.any() else np.fmin.reduce(sizes, axis=None))
+        if near > 0 and x[0].all() and not each.loss(near, x.ravel() + each.at) > LOST_DIGITS:
             continue
         _TOLD.add(poles)
         warn(

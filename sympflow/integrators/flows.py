@@ -31,7 +31,7 @@ from sympflow.integrators.clocks import (
 )
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
-from sympflow.integrators.grid_runs import GridRun
+from sympflow.integrators.grid_runs import grid_run
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
 from sympflow.kernels.protocol import RunCheckpoint
 
@@ -195,7 +195,7 @@ class FlowIntegrator(FixedStep):
         return Stepper(self, problem, FlowSteps(flow, kernel is not None), kernel)
 
     def run(self, problem: Problem) -> Outcome:
-        run = GridRun(self, problem)
+        run = grid_run(self, problem)
         if self.tolerance is not None:
             check_start(self.known_flow(problem.system), problem.system, problem.y0, run.stepper.compiled)
         return run.outcome()

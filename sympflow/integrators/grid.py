@@ -111,36 +111,30 @@ class Grid:
         count = np.where(on_grid, nearest, np.floor(x)).astype(np.int64)
         return count, np.where(on_grid, 0.0, t - (self.t0 + count * self.h))
 
-    def outputs(self, t_eval: np.ndarray | None, save_every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Output times (n,), their counts and remainders: `t_eval`, or every `save_every`-th step and the end."""
-        if t_eval is not None:
-            if len(t_eval) == 1:
-                k, r = self.place(float(t_eval[0]))
-                return t_eval, np.array([k]), np.array([r])
-            return t_eval, *self.locate(t_eval, bounded=False)
-        count = np.arange(0, self.n_steps + 1, save_every)
-        t = self.t0 + count * self.h
-        remainder = np.zeros(len(count))
-        if self.remainder or count[-1] != self.n_steps:
-            count, t = np.append(count, self.n_steps), np.append(t, self.t1)
-            remainder = np.append(remainder, self.remainder)
-        elif self.n_steps:
-            t[-1] = self.t1
-        return t, count, remainder
+    def outputs(self, t_eval: np.ndarray | None, save_every: int) -> np.ndarray:
+        """Output times (n,): `t_eval`, or every `save_every`-th step and the end."""
+        outputs = Outputs(self, t_eval, save_every)
+        return outputs.part(0, outputs.n)[0]
 
 
 class Outputs:
-    """The outputs of a run by their numbers 0 … n − 1: `Grid.outputs`, of which a part is made at a time."""
+    """The outputs of a run by their numbers 0 … n − 1, of which a part is made at a time.
+
+    These are the times of `t_eval`, or those of every `save_every`-th step and the end.
+    """
 
     def __init__(self, grid: Grid, t_eval: np.ndarray | None, save_every: int) -> None:
         self.grid, self.t_eval, self.every = grid, t_eval, save_every
-        if t_eval is not None:
-            _, self.count, self.remainder = grid.outputs(t_eval, save_every)
-            self.n, self.last = len(t_eval), int(self.count[-1]) if len(t_eval) else 0
+        if t_eval is None:
+            whole, rest = divmod(grid.n_steps, save_every)
+            self.n, self.last = whole + 1 + bool(rest or grid.remainder), grid.n_steps
             return
-        whole, rest = divmod(grid.n_steps, save_every)
-        self.extra = int(bool(rest or grid.remainder))  # the end, which is none of the others
-        self.n, self.last = whole + 1 + self.extra, grid.n_steps
+        if len(t_eval) == 1:
+            k, r = grid.place(float(t_eval[0]))
+            self.count, self.remainder = np.array([k]), np.array([r])
+        else:
+            self.count, self.remainder = grid.locate(t_eval, bounded=False)
+        self.n, self.last = len(t_eval), int(self.count[-1]) if len(t_eval) else 0
 
     def up_to(self, k: int) -> int:
         """Return how many there are at step k, within the step after it, and before."""
@@ -153,13 +147,23 @@ class Outputs:
         if self.t_eval is not None:
             return self.t_eval[first:end], self.count[first:end], self.remainder[first:end]
         grid = self.grid
-        count = np.arange(first, end, dtype=np.int64) * self.every
-        if end == self.n and end > first:
-            count[-1] = grid.n_steps
-        t, remainder = grid.t0 + count * grid.h, np.zeros(len(count))
-        if end == self.n and end > first and grid.n_steps + bool(grid.remainder):
-            t[-1], remainder[-1] = grid.t1, grid.remainder
+        count = np.arange(first * self.every, end * self.every, self.every)
+        t, remainder = grid.t0 + count * grid.h, np.zeros(end - first)
+        if first < end == self.n:
+            count[-1], remainder[-1] = grid.n_steps, grid.remainder
+            t[-1] = grid.t1 if grid.n_steps or grid.remainder else grid.t0
         return t, count, remainder
+
+    def counts(self, n: int, last: int) -> tuple[int, int]:
+        """Return the number of states that the first n outputs take from steps 1 … last, and of those within steps."""
+        if self.t_eval is not None:
+            count = self.count[:n]
+            count = count[(count > 0) & (count <= last)]
+            return len(distinct(count)[0]), int(np.count_nonzero(self.remainder[:n]))
+        n_steps, at_end = self.grid.n_steps, n == self.n > 0
+        multiples = min(max(n - 1, 0), n_steps // self.every, last // self.every)
+        rest = at_end and n_steps % self.every > 0 and n_steps <= last
+        return multiples + rest, int(at_end and bool(self.grid.remainder))
 
 
 def distinct(count: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:

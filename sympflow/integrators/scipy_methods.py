@@ -113,7 +113,7 @@ class _Scipy(RungeKutta):
         batch = problem.y0.shape[:-1]
         t_eval = problem.t_eval
         if t_eval is None:  # the trajectories take different steps: report on a common grid
-            t_eval = Grid(problem.t0, problem.t1, problem.system.dt).outputs(None, problem.save_every)[0]
+            t_eval = Grid(problem.t0, problem.t1, problem.system.dt).outputs(None, problem.save_every)
         runs, problem = [], replace(problem, progress=None)
         try:
             for y0 in problem.y0.reshape(-1, problem.y0.shape[-1]):

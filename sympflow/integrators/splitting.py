@@ -44,10 +44,7 @@ END = 1e-9
 class Clock:
     """A time in which steps are equal, with the traits of the contract that depend on it.
 
-    Attributes
-    ----------
-    on : callable, optional
-        Makes of a method and a system the method on the clock; None for the physical time, which needs none.
+    `on` makes of a method and a system the method on the clock; None for the physical time, which needs none.
     """
 
     on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None
@@ -140,7 +137,7 @@ class Splitting(FixedStep):
         orbit. Elsewhere a step is then dt·2B/(c − V(q)).
     compensated : bool
         True to sum with Kahan's compensation, which slows the growth of round-off over many steps. Compiled only, for
-        the splitting "kinetic". The sums begin anew with each piece of a run that is executed in pieces: with events,
+        the splittings "kinetic" and "kepler". The sums begin anew with each piece of a run that is executed in pieces:
         within SciPy's `solve_ivp`, and where the metrics execute it again.
     splitting : str
         The parts: "kinetic" | potential; "linear" | rest, the exact flow of the quadratic part of H in place of the
@@ -213,7 +210,7 @@ class Splitting(FixedStep):
             value = getattr(self, name)
             check_one_of(name, value, known)
         if self.compensated and not SPLITTINGS[self.splitting].compensates:
-            raise ValueError("`compensated` sums are for the splitting 'kinetic': leave it out.")
+            raise ValueError("`compensated` sums are for the splittings 'kinetic' and 'kepler': leave it out.")
         if self.shift is not None:
             checked_shift(self.shift)
             if self.clock == "physical":
@@ -399,15 +396,12 @@ class Splitting(FixedStep):
                 yield at, length, partial(self.jvp, system, start, y, length.astype(y.dtype))
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
-        scheme = self.kicks_and_drifts
-        if scheme is None or self.compensated:
+        if self.clock != "physical" or self.overrides("step") or self.compensated:
             raise ValueError(
-                f"`method` {self.name!r} has compiled deviation vectors on the splitting 'kinetic' and the clock "
-                "'physical' only, without compensated sums: use backend='auto'."
+                f"`method` {self.name!r} has compiled deviation vectors on the clock 'physical' only, without "
+                "compensated sums: use backend='auto'."
             )
-        from sympflow.kernels.tangents import tangent_kernel
-
-        return tangent_kernel(system, scheme, vectors)
+        return self.composed(system).tangent_kernel(vectors)
 
     def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:
         if not self.keeps:

@@ -345,7 +345,7 @@ class Adaptive(Watched, RungeKutta):
         if problem.t_eval is not None:
             return problem.t_eval, {}
         dt = problem.system.dt
-        return Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)[0], {"output_step": dt}
+        return Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every), {"output_step": dt}
 
     def output_step(self, problem: Problem) -> float:
         return problem.system.dt
@@ -461,7 +461,7 @@ class Adams(Watched):
 
     def outputs(self, problem: Problem) -> tuple[np.ndarray, dict[str, Any]]:
         dt = self.step_length(problem.system)
-        return Grid(problem.t0, problem.t1, dt).outputs(problem.t_eval, problem.save_every)[0], {"dt": dt}
+        return Grid(problem.t0, problem.t1, dt).outputs(problem.t_eval, problem.save_every), {"dt": dt}
 
     def make_trace(self, system: HamiltonianSystem, t_span: tuple[float, float], y0: Array, visit: Visit) -> Trace:
         return _Nodes(self.step_length(system), system, t_span, y0, visit)

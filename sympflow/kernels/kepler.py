@@ -3,7 +3,7 @@
 A state has, for each group of eight planets, their three coordinates and three velocities, a register each. A column
 is a kick and the drift after it. The drift guesses X by a series of third order and corrects it twice by Halley's
 method, with addition theorems in place of new series; where that is not enough, which is tested, the general solver
-does it.
+does it. A number is a register, or a dual one, of a register and its rate along a deviation vector.
 
 References
 ----------
@@ -16,22 +16,24 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.compiler.control import Code, Type, Value
+from sympflow.compiler.control import INT, Type, Value
+from sympflow.compiler.dual import Dual
 from sympflow.compiler.functions import where
-from sympflow.hamiltonian.kepler import coefficients, dot, kepler_flow, moved, series
+from sympflow.hamiltonian.kepler import coefficients, dot, kepler_changes, moved, series, varied
 from sympflow.hamiltonian.planets import Frame
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts, zeros
 from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.tangents import EVERY, TangentKernel, exponent_of
 
-__all__ = ["KeplerKernel", "Substeps"]
+__all__ = ["KeplerKernel", "KeplerLoops", "KeplerTangents", "Substeps"]
 
 LANES, LANES_SHIFT = 8, 3
 AXES = 3
@@ -41,13 +43,42 @@ TERMS, LONGEST = 9, 2.0  # of the series of a drift, and the βX² up to which t
 AWAY = 1e3  # of the largest orbit: where lanes without a planet are
 WORK = 250  # nanoseconds of a stage
 ONE = np.ones(1, dtype=np.int64)
+REGISTER = Type("double", LANES)
+POWERS = np.array([1, 1, 3])  # of the step, with which the numbers of a column grow
 ROWS = ("Gm", "mu", "weight", "ratio", "over", "mass", "star", "share")
 """Constants of each planet: Gm, μ, its share in the mass up to it, that mass over the one before, 1 over that, m, the
 G m of the star, its mass as a part of the star's."""
 
-Substeps = Sequence[tuple[float, float]]
-"""Kicks and the drifts after them, one after the other, of a step or a processor, times its length."""
-Vectors = list[Value]
+Substeps = Sequence[tuple[float, float, float]]
+"""Kicks, the drifts after them, and the force gradients of the kicks, one after the other, of a step of length 1."""
+Vectors = list[Any]
+
+
+class Form(NamedTuple):
+    """What a run carries: deviation vectors, which may grow without bound, force gradients, compensated sums."""
+
+    vectors: int = 0
+    grows: bool = False
+    gradients: bool = False
+    compensated: bool = False
+
+
+class Sum:
+    """A number that is changed often; with an error that is the part of the changes which rounding left out."""
+
+    __slots__ = ("error", "value")
+
+    def __init__(self, value: Any, error: Value | None) -> None:
+        self.value, self.error = value, error
+
+    def add(self, change: Any) -> None:
+        if self.error is None:
+            self.value = self.value + change
+            return
+        change = change + self.error
+        new = self.value + change
+        self.error = change - (new - self.value)
+        self.value = new
 
 
 class KeplerCode(Rollouts):
@@ -55,58 +86,112 @@ class KeplerCode(Rollouts):
 
     lanes, fewest = 1, 1
 
-    def __init__(self, frame: Frame) -> None:
+    def __init__(self, frame: Frame, form: Form) -> None:
         self.light = places_of_light(frame)
         self.groups = -(-(len(frame.order) + bool(self.light)) // LANES)  # with one lane behind all planets
-        whole = NUMBERS * (self.groups + len(self.light))
-        super().__init__(whole, whole)
+        self.form, self.whole = form, NUMBERS * (self.groups + len(self.light))
+        n_values = self.whole * (1 + form.vectors + form.compensated) + form.vectors * form.grows
+        super().__init__(n_values, self.whole if form.compensated else n_values)
+        self.every = EVERY if form.grows else None
         self.planets = len(frame.order)
         self.jacobi, self.watches = frame.jacobi, frame.encounter is not None
         planets = LANES * self.groups
-        self.room, self.size = 3 * AXES * planets, 2
+        self.room, self.size = 3 * AXES * planets, 3 if form.gradients else 2
         table, limits = constants(frame, self.groups)
         self.report = zeros(AXES * (planets + LANES) + 1)
         inside = np.array([frame.inside[group[0]] for group in self.light])
         of_light = np.stack([frame.G * frame.sums[inside], 1 / frame.sums[inside], inside]) if len(inside) else zeros(1)
         near = np.zeros(planets)
         near[: len(frame.order)] = ((frame.encounter or 0.0) * frame.hill_radii(frame.order, frame.order, 0.0)) ** 2
-        self.data = (table, limits, self.report, np.ascontiguousarray(of_light), near)
+        self.extra = frame.extra
+        values = zeros(1) if self.extra is None else np.array(self.extra[1])
+        self.data = (table, limits, self.report, np.ascontiguousarray(of_light), near, values)
 
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
         """A kick and a drift, which may be of length 0."""
-        code, type = room.code, Type("double", LANES)
-        kick, drift = (code.splat(numbers(i), LANES) for i in range(2))
+        given = [room.state, room.work, room.places, *(numbers(i) for i in range(self.size))]
+        room.code.outlined("stage", given, self._stage)
+
+    def _stage(self, state: Value, work: Value, places: Value, *numbers: Value) -> None:
+        code = state.code
+        room = Room(code, 1, state, work, code.constant(self.n_values, INT), places)
+        lengths = [code.splat(x, LANES) for x in numbers]
         table = room.data(0)
         known = [
-            [code.load(table, (len(ROWS) * g + i) * LANES, type) for i in range(len(ROWS))] for g in range(self.groups)
+            [code.load(table, (len(ROWS) * g + i) * LANES, REGISTER) for i in range(len(ROWS))]
+            for g in range(self.groups)
         ]
         c = [dict(zip(ROWS, rows, strict=True)) for rows in known]
-        state = [
-            [code.load(room.state, NUMBERS * g + LANES * i, type) for i in range(2 * AXES)] for g in range(self.groups)
-        ]
-        x, v = ([group[k : k + AXES] for group in state] for k in (0, AXES))
-        if not self.jacobi:
-            x = self._jumped(x, v, c, 0.5 * kick)
-        roots = [sqrt(dot(each, each)) for each in x]
-        inverses = [1.0 / r for r in roots]
-        v, kick = self._kicked(room, x, v, c, kick, inverses)
-        if not self.jacobi:
-            x = self._jumped(x, v, c, 0.5 * kick)
-            roots = [sqrt(dot(each, each)) for each in x]
-            inverses = [1.0 / r for r in roots]
-        for g in range(self.groups):
-            new = drifted(x[g], v[g], c[g]["mu"], drift, roots[g], inverses[g])
-            for i, value in enumerate([*new[0], *new[1]]):
-                code.store(value, room.state, NUMBERS * g + LANES * i)
+        if self.form.vectors:
+            with code.over(self.form.vectors) as k:
+                self._moved(room, c, lengths, code.at(state, (k + 1) * self.whole))
+        kick = self._moved(room, c, lengths)
         if len(self.light):
             with code.over(len(self.light)) as turn:
-                self._light(room, turn, kick, drift, c[0]["star"])
+                self._light(room, turn, kick, lengths[1], c[0]["star"])
+
+    def _moved(
+        self, room: Room, c: list[dict[str, Value]], lengths: Sequence[Value], vector: Value | None = None
+    ) -> Value:
+        """Move the planets, or in their place a deviation vector by the derivative of that, and return the kick."""
+        code, groups = room.code, range(self.groups)
+        (kick, drift, *third) = lengths
+        state = [self._read(room, code.at(room.state, NUMBERS * g), vector, NUMBERS * g) for g in groups]
+        if not self.jacobi:
+            self._jump(state, c, 0.5 * kick)
+        x = [values(group[:AXES]) for group in state]
+        roots = [sqrt(dot(each, each)) for each in x]
+        inverses = [1.0 / r for r in roots]
+        watch = partial(self._watch, room, kick) if self.watches and vector is None else None
+        a, kick = self._accelerations(room, x, c, inverses, kick, watch)
+        turned = None
+        if third:
+            again = [[Dual(y, b) for y, b in zip(*z, strict=True)] for z in zip(x, a, strict=True)]
+            turned, _ = self._accelerations(room, again, c, [1.0 / sqrt(dot(y, y)) for y in again], kick)
+        for g in groups:
+            for i in range(AXES):
+                change = kick * a[g][i]
+                if turned is not None:
+                    change = change + third[0] * turned[g][i].rate
+                state[g][AXES + i].add(change)
+        if not self.jacobi:
+            self._jump(state, c, 0.5 * kick)
+            x = [values(group[:AXES]) for group in state]
+            roots = [sqrt(dot(each, each)) for each in x]
+            inverses = [1.0 / r for r in roots]
+        for g in groups:
+            v = values(state[g][AXES:])
+            changes = drifted(x[g], v, c[g]["mu"], drift, roots[g], inverses[g])
+            for y, change in zip(state[g], changes, strict=True):
+                y.add(change)
+            self._write(room, code.at(room.state, NUMBERS * g), state[g], vector, NUMBERS * g)
+        return kick
+
+    def _read(self, room: Room, place: Value, vector: Value | None = None, at: int = 0) -> list[Sum]:
+        """The numbers of a group, with their errors, or with those of a vector as rates."""
+        code, turns = room.code, [LANES * i for i in range(2 * AXES)]
+        found = [code.load(place, i, REGISTER) for i in turns]
+        if vector is not None:
+            return [Sum(Dual(x, code.load(vector, at + i, REGISTER)), None) for x, i in zip(found, turns, strict=True)]
+        if not self.form.compensated:
+            return [Sum(x, None) for x in found]
+        return [Sum(x, code.load(place, self.whole + i, REGISTER)) for x, i in zip(found, turns, strict=True)]
+
+    def _write(self, room: Room, place: Value, group: list[Sum], vector: Value | None = None, at: int = 0) -> None:
+        for i, x in enumerate(group):
+            if vector is not None:
+                room.code.store(x.value.rate, vector, at + LANES * i)
+                continue
+            room.code.store(x.value, place, LANES * i)
+            if x.error is not None:
+                room.code.store(x.error, place, self.whole + LANES * i)
 
     def _light(self, room: Room, g: Value, kick: Value, drift: Value, star: Value) -> None:
         """The same of a group of bodies without mass, which have the same planets inside their orbits."""
-        code, type, light = room.code, Type("double", LANES), len(self.light)
+        code, light = room.code, len(self.light)
         place = code.at(room.state, (g + self.groups) * NUMBERS)
-        x, v = ([code.load(place, LANES * (k + i), type) for i in range(AXES)] for k in (0, AXES))
+        state = self._read(room, place)
+        x = values(state[:AXES])
         mu, over, inside = (code.splat(code.load(room.data(3), g + light * i), LANES) for i in range(3))
         inside = code.convert("fptosi", code.lane(inside, 0), "i64")
         planets = LANES * self.groups
@@ -120,6 +205,7 @@ class KeplerCode(Rollouts):
         pull, r = star / (square * sqrt(square)), sqrt(own)
         inverse = 1.0 / r
         a = [over * p - pull * y for p, y in zip(vector(2, inside), h, strict=True)]
+        a = self._with_extra(room, a, h)
 
         def added(j: Value, total: list[Value]) -> list[Value]:
             d = [p - y for p, y in zip(vector(0, j), h, strict=True)]
@@ -136,49 +222,66 @@ class KeplerCode(Rollouts):
         if self.watches:
             kick = kick + self._met(room, code.any(near < 0.0), [h], kick, g)
         own = mu * inverse * inverse * inverse
-        v = [q + kick * (p + own * y) for q, p, y in zip(v, a, x, strict=True)]
-        new = drifted(x, v, mu, drift, r, inverse)
-        for i, value in enumerate([*new[0], *new[1]]):
-            code.store(value, place, LANES * i)
+        for i in range(AXES):
+            state[AXES + i].add(kick * (a[i] + own * x[i]))
+        for y, change in zip(state, drifted(x, values(state[AXES:]), mu, drift, r, inverse), strict=True):
+            y.add(change)
+        self._write(room, place, state)
 
     def _of_mass(self, j: Value) -> Value:
         """Where G m of planet j stands in the table."""
         group = j >> LANES_SHIFT
         return j + group * (LANES * (len(ROWS) - 1))
 
-    def _kicked(
-        self, room: Room, x: list[Vectors], v: list[Vectors], c: list[dict[str, Value]], t: Value, inverses: Vectors
+    def _with_extra(self, room: Room, a: Vectors, h: Vectors) -> Vectors:
+        """Accelerations of bodies at places h from the star, with those by the extra potential."""
+        if self.extra is None:
+            return a
+        program, numbers = self.extra
+        given = [room.code.splat(room.code.load(room.data(5), i), LANES) for i in range(len(numbers))]
+        return [p - q for p, q in zip(a, program(*h, *given), strict=True)]
+
+    def _watch(self, room: Room, kick: Value, near: Value, h: list[Vectors]) -> Value:
+        return kick + self._met(room, room.code.any(near), h, kick)
+
+    def _accelerations(
+        self,
+        room: Room,
+        x: list[Vectors],
+        c: list[dict[str, Value]],
+        inverses: Vectors,
+        kick: Value,
+        watch: Callable[[Value, list[Vectors]], Value] | None = None,
     ) -> tuple[list[Vectors], Value]:
-        """The velocities after a kick, and its length, which is NaN where planets met."""
-        code, groups, zero = room.code, range(self.groups), room.code.constant(0.0, x[0][0].type)
+        """The accelerations by the interaction, and the length of the kick, which is NaN where planets met."""
+        code, groups, zero = room.code, range(self.groups), room.code.constant(0.0, REGISTER)
         h = self._heliocentric(x, c) if self.jacobi else x
-        a = [[zero] * AXES for _ in groups]
+        a: list[Vectors] = [[zero] * AXES for _ in groups]
         close = None
-        limits = room.data(1)
         for one in groups:
             for other in range(one, self.groups):
                 turns = range(1, LANES // 2 + 1) if one == other else range(LANES)
                 for k in turns:
                     to, back = ([(i + s * k) % LANES for i in range(LANES)] for s in (1, -1))
-                    d = [code.shuffle(z, z, to) - y for y, z in zip(h[one], h[other], strict=True)]
+                    d = [turned(z, to) - y for y, z in zip(h[one], h[other], strict=True)]
                     square = dot(d, d)
                     w = 1.0 / (square * sqrt(square))
-                    mine = w * code.shuffle(c[other]["Gm"], zero, to)
+                    mine = w * turned(c[other]["Gm"], to)
                     a[one] = [p + q * mine for p, q in zip(a[one], d, strict=True)]
                     if one != other or k < LANES // 2:
                         theirs = w * c[one]["Gm"]
-                        a[other] = [p - code.shuffle(q * theirs, zero, back) for p, q in zip(a[other], d, strict=True)]
-                    if self.watches:
-                        near = square < code.load(
-                            limits, ((one * self.groups + other) * LANES + k) * LANES, square.type
-                        )
+                        a[other] = [p - turned(q * theirs, back) for p, q in zip(a[other], d, strict=True)]
+                    if watch is not None:
+                        place = ((one * self.groups + other) * LANES + k) * LANES
+                        near = square < code.load(room.data(1), place, REGISTER)
                         close = near if close is None else close | near
-        if close is not None:
-            t = t + self._met(room, code.any(close), h, t)
-        new = []
+        if watch is not None and close is not None:
+            kick = watch(close, h)
+        a = [self._with_extra(room, each, y) for each, y in zip(a, h, strict=True)]
         if not self.jacobi:
-            return [[p + t * q for p, q in zip(v[g], a[g], strict=True)] for g in groups], t
-        behind = [zero] * AXES
+            return a, kick
+        new: list[Vectors] = []
+        behind: Vectors = [zero] * AXES
         for g in reversed(groups):
             star, own = (c[g][name] for name in ("star", "mu"))
             square = dot(h[g], h[g])
@@ -186,12 +289,11 @@ class KeplerCode(Rollouts):
             a[g] = [p - pull * y for p, y in zip(a[g], h[g], strict=True)]
             own = own * inverses[g] * inverses[g] * inverses[g]
             weighted = [c[g]["mass"] * p for p in a[g]]
-            outer = [_suffix(code, p, zero) + q for p, q in zip(weighted, behind, strict=True)]
-            behind = (
-                [q + code.splat(code.total(p), LANES) for p, q in zip(weighted, behind, strict=True)] if g else behind
+            outer = [of_lanes(_suffix, p) + q for p, q in zip(weighted, behind, strict=True)]
+            behind = [q + of_lanes(_whole, p) for p, q in zip(weighted, behind, strict=True)] if g else behind
+            new.append(
+                [c[g]["ratio"] * p + c[g]["over"] * q + own * y for p, q, y in zip(a[g], outer, x[g], strict=True)]
             )
-            change = [c[g]["ratio"] * p + c[g]["over"] * q + own * y for p, q, y in zip(a[g], outer, x[g], strict=True)]
-            new.append([p + t * q for p, q in zip(v[g], change, strict=True)])
             if len(self.light):
                 before = [y - z for y, z in zip(h[g], x[g], strict=True)]
                 all_behind = [p + q for p, q in zip(weighted, outer, strict=True)]
@@ -199,28 +301,42 @@ class KeplerCode(Rollouts):
                     for i, value in enumerate(vector):
                         start = LANES * (self.groups * (AXES * which + i) + g)
                         code.store(value, room.work, start)
-        return new[::-1], t
+        return new[::-1], kick
 
     def _heliocentric(self, x: list[Vectors], c: list[dict[str, Value]]) -> list[Vectors]:
         """Places as seen from the star, of those from the centre of all inside."""
-        code, h = x[0][0].code, []
-        zero = code.constant(0.0, x[0][0].type)
-        before = [zero] * AXES
+        h: list[Vectors] = []
+        before: Vectors = []
         for g, group in enumerate(x):
             weighted = [c[g]["weight"] * y for y in group]
-            h.append([y + (_prefix(code, w, zero) + b) for y, w, b in zip(group, weighted, before, strict=True)])
+            inner = [of_lanes(_prefix, w) for w in weighted]
+            if g:
+                inner = [p + b for p, b in zip(inner, before, strict=True)]
+            h.append([y + p for y, p in zip(group, inner, strict=True)])
             if g + 1 < self.groups:
-                before = [b + code.splat(code.total(w), LANES) for w, b in zip(weighted, before, strict=True)]
+                total = [of_lanes(_whole, w) for w in weighted]
+                before = [b + t for b, t in zip(before, total, strict=True)] if g else total
         return h
 
-    def _jumped(self, x: list[Vectors], v: list[Vectors], c: list[dict[str, Value]], t: Value) -> list[Vectors]:
-        """Places moved with the star, whose momentum is that of the planets reversed."""
-        code = t.code
-        jump = []
+    def _jump(self, state: list[list[Sum]], c: list[dict[str, Value]], t: Value) -> None:
+        """Move places with the star, whose momentum is that of the planets reversed."""
         for k in range(AXES):
-            parts = [code.splat(code.total(c[g]["share"] * v[g][k]), LANES) for g in range(self.groups)]
-            jump.append(t * sum(parts[1:], parts[0]))
-        return [[y + j for y, j in zip(group, jump, strict=True)] for group in x]
+            parts = [of_lanes(_whole, c[g]["share"] * group[AXES + k].value) for g, group in enumerate(state)]
+            jump = t * sum(parts[1:], parts[0])
+            for group in state:
+                group[k].add(jump)
+
+    def look(self, room: Room) -> None:
+        """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
+        code, count = room.code, self.form.vectors
+        with code.over(count) as k:
+            place, last = code.at(room.state, (k + 1) * self.whole), (count + 1) * self.whole + k
+            w = [code.load(place, LANES * i, REGISTER) for i in range(self.whole // LANES)]
+            sizes = [abs(y) for y in w]
+            n, factor = exponent_of(code.total(sum(sizes[1:], sizes[0])))
+            for i, y in enumerate(w):
+                code.store(y * code.splat(factor, LANES), place, LANES * i)
+            code.store(code.load(room.state, last) + n, room.state, last)
 
     def _met(self, room: Room, met: Value, h: list[Vectors], like: Value, light: Value | None = None) -> Value:
         """NaN where two planets met, whose places are then written down; else 0."""
@@ -245,25 +361,47 @@ def sqrt(x: Any) -> Any:
     return x.apply("sqrt", (x,))
 
 
-def _prefix(code: Code, x: Value, zero: Value) -> Value:
+def values(sums: Sequence[Sum]) -> Vectors:
+    return [x.value for x in sums]
+
+
+def of_lanes(function: Callable[[Value], Value], x: Any) -> Any:
+    """A linear function of the lanes of a register, and of the rates of a dual number."""
+    return Dual(of_lanes(function, x.value), of_lanes(function, x.rate)) if isinstance(x, Dual) else function(x)
+
+
+def turned(x: Any, lanes: Sequence[int]) -> Any:
+    """The lanes of a number in another order; that of index 8 is 0."""
+    return of_lanes(lambda y: y.code.shuffle(y, y.code.constant(0.0, y.type), lanes), x)
+
+
+def _prefix(x: Value) -> Value:
     """The sum of all lanes before each."""
-    s = code.shuffle(x, zero, [LANES, *range(LANES - 1)])
+    s = turned(x, [LANES, *range(LANES - 1)])
     for k in (1, 2, 4):
-        s = s + code.shuffle(s, zero, [LANES] * k + [*range(LANES - k)])
+        s = s + turned(s, [LANES] * k + [*range(LANES - k)])
     return s
 
 
-def _suffix(code: Code, x: Value, zero: Value) -> Value:
+def _suffix(x: Value) -> Value:
     """The sum of all lanes behind each."""
-    s = code.shuffle(x, zero, [*range(1, LANES), LANES])
+    s = turned(x, [*range(1, LANES), LANES])
     for k in (1, 2, 4):
-        s = s + code.shuffle(s, zero, [*range(k, LANES)] + [LANES] * k)
+        s = s + turned(s, [*range(k, LANES)] + [LANES] * k)
     return s
 
 
-def drifted(x: Vectors, v: Vectors, mu: Value, t: Value, r: Value, inverse: Value) -> tuple[Vectors, Vectors]:
-    """Kepler's motion of all lanes: a few steps that suit short times, or the general solver where they do not."""
-    code = t.code
+def _whole(x: Value) -> Value:
+    """The sum of all lanes, in each."""
+    return x.code.splat(x.code.total(x), LANES)
+
+
+def drifted(x: Vectors, v: Vectors, mu: Value, t: Value, r: Any, inverse: Any) -> Vectors:
+    """Changes by Kepler's motion of all lanes: a few steps that suit short times, or the general solver."""
+    code, rates = t.code, []
+    if isinstance(r, Dual):
+        rates = [y.rate for y in (*x, *v)]
+        x, v, r, inverse = [y.value for y in x], [y.value for y in v], r.value, inverse.value
     eta = dot(x, v)
     beta = 2.0 * mu * inverse - dot(v, v)
     zeta = mu - beta * r
@@ -281,7 +419,9 @@ def drifted(x: Vectors, v: Vectors, mu: Value, t: Value, r: Value, inverse: Valu
         G = G0 * g0 - beta * (G1 * g1), G1 * g0 + G0 * g1, G2 + (G1 * g1 + G0 * g2), G3 + (G2 * d + (G1 * g2 + G0 * g3))
         errors.append(most * (d * d))
     *c, d, _ = coefficients(X, G, r, inverse, eta, zeta, mu, t)
-    fast = [y for group in moved(x, v, c) for y in group]
+    fast = moved(x, v, c)
+    if rates:
+        fast += varied((x, v), rates, c, (inverse, eta, beta, zeta, mu, r), (X, G, d))
     square = X * X
     worst = code.apply("max", (code.apply("max", (errors[0], errors[1])), 1e16 * (d * d)))
     size = code.apply("abs", (beta * square,))
@@ -289,22 +429,19 @@ def drifted(x: Vectors, v: Vectors, mu: Value, t: Value, r: Value, inverse: Valu
     bad = (square < worst) | (size > LONGEST) | (code.apply("abs", (t,)) < late)
 
     def again() -> Vectors:
-        types = [value.type for value in (*x, *v, mu, t)]
-        packed = Type(f"{{ {', '.join(str(y.type) for y in fast)} }}")
+        given = [*x, *v, mu, t, *rates]
+        types = [y.type for y in fast]
+        packed = Type(f"{{ {', '.join(map(str, types))} }}")
 
         def body(*given: Value) -> Value:
-            new = kepler_flow(given[:3], given[3:6], given[6], given[7])
-            return code_of(given).pack([*new[0], *new[1]])
+            return given[0].code.pack(kepler_changes(given[:3], given[3:6], given[6], given[7], given[8:]))
 
-        exact = code.unpack(code.outlined("kepler", [*x, *v, mu, t], body, packed, rare=True), types[:6])
+        name = "kepler_rates" if rates else "kepler"
+        exact = code.unpack(code.outlined(name, given, body, packed, rare=True), types)
         return [where(bad, y, z) for y, z in zip(exact, fast, strict=True)]
 
     new = code.when(code.any(bad), again, lambda: fast, rare=True)
-    return new[:3], new[3:]
-
-
-def code_of(values: Sequence[Value]) -> Code:
-    return values[0].code
+    return [Dual(y, z) for y, z in zip(new[:6], new[6:], strict=True)] if rates else new
 
 
 def places_of_light(frame: Frame) -> list[np.ndarray]:
@@ -347,36 +484,55 @@ class KeplerLoops:
     """The states of a frame as the registers of its code, and back."""
 
     def __init__(self, frame: Frame) -> None:
-        n = len(frame.order)
-        if not n or n > MOST_GROUPS * LANES - 1 or (len(frame.test) and not frame.jacobi):
+        n, light = len(frame.order), places_of_light(frame)
+        if not n or n > MOST_GROUPS * LANES - 1 or (light and not frame.jacobi):
             raise ValueError(
                 f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, with "
                 "bodies without mass in Jacobi's coordinates only: use backend='array'."
             )
-        self.frame, self.code = frame, KeplerCode(frame)
-        size = AWAY * frame.size.max()
-        spare = LANES * self.code.groups - n
+        self.frame, self._light, self._codes = frame, bool(light), dict[Form, KeplerCode]()
+        groups = self.code(Form()).groups
+        spare = LANES * groups - n
         self._spare = np.zeros((spare, 2 * AXES))
-        self._spare[:, 0] = size * (1 + np.arange(spare))
+        self._spare[:, 0] = AWAY * frame.size.max() * (1 + np.arange(spare))
         self._spare[:, AXES + 1] = np.sqrt(frame.G * frame.sums[-1] / self._spare[:, 0])
 
         lanes = np.arange(LANES)
-        light = [n + group[np.minimum(lanes, len(group) - 1)] for group in self.code.light]
+        places = [n + group[np.minimum(lanes, len(group) - 1)] for group in light]
         self._given = np.concatenate(
-            [np.arange(n), np.arange(n + len(frame.test), n + len(frame.test) + spare), *light]
+            [np.arange(n), np.arange(n + len(frame.test), n + len(frame.test) + spare), *places]
         )
         self._found = np.zeros(n + len(frame.test), dtype=int)
         self._found[:n] = np.arange(n)
-        for g, group in enumerate(self.code.light):
-            self._found[n + group] = LANES * (self.code.groups + g) + lanes[: len(group)]
+        for g, group in enumerate(light):
+            self._found[n + group] = LANES * (groups + g) + lanes[: len(group)]
 
-    def rows(self, y: np.ndarray) -> np.ndarray:
-        """The running states (N, n_values) of states (N, 2d)."""
+    def code(self, form: Form) -> KeplerCode:
+        """The compiled functions of a form, made once.
+
+        Raises
+        ------
+        ValueError
+            If there are none.
+        """
+        if self._light and (form.vectors or form.gradients):
+            raise ValueError(
+                "`system` has bodies without mass, and compiled deviation vectors and force gradients are for bodies "
+                "with mass: use backend='array'."
+            )
+        if form not in self._codes:
+            self._codes[form] = KeplerCode(self.frame, form)
+        return self._codes[form]
+
+    def rows(self, y: np.ndarray, spare: float = 1.0) -> np.ndarray:
+        """The running states (..., n_values) of states (..., 2d); of deviation vectors with a `spare` of 0."""
         x, v, *_ = self.frame.into(y)
         planets = np.concatenate([x, v], axis=-1)
-        planets = np.concatenate([planets, np.broadcast_to(self._spare, (len(y), *self._spare.shape))], axis=1)
-        groups = planets[:, self._given].reshape(len(y), -1, LANES, 2 * AXES).swapaxes(-1, -2)
-        return np.ascontiguousarray(groups).reshape(len(y), -1)
+        more = np.broadcast_to(spare * self._spare, (*planets.shape[:-2], *self._spare.shape))
+        planets = np.concatenate([planets, more], axis=-2)[..., self._given, :]
+        n = len(self._given)
+        groups = planets.reshape(*y.shape[:-1], n // LANES, LANES, 2 * AXES).swapaxes(-1, -2)
+        return np.ascontiguousarray(groups).reshape(*y.shape[:-1], 2 * AXES * n)
 
     def states(self, rows: np.ndarray, y0: np.ndarray, times: np.ndarray) -> np.ndarray:
         """The states (..., n, 2d) after times (n,) of running ones, of runs from y0 (..., 2d)."""
@@ -384,14 +540,14 @@ class KeplerLoops:
         y[..., times == 0, :] = y0[..., None, :]
         return y
 
-    def moved(self, rows: np.ndarray, y0: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """The states of running ones (..., n_values), after times since those y0 (..., 2d)."""
+    def moved(self, rows: np.ndarray, y0: np.ndarray, times: np.ndarray, size: Any = 1.0) -> np.ndarray:
+        """The states, or vectors, of running ones (..., n_values), after times since those size·y0 (..., 2d)."""
         *_, Q, U = self.frame.into(y0)
         groups = len(self._given) // LANES
         planets = rows.reshape(*rows.shape[:-1], groups, 2 * AXES, LANES).swapaxes(-1, -2)
         planets = planets.reshape(*rows.shape[:-1], groups * LANES, 2 * AXES)[..., self._found, :]
-        centre = Q + times[..., None] * U
-        return self.frame.out(planets[..., :AXES], planets[..., AXES:], centre, U + 0 * centre)
+        centre = size * (Q + times[..., None] * U)
+        return self.frame.out(planets[..., :AXES], planets[..., AXES:], centre, size * U + 0 * centre)
 
 
 class KeplerKernel(Kernel):
@@ -401,38 +557,50 @@ class KeplerKernel(Kernel):
     ----------
     loops : KeplerLoops
     substeps : Substeps
-        Of a step of length 1.
     before, after : Substeps
         The processor and its inverse; empty for none.
+    compensated : bool
     """
 
-    def __init__(self, loops: KeplerLoops, substeps: Substeps, before: Substeps = (), after: Substeps = ()) -> None:
+    def __init__(
+        self,
+        loops: KeplerLoops,
+        substeps: Substeps,
+        before: Substeps = (),
+        after: Substeps = (),
+        compensated: bool = False,
+    ) -> None:
         self.loops, self.before, self.after, self.step_itself = loops, before, after, [*before, *substeps, *after]
-        *rest, last = substeps
+        self.form = Form(gradients=any(third for *_, third in self.step_itself), compensated=compensated)
+        self.code = loops.code(self.form)
+        *rest, last = np.array(substeps)
         first = rest[0] if rest else last
         ends = first[0] == 0 or last[1] == 0  # with what the next step begins with
-        inner, end = (rest[1:], last) if ends else ([*rest[1:], last], (0.0, 0.0))
-        link = (end[0] + first[0], end[1] + first[1])
-        self.columns = np.array([first, *inner, link, end])
+        inner, end = (rest[1:], last) if ends else ([*rest[1:], last], 0 * last)
+        self.columns = np.array([first, *inner, end + first, end])
 
     def _table(self, h: Any, columns: Any) -> Columns:
-        entries = np.asarray(h, dtype=float)[..., None, None] * np.asarray(columns)
-        return np.ascontiguousarray(entries), np.zeros(len(columns), dtype=np.int64)
+        entries = np.asarray(h, dtype=float)[..., None, None] ** POWERS * np.asarray(columns)
+        return np.ascontiguousarray(entries[..., : self.code.size]), np.zeros(len(columns), dtype=np.int64)
+
+    def rollout(self, code: KeplerCode, h: float) -> Callable[[Batch], None]:
+        """The runs of batches, with steps of a length."""
+        columns = self._table(h, self.columns)
+        if not self.before:
+            return partial(code.run, columns)
+        after = self._table(h, [self.columns[-1], *self.after])
+        return partial(code.run_processed, self._table(h, self.before), columns, after)
 
     def runs(self, task: Task) -> Run:
-        loops, columns, start = self.loops, self._table(task.h, self.columns), self.loops.rows(task.y0)
-        if self.before:
-            after = self._table(task.h, [self.columns[-1], *self.after])
-            run = partial(loops.code.run_processed, self._table(task.h, self.before), columns, after)
-        else:
-            run = partial(loops.code.run, columns)
-        rows, n_finite, _ = run_states(run, task._replace(y0=start), start.shape[1], WORK * len(self.columns))
+        loops, start = self.loops, self.loops.rows(task.y0)
+        run, work = self.rollout(self.code, task.h), WORK * len(self.columns)
+        rows, n_finite, _ = run_states(run, task._replace(y0=start), self.code.n_values, work)
         self.remark = self._pair() if len(start) == 1 and n_finite[0] < task.n_steps else ""
         return Run(loops.states(rows, task.y0, task.save * task.h), n_finite)
 
     def _pair(self) -> str:
         """A sentence on the bodies that met."""
-        frame, code = self.loops.frame, self.loops.code
+        frame, code = self.loops.frame, self.code
         if frame.encounter is None or not code.report.any():
             return ""
         *places, group = code.report
@@ -452,10 +620,48 @@ class KeplerKernel(Kernel):
         return f" Bodies {first} and {second} were {distance[k]:.4g} apart, {radii[k]:.3g} Hill radii."
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
-        columns = [*self.step_itself, (0.0, 0.0), (0.0, 0.0)]
-        rows = self.loops.rows(y)
-        start = np.concatenate([rows, np.arange(len(y), dtype=float)[:, None]], axis=1)
-        batch = Batch.whole(start, 1, ONE, rows.shape[1])
-        self.loops.code.run(self._table(lengths, columns), batch, False)
-        return Steps(self.loops.moved(batch.out[:, 0], y, lengths))
+        return Steps(self.jvp(h, y)[0])
+
+    def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.jvp(h, y, np.broadcast_to(np.eye(y.shape[-1]), (*y.shape, y.shape[-1])))
+
+    def jvp(self, h: ArrayLike, y: np.ndarray, W: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """The steps from rows of `y` (N, 2d), and vectors W (N, 2d, k) moved by their derivatives."""
+        vectors = y[..., None, :][:, :0] if W is None else W.swapaxes(-1, -2)
+        code, N, k = (
+            self.loops.code(self.form._replace(vectors=vectors.shape[1], compensated=False)),
+            *vectors.shape[:2],
+        )
+        lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), (N,))
+        nothing = (0.0, 0.0, 0.0)
+        rows = np.concatenate([self.loops.rows(y), self.loops.rows(vectors, 0.0).reshape(N, k * code.whole)], axis=1)
+        start = np.concatenate([rows, np.arange(N, dtype=float)[:, None]], axis=1)
+        batch = Batch.whole(start, 1, ONE, code.n_out)
+        code.run(self._table(lengths, [*self.step_itself, nothing, nothing]), batch, False)
+        rows = batch.out[:, 0].reshape(N, 1 + k, code.whole)
+        moved = self.loops.moved(rows[:, 1:], vectors, lengths[:, None])
+        return self.loops.moved(rows[:, 0], y, lengths), moved.swapaxes(-1, -2)
+
+
+class KeplerTangents(TangentKernel):
+    """The same with k deviation vectors, whose lengths are those of inertial states."""
+
+    _code: KeplerCode
+
+    def __init__(self, kernel: KeplerKernel, vectors: int) -> None:
+        self.vectors, self._kernel = vectors, kernel
+        self._code = kernel.loops.code(kernel.form._replace(vectors=vectors, grows=True))
+
+    def _begun(self, y0: np.ndarray, w0: np.ndarray) -> np.ndarray:
+        loops, n = self._kernel.loops, len(y0)
+        vectors = np.broadcast_to(loops.rows(w0, 0.0).reshape(-1), (n, self.vectors * self._code.whole))
+        return np.concatenate([loops.rows(y0), vectors, np.zeros((n, self.vectors))], axis=1)
+
+    def _rollout(self, h: float) -> tuple[Callable[[Batch], None], float]:
+        return self._kernel.rollout(self._code, h), WORK * len(self._kernel.columns) * (1 + 4 * self.vectors)
+
+    def _vectors(self, states: np.ndarray, times: np.ndarray, w0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        k, whole = self.vectors, self._code.whole
+        rows, exponents = states[..., whole:-k].reshape(*states.shape[:-1], k, whole), states[..., -k:]
+        size = np.exp2(-exponents)[..., None]
+        return self._kernel.loops.moved(rows, w0, times[:, None] + 0 * exponents, size), exponents

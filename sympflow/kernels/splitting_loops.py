@@ -142,8 +142,10 @@ class SplittingLoops:
                     f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
                     "backend='array'."
                 )
-            if system.local.felt is not None:
-                raise ValueError("`system` has bodies without mass, whose kicks are array operations: use 'array'.")
+            if system.local.arrays_only:
+                raise ValueError(
+                    f"`system` has {system.local.arrays_only}, whose kicks are array operations: use 'array'."
+                )
             if system.local.loops == "pairs":
                 from sympflow.kernels.pairs import few, pair_code
 

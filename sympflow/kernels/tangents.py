@@ -21,7 +21,8 @@ from sympflow.compiler.program import Program, derivatives, gradient, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.protocol import RunCheckpoint, Task, run_states
+from sympflow.kernels.protocol import Batch, RunCheckpoint, Task, run_states
+from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import Shape, Splitting, SplittingCode, shared
@@ -224,19 +225,41 @@ def _rescaled(w: Sequence[Value], exponent: Value) -> tuple[list[Value], Value]:
     length = abs(w[0])
     for x in w[1:]:
         length = length + abs(x)
+    n, factor = exponent_of(length)
+    return [x * factor for x in w], exponent + n
+
+
+def exponent_of(length: Value) -> tuple[Value, Value]:
+    """The exponent of the power of two next to a length, and 1 over that power."""
     n = (length.bits >> 52) - 1023
-    factor = ((1023 - n) << 52).real
-    code = length.code
-    return [x * factor for x in w], exponent + code.convert("sitofp", n, "double")
+    return length.code.convert("sitofp", n, "double"), ((1023 - n) << 52).real
 
 
 class TangentKernel:
     """Compiled loops of one scheme on one system with k deviation vectors: see `tangent_kernel`."""
 
+    _code: Rollouts
+
     def __init__(self, system: HamiltonianSystem, scheme: Scheme, vectors: int) -> None:
         self.vectors, self._width = vectors, 2 * system.ndof
         self._loops, self._scheme = splitting_loops(system), scheme
         self._code = tangent_code(system, scheme.level, scheme.monomials, vectors, True)
+
+    def _begun(self, y0: np.ndarray, w0: np.ndarray) -> np.ndarray:
+        """The rows to begin with."""
+        start = np.zeros((len(y0), self._code.n_out))
+        start[:, : self._width], start[:, self._width : -self.vectors] = y0, w0.reshape(-1)
+        return start
+
+    def _rollout(self, h: float) -> tuple[Callable[[Batch], None], float]:
+        """The runs of batches, and about how many nanoseconds a step takes."""
+        table = self._loops.rows(run_table(self._scheme, h), h)
+        return partial(self._code.run, table), table.shape[1] * self._code.n_out / 2
+
+    def _vectors(self, states: np.ndarray, times: np.ndarray, w0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Vectors (N, m, k, 2d) of rows (N, m, ·) after times, and the exponents of two in their lengths."""
+        k = self.vectors
+        return states[..., self._width : -k].reshape(*states.shape[:2], k, self._width), states[..., -k:]
 
     def run(
         self,
@@ -257,8 +280,7 @@ class TangentKernel:
         every 256 steps.
         """
         N, k, n = len(y0), self.vectors, self._code.n_out
-        start = np.zeros((N, n))
-        start[:, : self._width], start[:, self._width : n - k] = y0, w0.reshape(-1)
+        start, (rollout, work) = self._begun(y0, w0), self._rollout(h)
         looks = _looks(save, n_steps, limit)
         some = min(64, max(4, LOOKS // N)) if limit > 0 else len(looks)
         found = TangentRun(
@@ -267,19 +289,16 @@ class TangentKernel:
             np.full(N, n_steps),
             np.ones(N, dtype=bool),
         )
-        table = self._loops.rows(run_table(self._scheme, h), h)
-        width = self._width
 
         def follow(looks: np.ndarray, rows: np.ndarray, carry: RunCheckpoint) -> np.ndarray:
             """Follow orbits to the last of some looks, into the rows of `found`, and tell which have ended (n,)."""
-            work = table.shape[1] * self._code.n_out / 2
             task = Task(0.0, start[rows], int(looks[-1]), looks, carry, threads=threads)
-            run = run_states(partial(self._code.run, table), task, self._code.n_values, work)
-            w = run.states[..., width:-k].reshape(*run.states.shape[:2], k, width)
-            w = w if scale is None else w * scale
+            run = run_states(rollout, task, self._code.n_values, work)
             with np.errstate(all="ignore"):
-                growth = LOG_2 * run.states[..., -k:] + 0.5 * np.log(np.einsum("nmki,nmki->nmk", w, w))
-                W = w.swapaxes(-1, -2).reshape(-1, width, k)
+                w, exponents = self._vectors(run.states, looks * h, w0)
+                w = w if scale is None else w * scale
+                growth = LOG_2 * exponents + 0.5 * np.log(np.einsum("nmki,nmki->nmk", w, w))
+                W = w.swapaxes(-1, -2).reshape(-1, w.shape[-1], k)
                 spreads = np.full(w.shape[:2], np.nan) if spread is None else spread(W).reshape(w.shape[:2])
             known = looks <= run.n_finite[:, None]
             below = known & (spreads < limit)

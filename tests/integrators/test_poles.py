@@ -213,6 +213,30 @@ def test_a_run_about_a_place_where_terms_cancel_is_warned_of_once(V):
     assert all(text.startswith("`system` has terms that cancel at q1 = 0, ") and "sinc" in text for text in told[0])
 
 
+@pytest.mark.parametrize(
+    ("system", "y0", "lost"),
+    [
+        (HamiltonianSystem.lattice(shape=2, bond="csch(r) - 1/r", boundary="fixed"), [0.01, -0.02, 0, 0], True),
+        (
+            HamiltonianSystem.lattice(shape=2, bond="k*csch(r) - 1/r", params={"k": 1.0}, boundary="fixed"),
+            [0.01, -0.02, 0, 0],
+            True,
+        ),
+        (HamiltonianSystem.lattice(shape=2, onsite="(cosh(q) - 1)/q**2"), [0.01, -0.02, 1, -1], True),
+        (HamiltonianSystem.lattice(shape=2, onsite="sin(q)/q"), [0.01, -0.02, 1, -1], False),
+        (HamiltonianSystem.pairs("1/r - 1/sinh(r)", masses=[1, 1], dim=2), [0, 0, 1e-3, 0, 0, 0, 0, 0], True),
+        (HamiltonianSystem.pairs("1/r - 1/sinh(r)", masses=[1, 1], dim=2), [0, 0, 1, 0, 0, 0, 0, 0], False),
+        (HamiltonianSystem.pairs("(cosh(r) - 1)/r**2", masses=[1, 1], dim=1), [0, 1, 3, -3], True),
+    ],
+)
+def test_terms_of_lattices_and_pairs_that_cancel_are_told(system, y0, lost):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sf.solve(system, "verlet", (0, 0.5), y0, dt=1e-4)
+    told = [str(w.message) for w in caught if "cancel" in str(w.message)]
+    assert len(told) == lost
+
+
 def test_a_start_where_terms_cancel_is_told_why_it_fails():
     system = HamiltonianSystem.from_sympy("p**2/2 + tan(q)/q")
     with pytest.warns(RuntimeWarning, match=r"cancel at q1 = 0, tan\(q1\)/q1"):

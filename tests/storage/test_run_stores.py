@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators import grid_runs, progress, windows
+from sympflow.integrators import grid_runs, progress
 from sympflow.integrators.contract import Interrupted
 from sympflow.solver import solve
 from sympflow.storage import store as storage
@@ -45,7 +45,7 @@ CASES = {
 def short_windows(monkeypatch):
     monkeypatch.setattr(grid_runs, "ONE", 100)
     monkeypatch.setattr(grid_runs, "ARRAY_STEPS", 30)
-    monkeypatch.setattr(windows.Pace, "took", lambda self, n: None)
+    monkeypatch.setattr(grid_runs.Pace, "took", lambda self, n: None)
     monkeypatch.setattr(progress, "BETWEEN", 0.0)
 
 
@@ -89,7 +89,7 @@ def test_ctrl_c_between_the_steps_and_their_outputs(tmp_path, monkeypatch, case,
     whole = solve(system, method, (0, END), **options)
     owner, name = {
         "append": (RunStore, "append"),
-        "pieces": (windows.Pieces, "to"),
+        "pieces": (grid_runs.GridRun, "advance"),
     }.get(where, (grid_runs, where))
     done, calls = getattr(owner, name), []
 
@@ -128,11 +128,11 @@ def test_a_run_that_goes_on_to_a_later_end_is_the_longer_run(tmp_path, case):
 
 KILLED = """
 import os, signal, sys
-from sympflow.integrators import grid_runs, progress, windows
+from sympflow.integrators import grid_runs, progress
 from sympflow.solver import solve
 from sympflow.systems import henon_heiles
 
-grid_runs.ONE, progress.BETWEEN, windows.Pace.took = 100, 0.0, lambda self, n: None
+grid_runs.ONE, progress.BETWEEN, grid_runs.Pace.took = 100, 0.0, lambda self, n: None
 
 def kill(done, total):
     if done >= 12:
