@@ -45,7 +45,7 @@ class _TorchSteps:
 
     finished: str | None = None
     needs_residuals: ClassVar[bool] = False
-    method: torch.optim.Optimizer
+    method: Any
 
     def state_dict(self) -> dict[str, Any]:
         return self.method.state_dict()

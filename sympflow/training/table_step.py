@@ -129,7 +129,7 @@ class TableStep:
         """−Γp of momenta (d, P), their rate in a drift."""
         return np.zeros_like(p) if not self._friction else self._friction.force(p.T).T
 
-    def errors(self, *given: np.ndarray) -> LabelErrors | ArrayErrors:
+    def errors(self, *given: Any) -> LabelErrors | ArrayErrors:
         """Weighted errors of labels after a step: see `LabelErrors`."""
         return ArrayErrors(self, *given) if self.loops is None else self.loops.errors(*given)
 
