@@ -226,7 +226,7 @@ class Hamiltonian:
             If it is none.
         """
         raise ValueError(
-            f"`system` {self.name!r} is no doubled one, so that its states are the physical ones as they are: make one "
+            f"`system` {self.name!r} is not doubled: its states are the physical ones: make one "
             "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
         )
 

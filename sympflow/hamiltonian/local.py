@@ -90,8 +90,8 @@ class LocalHamiltonian(Definition, ABC):
     def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
         """Return the definition with the same terms on a few sites: see `HamiltonianSystem.piece`."""
         raise TypeError(
-            f"`system` is no lattice, of which a few sites are a piece: make a smaller one by HamiltonianSystem."
-            f"{self.loops}."
+            f"`system` is not a lattice, and only lattices have pieces of a few sites: make a smaller one "
+            f"by HamiltonianSystem.{self.loops}."
         )
 
     @property

@@ -488,7 +488,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         """
         if self.local is None:
             raise TypeError(
-                f"`system` {self.name!r} is no lattice, of which a few sites are a piece: define it by "
+                f"`system` {self.name!r} is not a lattice, and only lattices have pieces of a few sites: define it by "
                 "HamiltonianSystem.lattice."
             )
         local = self.local.piece(sites, boundary)

@@ -76,7 +76,7 @@ def time_transformed(
         "and no Hamiltonian in another time", "solve it in the physical time, by 'verlet' or 'dop853' for instance"
     )
     system.check_autonomous(
-        "so that there is no energy E that a time transformation could hold",
+        "and a time transformation needs an energy E that is constant",
         "solve it in the physical time, by 'kahan_li8' or 'dop853' for instance",
     )
     if not system.separable:

@@ -362,7 +362,7 @@ def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[Fixe
     options.pop("norm", None)  # torchdiffeq adds its own
     system = options.pop("system", func if isinstance(func, HamiltonianSystem) else None)
     if not (system is None or isinstance(system, HamiltonianSystem)):
-        raise TypeError(f"`options` has a 'system' that is no HamiltonianSystem: {type(system).__name__}. Pass one.")
+        raise TypeError(f"`options` has a 'system' that is not a HamiltonianSystem: {type(system).__name__}. Pass one.")
     if "step_size" in options and "dt" in options:
         raise TypeError("`options` has both 'step_size' and 'dt', two names of the step length: give one of them.")
     if "step_size" in options:
