@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, stack, values
+from sympflow.arrays import (
+    Array,
+    beside,
+    concatenate,
+    detached,
+    is_tensor,
+    library,
+    like,
+    per_state,
+    stack,
+    values,
+)
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 
@@ -35,11 +46,7 @@ def stage_times(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, h
         return None
     nodes, batch = stage_nodes(tableau), y.shape[:-1]
     times = [stage_time(t, c, h) for c in nodes]
-    if is_tensor(y):
-        import torch
-
-        times = [torch.as_tensor(s, dtype=torch.float64, device=y.device).expand(batch) for s in times]
-    return stack(times if is_tensor(y) else [np.broadcast_to(s, batch) for s in times], axis=-1)
+    return stack([library(y).broadcast_to(beside(s, y), batch) for s in times], axis=-1)
 
 
 def advanced(system: HamiltonianSystem, tableau: Tableau, y: Array, K: Array, h: Any) -> Array:
@@ -63,7 +70,7 @@ def stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times:
     import torch
 
     with torch.no_grad():
-        start, length = y.detach(), h.detach() if is_tensor(h) else h
+        start, length = y.detach(), detached(h)
         K, iterations = _solved_stages(system, start, length, times, A, scale)
         M, _ = newton_matrix(system, start[..., None, :] + A @ K, length, times, A, scale)
         sizes = variable_sizes(start, K, 0 * M[..., 0])
@@ -90,7 +97,7 @@ def _solved_stages(
         lost = ~(size < xp.inf) & ~done
         K = xp.where(lost[..., None, None], xp.nan, K)
         done, before = done | small | lost, size
-        found = values(done) if is_tensor(done) else done
+        found = values(done)
         if iteration == TRACED_ITERATIONS if found is None else found.all():
             break
     return xp.where(done[..., None, None], K, xp.nan), iteration * math.prod(done.shape)

@@ -20,7 +20,7 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arguments import check_kept, plain
-from sympflow.arrays import Array, assemble, concatenate, library_name
+from sympflow.arrays import Array, assemble, beside, concatenate, library_name
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
@@ -440,8 +440,7 @@ class SymbolicHamiltonian(Definition):
                 )
             columns = [x[..., i] for i in range(n)]
             times = times[: len(moving)]
-            if library == "torch" and moving:
-                times = _doubles(times, x)
+            times = tuple(beside(t, x) for t in times)
             sampled_values = [self.samples[a.name_of_samples](at(*times), a.order) for a, at in values_of_samples]
             try:
                 values = generated[library](*columns, *times, *numbers, *sampled_values)
@@ -475,13 +474,6 @@ def _square(values: Sequence[Array], like: Array) -> Array:
     """Entries of a square matrix, row by row, as arrays: (..., n, n)."""
     flat, n = assemble(values, like), math.isqrt(len(values))
     return flat.reshape(*flat.shape[:-1], n, n)
-
-
-def _doubles(times: Sequence[Any], x: Any) -> tuple[Any, ...]:
-    """Times as tensors of doubles, on the device of x."""
-    import torch
-
-    return tuple(torch.as_tensor(t, dtype=torch.float64, device=x.device) for t in times)
 
 
 COORDINATE_LIKE = re.compile(r"[pqv]?[xyzr]\d?|[PQX]\d*|v|[pq]_?\w|[vpq]?_?(theta|phi)\d?")
