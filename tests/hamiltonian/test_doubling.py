@@ -138,13 +138,7 @@ class TestPhysicalSolution:
 
     @pytest.mark.parametrize(
         "metric",
-        [
-            "energy_error",
-            "max_energy_error",
-            "volume_error",
-            "symplecticity_defect",
-            "conformal_defect",
-        ],
+        ["energy_error", "max_energy_error", "volume_error", "symplecticity_defect", "conformal_defect"],
     )
     def test_what_is_not_kept_names_the_metric_that_holds(self, pendulum, metric):
         sol = solve(pendulum, "gauss_legendre6", (0, 1), dt=0.1).physical()
