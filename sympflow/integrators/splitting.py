@@ -259,7 +259,7 @@ class Splitting(FixedStep):
         expected: float,
         backend: str,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run on the logarithmic clock in one compiled pass: see `clocks.OnClock`."""
+        """Run on the logarithmic clock in one compiled pass: see `LogarithmicClock`."""
         transformed = clock.transformed
         if self.compensated or transformed.symbols is None:
             return None
