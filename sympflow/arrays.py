@@ -72,6 +72,13 @@ def moveaxis(y: Array, source: int, target: int) -> Array:
     return y.movedim(source, target) if is_tensor(y) else np.moveaxis(y, source, target)
 
 
+def expanded(y: Array, shape: tuple[int, ...]) -> Array:
+    """Return y broadcast to a shape: itself where it has that."""
+    if tuple(y.shape) == shape:
+        return y
+    return y.expand(shape) if is_tensor(y) else np.broadcast_to(y, shape)
+
+
 def masked(y: Array, mask: Any, value: float) -> Array:
     """Return y with a value where the mask, an array that broadcasts against it, is True."""
     if is_tensor(y):

@@ -30,26 +30,9 @@ LONGEST_MESSAGE = 400
 class Chunk:
     """Some orbits of an ensemble, one after another in its order; a reduction makes its fields of them.
 
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    integrator : Integrator
-    t_span : (float, float)
-    t_eval : ndarray of shape (m,) or None
-        Times of the states that a reduction sees; None for every step.
-    y0 : ndarray of shape (n, 2d)
-    params : mapping of str to ndarray of shape (n,)
-        Values of the parameters of each orbit, where they are others than the system's.
-    backend : str
-    first : int
-        Number of the first orbit within the ensemble.
-
-    Attributes
-    ----------
-    status : ndarray of shape (n,), of int8
-        0, or −1 for an orbit that failed.
-    messages : dict of int to str
-        Of the orbits that failed.
+    `t_eval` (m,) are the times of the states that a reduction sees, None for every step; `y0` is (n, 2d); `params` are
+    values (n,) of the parameters of each orbit, where they are others than the system's; `first` is the number of the
+    first orbit within the ensemble. `status` (n,) is 0, or −1 for an orbit that failed, `messages` say why.
     """
 
     system: HamiltonianSystem
@@ -111,13 +94,7 @@ class Chunk:
 
     @cached_property
     def times(self) -> np.ndarray:
-        """The times (m,) of the states that a reduction sees.
-
-        Raises
-        ------
-        ValueError
-            If they are the method's own, of each orbit others.
-        """
+        """The times (m,) of the states that a reduction sees."""
         if self.t_eval is not None:
             return self.t_eval
         length = self.integrator.step_length(self.system) if self.integrator.on_grid else None

@@ -38,21 +38,10 @@ _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary
 
 
 class Composition(ABC, ArraySteps):
-    """A scheme composed of the exact flows of the parts of one system.
+    """A scheme composed of the exact flows of the parts of one system; `method` is its name in messages.
 
-    A subclass may take options of its own: `parts`, `omega` or `corrector` of `Splitting`.
-
-    Parameters
-    ----------
-    method : str
-        The name of the method, for messages.
-    scheme : Scheme
-    system : HamiltonianSystem
-
-    Raises
-    ------
-    ValueError
-        If the splitting, or the scheme with it, does not apply to the system.
+    A subclass may take options of its own: `parts`, `omega` or `corrector` of `Splitting`. A ValueError says where the
+    splitting, or the scheme with it, does not apply to the system.
     """
 
     compensates: ClassVar[bool] = False

@@ -44,10 +44,7 @@ END = 1e-9
 class Clock:
     """A time in which steps are equal, with the traits of the contract that depend on it.
 
-    Attributes
-    ----------
-    on : callable, optional
-        Makes of a method and a system the method on the clock; None for the physical time, which needs none.
+    `on` makes of a method and a system the method on the clock; None for the physical time, which needs none.
     """
 
     on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None

@@ -61,18 +61,9 @@ class ArraySteps:
 class Stepper:
     """One run of a fixed-step integrator: all that a run changes or counts is here, its kernel and its arrays.
 
-    Attributes
-    ----------
-    kernel : Kernel or None
-        The compiled loops of the run; None where it is made of array operations.
-    arrays : ArraySteps
-        The same steps by array operations, and their evaluations.
-    saves_finite : bool
-        True if the states that `rollout` saves up to the last finite one are known to be finite.
-    remark : str
-        Why a run of a formula is not compiled, for its message.
-    why : str
-        Why functions of Python run as such, to be read after the backend.
+    `kernel` are its compiled loops, None where it is made of array operations; `arrays` the same steps by these.
+    `saves_finite` is True if the states that `rollout` saves up to the last finite one are known to be finite. `remark`
+    says why a run of a formula is not compiled, for its message; `why` why functions of Python run as such.
     """
 
     def __init__(

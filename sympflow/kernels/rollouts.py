@@ -127,8 +127,9 @@ class Rollouts(ABC):
         """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
         entries, kinds = self.own_entries(table, values)
         groups = -(-len(entries) // width)
-        full = np.concatenate([entries, entries[-1:].repeat(groups * width - len(entries), axis=0)])
-        return np.ascontiguousarray(full.reshape(groups, width, *entries.shape[1:]).transpose(0, 2, 3, 1)), kinds
+        if len(entries) < groups * width:
+            entries = np.concatenate([entries, entries[-1:].repeat(groups * width - len(entries), axis=0)])
+        return np.ascontiguousarray(entries.reshape(groups, width, *entries.shape[1:]).transpose(0, 2, 3, 1)), kinds
 
     def own_entries(self, table: Any, values: np.ndarray) -> Columns:
         """The numbers (N, m, size) of the columns of each, and their kinds (m,); `values` are places in the table."""

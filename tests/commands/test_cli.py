@@ -157,6 +157,7 @@ def test_missing_matplotlib_is_reported_before_anything_is_computed(command, tmp
     assert not computed
 
 
+@pytest.mark.slow
 def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
     words = ["henon-heiles", "--y0", "0,0,0,0.7", "--methods", "verlet,rk45", "--t-end", "20", "--repeats", "1"]
     code = "from sympflow.cli import main; main()"

@@ -56,6 +56,7 @@ def test_it_is_solved_and_saved_as_any_flow(tmp_path):
     torch.testing.assert_close(single(0.7, x.float()).double(), again(0.7, x), rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_of_runs_are_those_of_differences():
     flow = SympFlow.collocated(WHOLE, dt=0.5, stages=2)
     x = torch.tensor([0.4, 0.3], dtype=torch.float64, requires_grad=True)

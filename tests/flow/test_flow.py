@@ -398,6 +398,7 @@ def test_a_device_that_is_not_there_is_refused(make):
     assert make(1, device=torch.device("cpu")).device == torch.device("cpu")
 
 
+@pytest.mark.slow
 def test_forward_mode_gives_no_warnings_of_torch_itself():
     """In a new process, since torch warns but once."""
     code = """

@@ -40,7 +40,13 @@ def comb(times):
     return np.stack([(on * np.sin(since)).sum(1), (on * np.cos(since)).sum(1)])
 
 
-@pytest.mark.parametrize("method", ["kahan_li8", "gauss_legendre6", "tao8", "linear_kahan_li8", "dop853", "dopri5"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        *("kahan_li8", "gauss_legendre6", "linear_kahan_li8", "dop853"),
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ("tao8", "dopri5")),
+    ],
+)
 def test_an_oscillator_under_impulses_is_a_sum_of_sines(method):
     """There and back, at given times and at the steps, by the dense output and in a batch."""
     adaptive = method in ("dop853", "dopri5")
