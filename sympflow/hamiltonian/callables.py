@@ -146,7 +146,7 @@ class CallableHamiltonian(Definition):
 
     @cached_property
     def poles(self) -> TracedPoles | None:  # type: ignore[override]
-        return self.form and (TracedPoles(self.form) or None)
+        return None if self.form is None else TracedPoles(self.form) or None
 
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]
