@@ -288,13 +288,7 @@ class CallableHamiltonian(Definition):
                 return False
         return _alike(found, self.form.gradient(state, *times))
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the program, which is traced again."""
-        return {
-            name: value
-            for name, value in vars(self).items()
-            if name not in ("form", "poles", "takes_tensors", "_follows_tensors")
-        }
+    _generated = ("form", "poles", "takes_tensors", "_follows_tensors")
 
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None or (self.form is not None and self.library == "numpy"):
