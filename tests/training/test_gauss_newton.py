@@ -114,31 +114,38 @@ def test_derivatives_by_the_table(system, force_gradient, first):
 FEW = PrimedFit(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
 
 
-def errors_of(run, psi):
+LABELS = Labels.of(PENDULUM, states(PENDULUM.domain, 5, 0, Stream.RESIDUAL), 0.8 * np.arange(1, 4) / 3)
+
+
+def errors_of(psi):
     """The residuals by definition, of coordinates and of the energy, for ψ̄ at labels (3, 5, 2) of the pendulum."""
-    y = run.whole._y.T.reshape(3, 5, 2)
-    spread = np.std(PENDULUM.hamiltonian(run.whole._x[:, :5].T))
+    y = LABELS.y
+    spread = np.std(PENDULUM.hamiltonian(LABELS.x))
     energy = math.sqrt(7.0) / spread * (PENDULUM.gradient(y) * (psi - y)).sum(-1)
     return np.concatenate([np.moveaxis(psi - y, -1, -2), energy[:, None]], axis=1).ravel() / math.sqrt(15)
 
 
-@pytest.mark.parametrize("palindromic", [True, False])
-def test_the_fits_derivatives(palindromic):
+@pytest.mark.parametrize("options", [{}, {"palindromic": False}, {"processor": 2}], ids=str)
+def test_the_fits_derivatives(options):
     """Residuals and Jacobian by the flow's parameters, against the flow itself."""
-    flow = SympFlow.primed(PENDULUM, 2, degree=3, palindromic=palindromic, dt=0.8).requires_grad_(False)
+    flow = SympFlow.primed(PENDULUM, 2, degree=3, dt=0.8, **options).requires_grad_(False)
     run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
-    table, labels_x = Table(flow), torch.as_tensor(run.whole._x[:, :5].T)
+    table = Table(flow)
     theta = table.parameters() + 0.02 * np.random.default_rng(0).normal(size=flow.n_parameters)
-    r, J = run.whole.linearized(theta)
-    np.testing.assert_allclose(r, run.whole.residuals(theta), atol=1e-15)
+    r = check_derivatives(run.whole, theta, 1e-9)
     table.assign(theta)
-    executed = torch.stack([flow.psi(float(t), labels_x) for t in 0.8 * np.arange(1, 4) / 3])
-    np.testing.assert_allclose(r, errors_of(run, executed.numpy()), atol=1e-15)
-    e = 1e-6
-    for i in range(len(theta)):
-        d = e * np.eye(len(theta))[i]
-        slope = (run.whole.residuals(theta + d) - run.whole.residuals(theta - d)) / (2 * e)
-        np.testing.assert_allclose(J[:, i], slope, atol=1e-9)
+    executed = torch.stack([flow.psi(float(t), torch.as_tensor(LABELS.x)) for t in LABELS.t])
+    np.testing.assert_allclose(r, errors_of(executed.numpy()), atol=1e-14)
+
+
+def check_derivatives(problem, theta, tolerance):
+    """The residuals of a problem, whose Jacobian is compared with differences."""
+    r, J = problem.linearized(theta)
+    np.testing.assert_allclose(r, problem.residuals(theta), atol=1e-15)
+    for i, e in enumerate(1e-6 * np.eye(len(theta))):
+        slope = (problem.residuals(theta + e) - problem.residuals(theta - e)) / 2e-6
+        np.testing.assert_allclose(J[:, i], slope, atol=tolerance)
+    return r
 
 
 def test_a_table_is_continued_to_all_times():
@@ -274,22 +281,6 @@ def test_a_degenerate_direction_does_no_harm():
 # processed flows --------------------------------------------------------------------------------------------------
 
 
-def test_the_fits_derivatives_with_a_processor():
-    flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=2, dt=0.8)
-    run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
-    table = Table(flow)
-    theta = table.parameters() + np.random.default_rng(0).normal(0, 0.05, flow.n_parameters)
-    table.assign(theta)
-    r, J = run.whole.linearized(theta)
-    x, t = torch.as_tensor(run.whole._x[:, :5].T), torch.tensor([[0.8 / 3], [1.6 / 3], [0.8]], dtype=torch.float64)
-    np.testing.assert_allclose(r, errors_of(run, flow.psi(t, x.expand(3, 5, 2)).detach().numpy()), atol=1e-14)
-    e = 1e-6
-    for i in range(len(theta)):
-        d = e * np.eye(len(theta))[i]
-        slope = (run.whole.residuals(theta + d) - run.whole.residuals(theta - d)) / (2 * e)
-        np.testing.assert_allclose(J[:, i], slope, atol=1e-9)
-
-
 def test_a_processor_pays():
     """At every time, and at no cost over a long run."""
     processed, plain = (
@@ -341,14 +332,10 @@ def test_residuals_of_a_loss_are_those_of_the_flow():
     config = PrimedFit(loss="residual+matching", residual_weight=2.0, matching_weight=3.0, loss_points=20)
     run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
     theta = Table(flow).parameters() + np.random.default_rng(0).normal(0, 0.02, flow.n_parameters)
-    r, J = run.whole.linearized(theta)
+    r = check_derivatives(run.whole, theta, 1e-8)
+    run.whole.residuals(theta)
     objective = run.whole.objective
     assert r @ r == pytest.approx(float(objective.loss(flow, objective.points).detach()), rel=1e-12)
-    e = 1e-6
-    for i in range(len(theta)):
-        d = e * np.eye(len(theta))[i]
-        slope = (run.whole.residuals(theta + d) - run.whole.residuals(theta - d)) / (2 * e)
-        np.testing.assert_allclose(J[:, i], slope, atol=1e-8)
 
 
 def test_labels_may_be_handed_in():
@@ -534,7 +521,7 @@ def test_a_fit_returns_nothing_worse_than_its_start():
     start = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
     t, x, y = _labels_at(0.5)
     with (
-        pytest.warns(UserWarning, match=r"^`data` are no labels of the system 'pendulum'"),
+        pytest.warns(UserWarning, match=r"^`data` are not labels of the system 'pendulum'"),
         pytest.warns(RuntimeWarning, match=r"^The fit has a larger held-out error .* started from"),
     ):
         flow = train(PENDULUM, flow=start, data=(t, x, 2 * y), restarts=2, steps=8, progress=False)

@@ -54,7 +54,7 @@ def test_a_piece_has_the_states_of_the_lattice():
     assert fitted.domain.bounds == (0.1, TAIL * 0.3)  # a few neighbours have more than all of them
     assert fitted.states.bounds == (0.1, 0.3)
     assert ring(200).piece(8).domain is None
-    with pytest.raises(TypeError, match=r"^`system` 'custom' is no lattice"):
+    with pytest.raises(TypeError, match=r"^`system` 'custom' is not a lattice"):
         HamiltonianSystem.from_sympy("p**2/2 + q**2/2").piece()
     with pytest.raises(ValueError, match=r"^`sites` must be one to 3 positive integers"):
         ring(200).piece(0)
@@ -99,6 +99,7 @@ def test_a_flow_serves_every_shape(flow, tmp_path):
     assert sympflow.load(tmp_path / "flow.safetensors", system=ring(12)).system.ndof == 12
 
 
+@pytest.mark.slow
 def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
     """With the table that they found at Δt, which the numbers at shorter times lead to."""
     monkeypatch.setattr(table_fit, "RUN_STEPS", 8)
@@ -116,6 +117,7 @@ def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
     np.testing.assert_allclose(*numbers, atol=0.02)
 
 
+@pytest.mark.slow
 def test_runs_alone_ask_for_a_primed_flow():
     """As the page on large systems has it: no other option says so."""
     with pytest.warns(RuntimeWarning):  # wherever the time is up
@@ -138,6 +140,7 @@ def test_a_table_that_overflowed_is_as_bad_as_can_be(flow):
     np.testing.assert_array_equal(runs.residuals(theta), before)
 
 
+@pytest.mark.slow
 def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
     lattice = ring(domain=LatticeStates(0.2))
     with pytest.raises(ValueError, match=r"^`runs` must be a positive integer; got 0"):

@@ -76,7 +76,7 @@ def test_where_all_miss_the_goal_the_least_error_is_taken(monkeypatch):
 
 def test_a_map_that_keeps_the_energy_alone_is_no_candidate(monkeypatch):
     """The identity keeps it exactly, and misses all of what a step moves a state."""
-    monkeypatch.setattr(TableFit, "coefficients", lambda self, theta: np.zeros((self.design.shape[1], 1)))
+    monkeypatch.setattr(TableFit, "coefficients", lambda self, theta: np.zeros((1, self.design.shape[1])))
     monkeypatch.setattr(TableFit, "minimize", lambda self, theta, *_, **__: Minimum(theta, 0.0, 0, ""))
     assert trials.trial(default_primed(PENDULUM), PENDULUM, PENDULUM.domain).error == np.inf
     monkeypatch.setattr(trials, "USELESS", 1.1)
