@@ -258,7 +258,7 @@ def domain_of(domain: Domain, system: Hamiltonian) -> Domain:
 def remedy_for(system: Hamiltonian) -> str:
     """Domains that a system of which none is known may be given, as code."""
     local = system.local
-    own = ["LatticeStates(density)"] if local is not None and local.has_piece else []
+    own = ["LatticeStates(density)"] if local is not None and local.has_subsystem else []
     names = [*own, "Box(low, high)", "Ball(center, radius)", "EnergySublevel(energy, box)"]
     return ", ".join(f"sympflow.{name}" for name in names[:-1]) + f" or sympflow.{names[-1]}"
 
