@@ -45,7 +45,7 @@ def check_system(system: Any) -> None:
             "define one with HamiltonianSystem.from_sympy."
         )
     if system.functions_given:
-        system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
+        system.check_functions(torch.empty(0, dtype=torch.float64) if system.definition.takes_tensors else None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -226,6 +226,10 @@ class SymbolicHamiltonian(Definition):
         return [*letters.found, *letters.numbers], letters.replaced
 
     @property
+    def symbols(self) -> SymbolicHamiltonian:
+        return self
+
+    @property
     def timed(self) -> bool:  # type: ignore[override]
         return self.time is not None
 
@@ -469,10 +473,7 @@ class SymbolicHamiltonian(Definition):
         timed = self.kinetic_timed if name in ("T", "drift") else self.timed
         return (self.time,) * timed + (DURATION,) * (name == "drift")
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the generated functions, which cannot be pickled and are generated again."""
-        left_out = ("_functions", "_switches", "poles")
-        return {name: value for name, value in vars(self).items() if name not in left_out}
+    _generated = ("_functions", "_switches", "poles")
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:

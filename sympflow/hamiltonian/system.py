@@ -258,7 +258,6 @@ class HamiltonianSystem(Hamiltonian, Shown):
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(matrices.from_entries(M.shape, M.todok()))
         Hamiltonian.__init__(self, settled.name, symbols, inverse_mass, M is not None)
-        self.symbols = symbols
         self._set_friction(damping)
         self._set_scene(params, settled)
         self._set_period(period)
@@ -489,7 +488,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         """
         if self.local is None:
             raise TypeError(
-                f"`system` {self.name!r} is no lattice, of which a few sites are a piece: define it by "
+                f"`system` {self.name!r} is not a lattice, and only lattices have pieces of a few sites: define it by "
                 "HamiltonianSystem.lattice."
             )
         local = self.local.piece(sites, boundary)
@@ -605,7 +604,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         if self.autonomous:
             raise TypeError("`period` only goes with `time`, for H that depends on t: leave it out.")
         check_positive("period", period, most=1e100)
-        known = self._definition.has_period(float(period))
+        known = self.definition.has_period(float(period))
         if known is False:
             raise ValueError(
                 f"`period` {period!r} is none of H, which differs a period later: give the period of the drive, such "
@@ -631,7 +630,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         self.domain = None if scene.domain is None else domain_of(scene.domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
-        self._definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
+        self.definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
 
     @property
     def scene(self) -> Scene:
@@ -756,14 +755,14 @@ class HamiltonianSystem(Hamiltonian, Shown):
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
         if kind in self._tested:
-            self._definition.check_unchanged()
+            self.definition.check_unchanged()
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 
         given = one_lane(like) if math.prod(like.shape) else self.y0
         probes = probe_states(given, self.domain, 2 * self.ndof)
         n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
-        self._definition.check(probes, like, n_given, *self._probed_times())
+        self.definition.check(probes, like, n_given, self.probe_times())
         self._tested = self._tested | {kind: reach(probes[:, : self._arguments], self._arguments // self.ndof)}
 
     def check_functions_along(self, y: Array) -> bool:
@@ -785,7 +784,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         if not len(far):
             return False
         try:
-            self._definition.check(far, y, 0, *self._probed_times())
+            self.definition.check(far, y, 0, self.probe_times())
         except (ValueError, TypeError) as error:
             warn(f"On this run, far from its start: {error}", RuntimeWarning)
             return True
@@ -793,9 +792,10 @@ class HamiltonianSystem(Hamiltonian, Shown):
         self._tested = self._tested | {kind: reach(seen, self._arguments // self.ndof)}
         return False
 
-    def _probed_times(self) -> tuple[np.ndarray, ...]:
-        """The times at which functions of a driven system are tested."""
-        return () if self.autonomous else (probe_times(*self.t_span),)
+    def probe_times(self, length: float | None = None) -> list[float]:
+        """The times at which functions of the system are tried: the first one, of a driven system others after it."""
+        t0, t1 = self.t_span
+        return [t0] if self.autonomous else probe_times(t0, t1 if length is None else t0 + length).tolist()
 
     @property
     def _arguments(self) -> int:
@@ -813,7 +813,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         >>> [(kick.t, kick(np.array([0.0, 0.5]))) for kick in system.kicks(0, 2)]
         [(1.0, array([0. , 1.5]))]
         """
-        return self._definition.kicks(t0, t1, self.dt / 4)
+        return self.definition.kicks(t0, t1, self.dt / 4)
 
     # structure --------------------------------------------------------------------------------------
 
@@ -844,7 +844,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
             kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
-        if self._definition.given_functions:
+        if self.definition.given_functions:
             kind += f", arrays: it could not be traced, for {self.untraced}" if self.form is None else ", traced"
         degrees = f"{self.ndof:,} degree{'s' * (self.ndof > 1)} of freedom"
         named = self.title if self.name == UNNAMED and self.symbols is not None else f"{self.name}({params})"

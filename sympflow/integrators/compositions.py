@@ -139,7 +139,7 @@ class KineticPotential(Composition):
         if not system.separable:
             raise ValueError(
                 f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
-                f"{system.instead}."
+                f"{system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
@@ -251,7 +251,7 @@ class KineticPotential(Composition):
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
         system = self.system
         if system.symbols is None:
-            raise ValueError(f"`system` {system.name!r} is no symbolic one.")
+            raise ValueError(f"`system` {system.name!r} is not symbolic.")
         if system.kinetic_timed:
             raise ValueError(f"`system` {system.name!r} has a kinetic energy that depends on t.")
         kernel = _splitting_loops()(system, names).kernel(self.scheme, compensated)

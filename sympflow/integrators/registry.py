@@ -245,7 +245,7 @@ def _load(point: EntryPoint) -> type[Integrator]:
         integrator = load_announced(point, "method")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise ImportError(
-            f"`method` {point.name!r} of the plug-in {distribution(point)} is no Integrator class: report it there."
+            f"`method` {point.name!r} of the plug-in {distribution(point)} is not an Integrator class: report it there."
         )
     if not named(integrator):
         raise ImportError(

@@ -197,10 +197,10 @@ class Store:
             return cls(place, fields, attributes)
         except FileNotFoundError:
             if place.exists():
-                raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
+                raise ValueError(f"`store` {str(place)!r} is not a store of sympflow: give another place.") from None
             raise FileNotFoundError(f"`store` {str(place)!r} does not exist.") from None
         except (ValueError, KeyError, TypeError, AttributeError, NotADirectoryError, RecursionError) as error:
-            raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from error
+            raise ValueError(f"`store` {str(place)!r} is not a store of sympflow: give another place.") from error
 
     def check_same(self, key: str, mine: Known, asked: str, kind: str, remedy: str, same: bool) -> None:
         """Check that a store is of the call that asks for it."""
@@ -210,7 +210,7 @@ class Store:
             theirs = None
         if not isinstance(theirs, dict):
             article = "an" if kind[0] in "aeiou" else "a"
-            raise ValueError(f"`store` {asked!r} is no store of {article} {kind}: name another folder.")
+            raise ValueError(f"`store` {asked!r} is not a store of {article} {kind}: name another folder.")
         known = {name: text for name, text in mine.texts.items() if not (same and name in mine.python)}
         if other := difference(theirs, known):
             name = other.split("`")[1]
@@ -258,7 +258,7 @@ class Store:
         assert known.chunks is not None
         values = np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
-            raise ValueError(f"`values` of shape {values.shape} are no chunk of {name!r}, of shape {known.chunks}.")
+            raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
         if values.shape == known.chunks:
             chunk = np.ascontiguousarray(values, dtype=known.dtype)
         else:

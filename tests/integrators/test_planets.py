@@ -363,7 +363,9 @@ def test_the_scene_of_planets():
     given = {"elements": ELEMENTS, "G": GAUSS}
     system = HamiltonianSystem.planets(MASSES, **given, name="giants", dt=None, t_span=(0, 9), domain=None)
     assert (system.name, system.t_span, system.dt) == ("giants", (0.0, 9.0), system.local.frame.longest_step)
-    with pytest.raises(TypeError, match=r"^`damping` is no argument of this system, nor of its scene, name, domain"):
+    with pytest.raises(
+        TypeError, match=r"^`damping` is not an argument of this system, nor of its scene, name, domain"
+    ):
         HamiltonianSystem.planets(MASSES, **given, damping=0.1)
 
 

@@ -424,7 +424,7 @@ def test_a_fit_returns_nothing_worse_than_its_start():
     start = SympFlow.primed(PENDULUM, 2, dt=0.5, processor=2)
     t, x, y = _labels_at(0.5)
     with (
-        pytest.warns(UserWarning, match=r"^`data` are no labels of the system 'pendulum'"),
+        pytest.warns(UserWarning, match=r"^`data` are not labels of the system 'pendulum'"),
         pytest.warns(RuntimeWarning, match=r"^The fit has a larger held-out error .* started from"),
     ):
         flow = train(PENDULUM, flow=start, data=(t, x, 2 * y), restarts=2, steps=8, progress=False)

@@ -192,7 +192,7 @@ def test_data_is_used_and_a_tenth_of_it_held_out():
     arguments |= {"pairs": 2, "points": 300}
     flow = train(OSCILLATOR, data=(t, x, y), **arguments)
     assert flow.figures["one_step_error"] < flow.history[0]["one_step_error"] / 5
-    with pytest.warns(UserWarning, match=r"^`data` are no labels of the system 'harmonic_oscillator'"):
+    with pytest.warns(UserWarning, match=r"^`data` are not labels of the system 'harmonic_oscillator'"):
         other = train(OSCILLATOR, data=(t, torch.tensor(x), -y), **{**arguments, "steps": 2})
     assert flow.unfitted == other.unfitted == ()  # labels at random times leave no gap
     assert other.recipe["stages"][0]["data"] != flow.recipe["stages"][0]["data"]
