@@ -521,7 +521,7 @@ class LogSympFlow(FixedStep):
         expected: float,
         backend: str,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run in one compiled pass: see `clocks.OnClock`. Only a trained clock tells what times its steps reach."""
+        """Run in one compiled pass: see `LogarithmicClock`. Only a trained clock tells what times its steps reach."""
         if not clock.numbers:
             return None
         bound = self.flow.bound(clock.transformed)
@@ -534,7 +534,7 @@ class LogSympFlow(FixedStep):
         return SympFlowIntegrator(flow=self.flow)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count evaluations on the transformed system: see `clocks.OnClock`."""
+        """Count evaluations on the transformed system: see `LogarithmicClock`."""
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
 
     def identity_for(self, system: HamiltonianSystem) -> Identity | None:
