@@ -51,7 +51,7 @@ NEW = {"kind": "sympflow", "pairs": 1, "hidden": (5,)}
     ("system", "arguments", "error", "message"),
     [
         (
-            O,
+            W,
             {"optimizer": "sgd"},
             V,
             f"`optimizer` 'sgd' is unknown: choose one of {', '.join(SOLVERS)}",
@@ -81,7 +81,7 @@ NEW = {"kind": "sympflow", "pairs": 1, "hidden": (5,)}
         (W, {"optimizer": "gauss-newton", "dtype": torch.float32}, T, "^`optimizer` .* in float64"),
         (W, {"flow": 3}, T, "^`flow` must be a SympFlow or an MLPFlow; got 3"),
         (
-            O,
+            W,
             {"kind": "mlp", "pairs": 1, "hidden": (2,)},
             V,
             "^`hidden` and `pairs` describe .* 16 parameters.*: give wider layers",
