@@ -30,7 +30,7 @@ from sympflow.arrays import (
 )
 from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import TracedHamiltonian
+from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.times import probe_times
@@ -144,6 +144,10 @@ class CallableHamiltonian(Definition):
             return None
         self._known = states[0], 0.0, np.nan
         return found
+
+    @cached_property
+    def poles(self) -> TracedPoles | None:  # type: ignore[override]
+        return None if self.form is None else TracedPoles(self.form) or None
 
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]
@@ -285,7 +289,7 @@ class CallableHamiltonian(Definition):
                 return False
         return _alike(found, self.form.gradient(state, *times))
 
-    _generated = ("form", "takes_tensors", "_follows_tensors")
+    _generated = ("form", "poles", "takes_tensors", "_follows_tensors")
 
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None or (self.form is not None and self.library == "numpy"):
@@ -303,6 +307,8 @@ class CallableHamiltonian(Definition):
 
     def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
+        if self.form is not None:
+            self.form.check_continuous(self._name)
         if self.form is not None and self.library == "numpy":
             like = np.empty(0) if is_tensor(like) or self._gradient is None else like
         elif self.differentiates_itself and not is_tensor(like):

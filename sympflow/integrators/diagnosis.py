@@ -130,6 +130,8 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
     with np.errstate(all="ignore"):
         try:
             looked = _look(problem.system, poles.look(y, t[:, None], numbers))
+            if looked is not None and (exact := poles.exact) is not poles:
+                looked = _look(problem.system, exact.look(y, t[:, None])) if exact and exact.watched else None
         except TypeError:  # a function that takes no arrays
             return False
         if looked is None:
@@ -147,10 +149,11 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
                 if values is None or problem.parameter_values is None
                 else replace(problem, system=values.system_of(row), parameter_values=None)
             )
-            if own.system.definition.poles is None or not own.system.definition.poles.watched:
+            known = own.system.definition.poles and own.system.definition.poles.exact
+            if known is None or not known.watched:
                 continue
             ends = t[-1], t[int(np.argmax(odd[:, row]))]
-            passage = _passage(own.system.definition.poles, *_steps_of(outcome, integrator, own, row, ends), scale[row])
+            passage = _passage(known, *_steps_of(outcome, integrator, own, row, ends), scale[row])
             if passage is not None:
                 found[row] = passage
     certain = [row for row, passage in found.items() if passage.certain]
