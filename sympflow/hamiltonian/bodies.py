@@ -334,8 +334,8 @@ class PairsHamiltonian(LocalHamiltonian):
         before, after = ((self._of_bodies(x[self.ndof :]) ** 2).sum(-1) / self.inertia for x in (start, y))
         i, j = sorted(np.argsort(after - before)[-2:].tolist())
         return (
-            f"the bodies {i} and {j} have gained most: they met between two steps, which saw nothing of it. Take "
-            "shorter steps, `softening`, or a method with a clock of its own, such as 'log_leapfrog'"
+            f"the bodies {i} and {j} have gained most: they met within one step. Reduce `dt`, take `softening`, or "
+            "a method with a clock of its own, such as 'log_leapfrog'"
         )
 
     def remark(self, q: np.ndarray) -> str:

@@ -255,7 +255,9 @@ class LatticeHamiltonian(LocalHamiltonian):
             if name in values:
                 raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
         if len(set(written)) < len(written):
-            raise ValueError(f"`fields` are {self.fields}, of which the names {', '.join(written)} follow: rename one.")
+            raise ValueError(
+                f"`fields` {self.fields} give the names {', '.join(written)}, not all different: rename one."
+            )
 
         def expression(argument: str, given: Any, kind: str, example: str) -> sp.Expr:
             own = dict(zip(names[kind], getattr(self, kind), strict=True))
@@ -351,8 +353,8 @@ class LatticeHamiltonian(LocalHamiltonian):
                 bonds[k] = V
         if not onsite.any() and not any(kappa.any() for kappa in couplings.values()):
             raise ValueError(
-                "`onsite` and `bond` have no quadratic terms that are written as such, so that there is no linear "
-                "part: take a method that splits into T and V, such as 'srkn6b'."
+                "`onsite` and `bond` have no quadratic terms that are written out, so there is no linear part: "
+                "take a method that splits into T and V, such as 'srkn6b'."
             )
         transform = Transform(self.shape, self.boundary)
         waves = [dispersion(couplings, transform.angles(axis)) for axis in range(len(self.shape))] if couplings else []

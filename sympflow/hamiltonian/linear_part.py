@@ -205,7 +205,7 @@ def linear_part(system: Any) -> LinearPart:
     if part is None and not system.autonomous:
         raise ValueError(
             f"`system` {system.name!r} has no linear part: no coordinate has quadratic terms, in q and in p, that do "
-            "not depend on t, and the flow of those that do is not known. Use a scheme on the splitting 'kinetic', "
+            "not depend on t, and terms that do have no known flow. Use a scheme on the splitting 'kinetic', "
             "such as 'srkn11b' or 'kahan_li8', or an implicit method."
         )
     if part is None:
@@ -384,8 +384,8 @@ def turning(system: Any, part: LinearPart | None) -> str | None:
             "state of low potential, without what is not stiff in it"
         )
     return (
-        f"its stiff directions do not turn, but they are none of its quadratic terms, from the stiffest of which "
-        f"they are {np.degrees(angle):.0f}° away. Give the system by functions, Hamiltonian(V, ndof=…, "
+        f"its stiff directions do not turn, but its quadratic terms do not hold them: the stiffest of these is "
+        f"{np.degrees(angle):.0f}° away. Give the system by functions, Hamiltonian(V, ndof=…, "
         "stiffness_matrix=K) with K the curvature ∇²V of the stiff directions"
     )
 

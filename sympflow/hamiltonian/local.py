@@ -83,7 +83,7 @@ class LocalHamiltonian(Definition, ABC):
     def linear_and_rest(self, interval: float) -> tuple[Any, list[Any]]:
         """The quadratic part of H, in its normal modes, and the part that remains, if there is one."""
         raise ValueError(
-            f"`system` is made of {self.loops}, of which no linear part is known: take a method that splits into T and "
+            f"`system` is made of {self.loops}, which have no known linear part: take a method that splits into T and "
             "V, such as 'srkn6b'."
         )
 
@@ -146,7 +146,7 @@ class LocalHamiltonian(Definition, ABC):
         """Refuse a matrix with more than 5e7 entries: ∇²V, or that of the equations of an implicit step."""
         if entries > MOST_DENSE:
             raise ValueError(
-                f"`system` has {self.ndof:,} degrees of freedom, of which {what} is dense, with {entries:.3g} entries: "
+                f"`system` has {self.ndof:,} degrees of freedom, and {what} is dense, with {entries:.3g} entries: "
                 "take a splitting method such as 'srkn6b', which needs no matrix, or a subsystem."
             )
 
@@ -202,7 +202,7 @@ def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Sy
         )
     if unknown:
         raise ValueError(
-            f"`{argument}` holds {', '.join(unknown)}, and its names are {', '.join(symbols)}: give other ones a value "
+            f"`{argument}` holds {', '.join(unknown)}, and its names are {', '.join(symbols)}: give all others a value "
             "in `params`."
         )
     if f.has(sp.zoo, sp.nan, sp.oo) or complex_part(f) is not None:

@@ -31,7 +31,7 @@ def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
         raise ValueError(_too_many(degree, d))
     kept = _generated(symbols, degree) if symbols.V.is_polynomial(*symbols.q) else _as_even(symbols, degree)
     if not kept:
-        raise ValueError(f"`polynomial` {degree!r} leaves no monomial of those that suit V: take a higher degree.")
+        raise ValueError(f"`polynomial` {degree!r} leaves no monomial that suits V: take a higher degree.")
     if len(kept) > MOST_MONOMIALS:
         raise ValueError(_too_many(degree, d))
     return tuple(sorted(kept, key=lambda m: (sum(m), m)))

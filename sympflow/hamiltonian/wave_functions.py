@@ -109,7 +109,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         d = self.ndof
         if np.prod(y.shape, dtype=float) * 2 * d > MOST_DENSE:
             raise ValueError(
-                f"`system` has {d:,} sites, of which a dense ∇²H has {4.0 * d * d:.3g} entries for each state: take a "
+                f"`system` has {d:,} sites, and its dense ∇²H has {4.0 * d * d:.3g} entries for each state: take a "
                 "method with the exact linear flow, such as 'linear_kahan_li6', or fewer sites."
             )
         q, p = self._fields(y)

@@ -229,7 +229,7 @@ HERE = "^`system` 'driven_pendulum' is driven"
         (lambda: made("p**2/2 + a*q**2", params=AW, time="a"), ValueError, "^`time` 'a' is a"),
         (lambda: made("p**2/2 + t*q**2", time=1), TypeError, "^`time` must be the name"),
         (lambda: made("p**2/2 + q**2", period=1), TypeError, "^`period` only goes with `time`"),
-        (lambda: made(TEXT, time="t", params=AW, period=3.7), ValueError, "^`period` 3.7 is none"),
+        (lambda: made(TEXT, time="t", params=AW, period=3.7), ValueError, "^`period` 3.7 is not a period"),
         (lambda: made(TEXT, time="t", params=AW, period=-1), ValueError, "^`period` must be"),
         (lambda: made("p**2/2 + q**2", params=SAMPLED), ValueError, "^`params` has 'a'"),
         (

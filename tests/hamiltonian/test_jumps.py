@@ -522,7 +522,7 @@ def test_the_period_is_that_of_the_expression(V, period, other):
     params = {"a": SPLINE} if V.has(sp.Symbol("a")) else None
     if period is not None:
         assert made(p**2 / 2 + V, time="t", period=period, params=params).period == period
-    with pytest.raises(ValueError, match=r"^`period` .* is none of H"):
+    with pytest.raises(ValueError, match=r"^`period` .* is not a period of H"):
         made(p**2 / 2 + V, time="t", period=other, params=params)
 
 
@@ -545,5 +545,5 @@ def test_the_period_of_functions_is_tried_at_states_and_times_of_all_sizes(V, pe
     if is_one:
         check_period(H, 1, None, period)
         return
-    with pytest.raises(ValueError, match=r"^`period` .* is none of H"):
+    with pytest.raises(ValueError, match=r"^`period` .* is not a period of H"):
         check_period(H, 1, None, period)
