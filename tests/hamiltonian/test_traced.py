@@ -355,7 +355,7 @@ def test_a_given_gradient_is_optional_and_compared():
     backend = solve(system, "verlet", (0, 1), Y0, dt=0.1).stats["backend"]
     assert (
         backend
-        == "numpy: `potential` could not be traced, for `gradient` is not exactly the derivative of `potential`: leave it out"
+        == "numpy: `potential` could not be traced, for `gradient` is not exactly that of `potential`: leave it out"
     )
 
 
