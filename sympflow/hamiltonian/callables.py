@@ -246,7 +246,7 @@ class CallableHamiltonian(Definition):
             except Exception as error:  # whatever a user's function raises
                 raise Untraceable(f"`{name}` fails where `{self._name}` does not ({error})") from error
             if found.shape != exact.shape or not _alike(found, exact):
-                raise Untraceable(f"`{name}` is not exactly the derivative of `{self._name}`: leave it out")
+                raise Untraceable(f"`{name}` is not exactly that of `{self._name}`: leave it out")
 
     def check_unchanged(self) -> None:
         """Raise a ValueError if the function has another value than when it was traced."""

@@ -350,7 +350,7 @@ class Hamiltonian:
     def __call__(self, t: float, y: Array) -> Array:
         """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`.
 
-        Beyond the samples of a parameter its spline is extrapolated, because solvers may evaluate past the end of a run.
+        Beyond the samples of a parameter its spline is extrapolated: solvers may evaluate past the end of a run.
         """
         if isinstance(y, int | float):
             raise TypeError(f"`y` must be a state; got the number {y}: the time comes first, as in system(t, y).")

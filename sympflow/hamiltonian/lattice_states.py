@@ -120,7 +120,7 @@ class LatticeStates:
     def checked(cls, system: Hamiltonian) -> Any:
         if system.local is None or not system.local.shape:
             raise ValueError(
-                f"`domain` LatticeStates is for lattices, and the system {system.name!r} is not one: take a sympflow.Box."
+                f"`domain` LatticeStates is for lattices, and {system.name!r} is not one: take a sympflow.Box."
             )
         return system.local
 

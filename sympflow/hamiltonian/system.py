@@ -737,7 +737,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
 
         At a few states, y0 (the system's if it is None), near these and of the domain, the gradient, given or
         automatic, is compared with differences of H, and `hessian_vector` with those of the gradient; a batch with
-        single states; a value with itself. States where H is not finite, or next to a kink, are left out. The test takes
+        single states; a value with itself. States where H is not finite, or next to a kink, are left out. It takes
         milliseconds; `check=False` of the system omits it.
 
         Parameters
