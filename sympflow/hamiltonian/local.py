@@ -1,6 +1,6 @@
 """Hamiltonians of any size that are symbolic in one piece, a site and a bond or a pair; vectors stay arrays.
 
-A subclass states the pieces as expressions in a few letters, and adds their values up over the system by array
+A subclass states the pieces as expressions in a few symbols, and adds their values up over the system by array
 operations. Nothing that it holds, but what depends on sites, is as long as the system.
 """
 
@@ -23,7 +23,7 @@ from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.expression import complex_part, stated
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
-__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "letters", "named_values", "parsed"]
+__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "named_values", "numbered", "parsed"]
 
 MOST_DENSE = 50_000_000
 """Entries of matrices ∇²V that are made at a time."""
@@ -176,7 +176,7 @@ class LocalHamiltonian(Definition, ABC):
         return {}
 
 
-def letters(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
+def numbered(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
     """Real symbols kind_0, kind_1, … for things of these names."""
     return tuple(sp.Symbol(f"{kind}_{i}", real=True) for i in range(len(names)))
 

@@ -568,15 +568,14 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
     if "t" in unknown:
         raise TypeError('`expression` depends on the time t: name it by time="t", for a system that is driven.')
     if unknown:
+        shown = [name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…" for name in unknown]
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
         if any(COORDINATE_LIKE.fullmatch(name) for name in unknown):
             meant += (
                 " Coordinates are q and p, or q1 … qd and p1 … pd: other names are given by "
                 "from_sympy(H, q=['x', 'y'], p=['px', 'py'])."
             )
-        raise ValueError(
-            f"`expression` holds {', '.join(map(_short, unknown))} without a value: give it in `params`.{meant}"
-        )
+        raise ValueError(f"`expression` holds {', '.join(shown)} without a value: give it in `params`.{meant}")
     return H
 
 
@@ -688,10 +687,6 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
     return checked
 
 
-def _short(name: str) -> str:
-    return name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
-
-
 def _is_coordinate(name: str) -> bool:
     return COORDINATE.fullmatch(name) is not None
 
@@ -736,15 +731,13 @@ _MAX_POWER = 16  # integer powers up to this are made of products
 _INTEGER_POWER = sp.Function("integer_power", real=True)
 
 
-def _of_machine_numbers(f: sp.Expr) -> sp.Expr:
-    """f with integers that no 64 bits hold, as of a system in SI units, as floating-point numbers."""
-    return f.xreplace({n: sp.Float(int(n)) for n in f.atoms(sp.Integer) if abs(n) >= 2**63})
-
-
 def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], library: str) -> Callable[..., list[Any]]:
     """The values of the expressions, as a function of the variables' arrays of "numpy" or "torch"."""
-    written = _by_products if library == "numpy" else _with_tensor_functions
-    code = [written(_by_reciprocals(_of_machine_numbers(f))) for f in expressions]
+    code = []
+    for f in expressions:
+        large = [n for n in f.atoms(sp.Integer) if abs(n) >= 2**63]  # which no 64 bits hold
+        written = _by_reciprocals(f.xreplace({n: sp.Float(int(n)) for n in large}))
+        code.append(_by_products(written) if library == "numpy" else written.replace(sp.erfc, tensor_erfc))
     sums = [_in_pieces(f) for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
@@ -807,10 +800,6 @@ def _by_reciprocals(f: sp.Expr) -> sp.Expr:
         if f.has(function):
             f = f.replace(function, written)
     return f
-
-
-def _with_tensor_functions(f: sp.Expr) -> sp.Expr:
-    return f.replace(sp.erfc, tensor_erfc)
 
 
 def _integer_power(x: np.ndarray, n: int) -> np.ndarray:
