@@ -499,7 +499,7 @@ SCENES = {
     "an indefinite damping": (lambda: made(TWO, damping=[[1, 2], [2, 1]]), ValueError, "`damping` .* semi-definite"),
     "energy of a drive": (lambda: energy_error(by_arrays(DRIVEN)), ValueError, "`system` 'driven' .*balance_error"),
     "energy of friction": (lambda: energy_error(by_arrays(DAMPED)), ValueError, "`system` 'damped' .* energy is lost"),
-    "another time": (lambda: time_transformed(DRIVEN), ValueError, "`system` 'driven' is driven, .* no energy E"),
+    "another time": (lambda: time_transformed(DRIVEN), ValueError, "`system` 'driven' is driven, .* needs an energy E"),
     "a log clock": (lambda: solve(DRIVEN, "log_kahan_li8"), ValueError, "`system` 'driven' .*'log_kahan_li8' does not"),
     "a flow of no drive": (lambda: solve(DRIVEN, shipped()), ValueError, "`system` 'driven' is driven"),
     "a flow of no friction": (lambda: solve(damped_pendulum(), shipped()), ValueError, "`system` .* has friction"),

@@ -16,7 +16,7 @@ from sympflow.arguments import check_kept, checked_count, checked_number, plain
 from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
-from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, named_values, parsed
+from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, named_values, numbered, parsed
 from sympflow.hamiltonian.poles import PairsPoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
@@ -103,8 +103,8 @@ class PairsHamiltonian(LocalHamiltonian):
 
     def _read(self, potential: Any, columns: Mapping[str, np.ndarray]) -> None:
         r, self.s = sp.Symbol("r", positive=True), sp.Symbol("s", positive=True)
-        first, second = letters("a", tuple(columns)), letters("b", tuple(columns))
-        c = letters("c", tuple(self.params))
+        first, second = numbered("a", tuple(columns)), numbered("b", tuple(columns))
+        c = numbered("c", tuple(self.params))
         names: dict[str, sp.Symbol] = {"r": r}
         for name, a, b in zip(columns, first, second, strict=True):
             names |= {f"{name}1": a, f"{name}2": b}
@@ -146,10 +146,10 @@ class PairsHamiltonian(LocalHamiltonian):
     def _check_continuous(self) -> None:
         """Refuse a V that jumps."""
         columns = [*self.columns, *self.columns, *self.params.values()]
-        letters_of = (*self.first, *self.second, *self.c[: len(self.params)])
+        symbols = (*self.first, *self.second, *self.c[: len(self.params)])
         names = dict(zip(self.c, self.params, strict=False))
         distance = [s for s in self.of_distance.free_symbols if s.name == "r"]
-        check_continuous("potential", self.of_distance, distance, dict(zip(letters_of, columns, strict=True)), names)
+        check_continuous("potential", self.of_distance, distance, dict(zip(symbols, columns, strict=True)), names)
 
     def identity_parts(self) -> Any:
         made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
@@ -193,7 +193,7 @@ class PairsHamiltonian(LocalHamiltonian):
         c: Mapping[sp.Symbol, sp.Expr],
         box: Sequence[sp.Expr] = (),
     ) -> sp.Expr:
-        """V of all pairs, in letters of positions, ε², columns of bodies, parameters and the sides of the box."""
+        """V of all pairs, in symbols of positions, ε², columns of bodies, parameters and the sides of the box."""
         terms = []
         for i, j in combinations(range(self.n_bodies), 2):
             d = [q[self.dim * i + k] - q[self.dim * j + k] for k in range(self.dim)]
@@ -300,18 +300,18 @@ class PairsHamiltonian(LocalHamiltonian):
         return PairsPoles(self) or None
 
     def met(self, q: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]]:
-        """The ends i, j (P,) of pairs, their distances, or differences on a line, (..., P), and values of letters."""
+        """The ends i, j (P,) of pairs, their distances, or differences on a line, (..., P), and values of symbols."""
         for pairs in self._pairs(q):
             x = pairs.x[0][..., 0] if self.on_a_line else np.sqrt(pairs.s)
-            yield pairs.i, pairs.j, x, pairs.letters
+            yield pairs.i, pairs.j, x, pairs.symbol_values
 
     def values_of(
-        self, key: str, expressions: list[sp.Expr], x: sp.Symbol, distances: np.ndarray, letters: list[Any]
+        self, key: str, expressions: list[sp.Expr], x: sp.Symbol, distances: np.ndarray, symbol_values: list[Any]
     ) -> list[Any]:
-        """The values of expressions in a distance and the letters of two bodies."""
+        """The values of expressions in a distance and the symbols of two bodies."""
         names = (x, *self.first, *self.second, *self.c)
         with np.errstate(all="ignore"):
-            values = self._values(f"potential {key}", lambda: expressions, names, distances, *letters)
+            values = self._values(f"potential {key}", lambda: expressions, names, distances, *symbol_values)
         return [np.broadcast_to(value, distances.shape) for value in values]
 
     @property
@@ -436,14 +436,14 @@ class Pairs:
         self.s = _dot(x[0], x[0]) + local.softening**2
 
     @property
-    def letters(self) -> list[Any]:
-        """The values of the letters of V: (P,) of the bodies, and numbers."""
+    def symbol_values(self) -> list[Any]:
+        """The values of the symbols of V: (P,) of the bodies, and numbers."""
         return [*(column[ends] for ends in (self.i, self.j) for column in self.local.columns), *self.local.constants]
 
     def values(self, k: int) -> Array:
         """2ᵏ times the k-th derivative of V by s, 0 beyond the cut-off: (..., P)."""
         local, s = self.local, self.s
-        given = [like(x, s) for x in self.letters]
+        given = [like(x, s) for x in self.symbol_values]
         variables = (local.s, *local.first, *local.second, *local.c)
         with np.errstate(all="ignore"):  # bodies at one place
             value = local._values(f"potential {k}", lambda: [local.slopes[k]], variables, s, *given)[0] + 0 * s

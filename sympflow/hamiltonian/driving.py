@@ -225,11 +225,8 @@ DURATION = sp.Symbol("duration", real=True)
 
 def drift(slope: tuple[sp.Expr, ...], time: sp.Symbol | None) -> tuple[sp.Expr, ...]:
     """∫_t^{t+s} ∇T(p, u) du, an expression in p, t and s, which is `DURATION`, for each entry of the slope ∇T(p, t)."""
-    return tuple(sp.Add(*[_integrated(term, time) for term in sp.Add.make_args(_sum_of(f, time))]) for f in slope)
-
-
-def _sum_of(f: sp.Expr, time: sp.Symbol | None) -> sp.Expr:
-    return f if time is None or not f.has(time) else sp.expand(f)
+    sums = [f if time is None or not f.has(time) else sp.expand(f) for f in slope]
+    return tuple(sp.Add(*[_integrated(term, time) for term in sp.Add.make_args(f)]) for f in sums)
 
 
 def _integrated(term: sp.Expr, time: sp.Symbol | None) -> sp.Expr:

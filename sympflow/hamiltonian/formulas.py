@@ -429,16 +429,15 @@ def evaluator(numbers: Mapping[Any, Any]) -> Callable[[Any], Any]:
         if isinstance(f, float):
             return f
         if f not in known:
-            known[f] = f.value(known) if isinstance(f, Formula) else _of_symbols()(f, value)
+            if isinstance(f, Formula):
+                known[f] = f.value(known)
+            else:
+                from sympflow.hamiltonian.recorded import calculated
+
+                known[f] = calculated(f, value)
         return known[f]
 
     return value
-
-
-def _of_symbols() -> Callable[[Any, Callable[[Any], Any]], Any]:
-    from sympflow.hamiltonian.recorded import calculated
-
-    return calculated
 
 
 def recorded(expressions: Sequence[Any], inputs: Sequence[Any]) -> Program:

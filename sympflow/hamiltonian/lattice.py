@@ -17,7 +17,7 @@ from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
-from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, parsed
+from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, numbered, parsed
 from sympflow.hamiltonian.poles import LatticePoles, Poles
 from sympflow.hamiltonian.symbolic import exact
 
@@ -62,7 +62,8 @@ class LatticeHamiltonian(LocalHamiltonian):
         check_memory(float(n_sites) * len(self.fields), "`shape`")
         self.ndof = n_sites * len(self.fields)
         self.params = checked_params(params, self.shape)
-        self._set_letters()
+        self.x, self.p, self.r, self.v, self.w = (numbered(kind, self.fields) for kind in "xprvw")
+        self.c = numbered("c", tuple(self.params))
         self._read(onsite, bond, kinetic)
         self._check_continuous()
         self._check_sizes()
@@ -232,11 +233,6 @@ class LatticeHamiltonian(LocalHamiltonian):
                     r = [b - a for a, b in zip(fields(q, first), fields(q, last), strict=True)]
                     terms.append(self.bonds[k].xreplace(at(self.r, r, line[0] if first is None else first)))
         return sp.Add(*terms)
-
-    def _set_letters(self) -> None:
-        fields = self.fields
-        self.x, self.p, self.r, self.v, self.w = (letters(kind, fields) for kind in "xprvw")
-        self.c = letters("c", tuple(self.params))
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
@@ -494,7 +490,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     def _site_values(
         self, key: str, expressions: Expressions, variables: Sequence[sp.Symbol], *arrays: Sequence[Array]
     ) -> list[Array]:
-        return self._of_letters(key, expressions, variables, [x for row in arrays for x in row], list(self._sites))
+        return self._of_symbols(key, expressions, variables, [x for row in arrays for x in row], list(self._sites))
 
     def _bond_values(
         self,
@@ -506,9 +502,9 @@ class LatticeHamiltonian(LocalHamiltonian):
         *arrays: Sequence[Array],
     ) -> list[Array]:
         given = [x for row in arrays for x in row]
-        return self._of_letters(f"bond {k} {order}", expressions, variables, given, self._of_bonds(axis, k))
+        return self._of_symbols(f"bond {k} {order}", expressions, variables, given, self._of_bonds(axis, k))
 
-    def _of_letters(
+    def _of_symbols(
         self,
         key: str,
         expressions: Expressions,

@@ -1,6 +1,6 @@
 """Hamiltonians of any size that are symbolic in one piece, a site and a bond or a pair; vectors stay arrays.
 
-A subclass states the pieces as expressions in a few letters, and adds their values up over the system by array
+A subclass states the pieces as expressions in a few symbols, and adds their values up over the system by array
 operations. Nothing that it holds, but what depends on sites, is as long as the system.
 """
 
@@ -20,10 +20,10 @@ import sympy as sp
 from sympflow.arguments import as_float, check_kept, plain, real_number
 from sympflow.arrays import Array, is_tensor, like
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
+from sympflow.hamiltonian.expression import complex_part, stated
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
-__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "letters", "named_values", "parsed"]
+__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "named_values", "numbered", "parsed"]
 
 MOST_DENSE = 50_000_000
 """Entries of matrices ∇²V that are made at a time."""
@@ -176,7 +176,7 @@ class LocalHamiltonian(Definition, ABC):
         return {}
 
 
-def letters(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
+def numbered(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
     """Real symbols kind_0, kind_1, … for things of these names."""
     return tuple(sp.Symbol(f"{kind}_{i}", real=True) for i in range(len(names)))
 
@@ -187,17 +187,11 @@ def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Sy
         raise TypeError(
             f"`{argument}` must be a string or a SymPy expression such as {example!r}; got {type(expression).__name__}."
         )
-    try:
-        f = read(expression, symbols) if isinstance(expression, str) else sp.sympify(expression)
-        f = of_sympy(f, symbols)
-    except Unreadable as error:
-        raise ValueError(
-            f"`{argument}` cannot be parsed: {str(expression)[:200]!r} ({error}). Write it as {example!r}."
-        ) from None
+    f = stated(argument, expression, symbols, f"Write it as {example!r}")
     unknown = sorted(s.name for s in f.free_symbols if s.name not in symbols)
     if "t" in unknown:
         raise ValueError(
-            f"`{argument}` holds t, and systems by one piece do not depend on the time: give t a value in `params`, or "
+            f"`{argument}` holds t, and such systems do not depend on the time: give t a value in `params`, or "
             "write H out by from_sympy(..., time='t')."
         )
     if unknown:

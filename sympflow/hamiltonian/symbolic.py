@@ -7,7 +7,7 @@ import numbers
 import re
 import reprlib
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import islice
@@ -32,7 +32,7 @@ from sympflow.hamiltonian.driving import (
     sampled_parameter,
     with_letters,
 )
-from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, complex_part, of_sympy, read
+from sympflow.hamiltonian.expression import COORDINATE, FUNCTIONS, complex_part, of_sympy, stated
 from sympflow.hamiltonian.jumps import (
     MOST_IMPULSES,
     MOST_POINTS,
@@ -487,7 +487,7 @@ def renamed(expression: str | sp.Expr, q: Any, p: Any) -> sp.Expr:
     if len(rows[0]) != len(rows[1]) or len(set(names)) < len(names) or not names:
         raise ValueError(f"`q` and `p` must name d coordinates each, all different; got {q!r} and {p!r}.")
     if isinstance(expression, str):
-        f = _read_text(expression, names)
+        f = stated("expression", expression, {*names, *_AMBIGUOUS})
     else:
         functions = {x: sp.Symbol(str(x.func)) for row in rows for x in row if isinstance(x, sp.Function)}
         f = of_sympy(expression.xreplace(functions), names)
@@ -534,37 +534,13 @@ def parse(expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol 
     return _valued(*_read(expression, checked_params(params), time), time)
 
 
-def _read_text(text: str, names: Collection[str]) -> sp.Expr:
-    coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", text) if _is_coordinate(w))
-    try:
-        return read(text, {*names, *_AMBIGUOUS, *coordinates})
-    except Unreadable as error:
-        shown = text if len(text) <= 200 else text[:200] + "..."
-        raise ValueError(
-            f"`expression` cannot be parsed: {shown!r} ({error}). Write it with these, or pass a SymPy expression."
-        ) from None
-
-
 def _read(
     expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol | None
 ) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
     """The expression in real symbols, and the numbers, or functions of t, for those that are parameters."""
     names = {name: sp.Symbol(name, real=True) for name in params}
     meant = {*params, *(() if time is None else (time.name,))}
-    if isinstance(expression, str):
-        H = _read_text(expression, meant)
-    else:
-        try:
-            H = sp.sympify(expression, strict=True)
-        except sp.SympifyError:
-            raise ValueError(
-                f"`expression` must be a scalar expression; got {type(expression).__name__}: pass a string or a SymPy "
-                "expression."
-            ) from None
-    try:
-        H = of_sympy(H, meant)
-    except Unreadable as error:
-        raise ValueError(f"`expression` must be a scalar expression: {error}.") from None
+    H = stated("expression", expression, {*meant, *_AMBIGUOUS} if isinstance(expression, str) else meant)
     _check_real(H)
     for name in params:
         if names[name] not in H.free_symbols:
@@ -592,15 +568,14 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
     if "t" in unknown:
         raise TypeError('`expression` depends on the time t: name it by time="t", for a system that is driven.')
     if unknown:
+        shown = [name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…" for name in unknown]
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
         if any(COORDINATE_LIKE.fullmatch(name) for name in unknown):
             meant += (
                 " Coordinates are q and p, or q1 … qd and p1 … pd: other names are given by "
                 "from_sympy(H, q=['x', 'y'], p=['px', 'py'])."
             )
-        raise ValueError(
-            f"`expression` holds {', '.join(map(_short, unknown))} without a value: give it in `params`.{meant}"
-        )
+        raise ValueError(f"`expression` holds {', '.join(shown)} without a value: give it in `params`.{meant}")
     return H
 
 
@@ -712,12 +687,8 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
     return checked
 
 
-def _short(name: str) -> str:
-    return name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
-
-
 def _is_coordinate(name: str) -> bool:
-    return re.fullmatch(r"[qp]([1-9][0-9]{0,15})?", name) is not None
+    return COORDINATE.fullmatch(name) is not None
 
 
 def _index(symbol: sp.Symbol) -> int:
@@ -760,15 +731,13 @@ _MAX_POWER = 16  # integer powers up to this are made of products
 _INTEGER_POWER = sp.Function("integer_power", real=True)
 
 
-def _of_machine_numbers(f: sp.Expr) -> sp.Expr:
-    """f with integers that no 64 bits hold, as of a system in SI units, as floating-point numbers."""
-    return f.xreplace({n: sp.Float(int(n)) for n in f.atoms(sp.Integer) if abs(n) >= 2**63})
-
-
 def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], library: str) -> Callable[..., list[Any]]:
     """The values of the expressions, as a function of the variables' arrays of "numpy" or "torch"."""
-    written = _by_products if library == "numpy" else _with_tensor_functions
-    code = [written(_by_reciprocals(_of_machine_numbers(f))) for f in expressions]
+    code = []
+    for f in expressions:
+        large = [n for n in f.atoms(sp.Integer) if abs(n) >= 2**63]  # which no 64 bits hold
+        written = _by_reciprocals(f.xreplace({n: sp.Float(int(n)) for n in large}))
+        code.append(_by_products(written) if library == "numpy" else written.replace(sp.erfc, tensor_erfc))
     sums = [_in_pieces(f) for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
@@ -831,10 +800,6 @@ def _by_reciprocals(f: sp.Expr) -> sp.Expr:
         if f.has(function):
             f = f.replace(function, written)
     return f
-
-
-def _with_tensor_functions(f: sp.Expr) -> sp.Expr:
-    return f.replace(sp.erfc, tensor_erfc)
 
 
 def _integer_power(x: np.ndarray, n: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.lattice import checked_shape
-from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, checked_params, letters, parsed
+from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, checked_params, numbered, parsed
 from sympflow.hamiltonian.normal_modes import SpectralPart, Transform
 
 
@@ -42,7 +42,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         check_memory(float(self.ndof), "`shape`")
         self.length = _checked_length(length, self.grid)
         self.params = checked_params(params, self.grid)
-        self.c = letters("c", tuple(self.params))
+        self.c = numbered("c", tuple(self.params))
         self.rho, self.k = (sp.Symbol(name, real=True) for name in ("rho", "k"))
         values = dict(zip(self.params, self.c, strict=True))
         for name in ("rho", "k"):
