@@ -181,7 +181,11 @@ class FlowIntegrator(FixedStep):
 
     def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
         """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
-        return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend)
+        system = None
+        if is_tensor(problem.y0) and str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
+            weights: Any = flow
+            system = None if any(x.requires_grad for x in weights.parameters()) else problem.system
+        return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend, system=system)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         flow = self.known_flow(problem.system)

@@ -574,6 +574,7 @@ class FixedGrid(ExplicitStep, FixedStep):
             problem.y0,
             problem.backend,
             told=told,
+            system=problem.system,
         )
         return Stepper(self, problem, OwnSteps(self, problem), kernel, told)
 
