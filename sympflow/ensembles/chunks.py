@@ -113,7 +113,7 @@ class Chunk:
         times = self.times
         stepper = self._stepper
         most = max(1, MOST_VALUES // self.y0.size)
-        alike = self.t_eval is None and not self.params and self.system.autonomous
+        alike = self.t_eval is None and not self.params
         kernel = None if stepper is None else stepper.kernel
         if len(times) <= most or not alike or stepper is None or kernel is None or len(self) == 1:
             yield times, self.states(times)
@@ -122,14 +122,15 @@ class Chunk:
         carry, last = RunCheckpoint(), np.full(len(self), grid.n_steps)
         for start in range(0, grid.n_steps + 1, most):
             save = np.arange(start, min(start + most, grid.n_steps + 1))
-            y, last, _ = kernel.run(grid.h, self.y0, int(save[-1]), save, carry=carry)
+            y, last, _ = kernel.run(grid.h, self.y0, int(save[-1]), save, carry, grid.t0)
             ran_out = np.flatnonzero((last < save[-1]) & (self.status == 0))
             for row in ran_out.tolist():
                 self.fail(row, self._reason(grid.time(int(last[row])), ""))
             yield times[save], y.swapaxes(1, 2)
         if grid.remainder:
             with np.errstate(all="ignore"):
-                yield times[-1:], stepper.shorter(y[:, -1], np.full(len(self), grid.remainder))[..., None]
+                end = stepper.shorter(y[:, -1], np.full(len(self), grid.remainder), grid.time(grid.n_steps))
+                yield times[-1:], end[..., None]
 
     def orbits(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yield the row of each orbit, the times (m,), and its states (2d, m), NaN from where it failed."""

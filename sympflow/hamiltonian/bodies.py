@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import check_kept, plain, real_number
+from sympflow.arguments import check_kept, checked_count, checked_number, plain
 from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
@@ -54,7 +54,7 @@ class PairsHamiltonian(LocalHamiltonian):
         params: Mapping[str, Any] | None,
         bodies: Mapping[str, Any] | None,
     ) -> None:
-        self.dim = _checked_dim(dim)
+        self.dim = checked_count("dim", plain(dim), 1, MOST_AXES, "1, 2 or 3, the coordinates of a body")
         self.masses = checked_column("masses", masses)
         self._check_masses()
         self.n_bodies = len(self.masses)
@@ -479,13 +479,6 @@ def _added(out: Array, ends: np.ndarray, values: Array) -> Array:
     return out + sums.reshape(out.shape).astype(out.dtype)
 
 
-def _checked_dim(dim: Any) -> int:
-    dim = plain(dim)
-    if not isinstance(dim, int) or isinstance(dim, bool) or not 1 <= dim <= MOST_AXES:
-        raise ValueError(f"`dim` must be 1, 2 or 3, the coordinates of a body; got {dim!r}.")
-    return dim
-
-
 def checked_column(name: str, values: Any) -> np.ndarray:
     check_kept(name, values)
     values = to_numpy(values) if is_tensor(values) else values
@@ -506,10 +499,8 @@ def _checked_length(name: str, value: Any) -> float | None:
     if value is None:
         return None
     check_kept(name, value)
-    value = plain(value)
-    if not real_number(value) or not 0 <= value < math.inf or (name == "cutoff" and value == 0):
-        raise ValueError(f"`{name}` must be a positive, finite length; got {value!r}.")
-    return float(value)
+    low = 0.0 if name == "softening" else math.ulp(0.0)
+    return float(checked_number(name, plain(value), "a positive, finite length", lambda x: low <= x < math.inf))
 
 
 def _checked_box(box: Any, dim: int) -> np.ndarray | None:

@@ -36,24 +36,6 @@ class ExternalForce(Protocol):
         ...
 
 
-class Doubled(Protocol):
-    """A system in twice the variables: see `sympflow.doubled`."""
-
-    physical: Any
-
-    def lift(self, y: Array) -> Array:
-        """The state for a physical one: (..., 2d) to (..., 4d)."""
-        ...
-
-    def physical_limit(self, y: Array) -> Array:
-        """The physical part of a state: (..., 4d) to (..., 2d)."""
-        ...
-
-    def difference(self, y: Array) -> Array:
-        """The rest of a state, 0 in the physical limit: (..., 4d) to (..., 2d)."""
-        ...
-
-
 class Hamiltonian:
     """H(q, p), or H(t, q, p), of d degrees of freedom, by a definition of it.
 
@@ -217,7 +199,7 @@ class Hamiltonian:
         forced.name, forced.external_force = f"{self.name}_forced", force
         return forced
 
-    def as_doubled(self) -> Doubled:
+    def as_doubled(self) -> Any:
         """Return the system itself if it is a doubled one.
 
         Raises

@@ -29,9 +29,9 @@ Expressions = Callable[[], Sequence[sp.Expr]]
 BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
 FEW = 6, 4, 3
-"""Sites along each axis of a piece, of lattices of one, two and three axes."""
+"""Sites along each axis of a subsystem, of lattices of one, two and three axes."""
 MANY = 64, 10, 5
-"""The same, of a ring of which long runs are made; as many as a piece has, if that is more."""
+"""The same, of a ring of which long runs are made; as many as a subsystem has, if that is more."""
 MOST_JUDGED = 1024
 """Degrees of freedom of the lattice on which a flow is judged, where it has more."""
 WELLS, FAR = 8, 100.0
@@ -79,7 +79,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         other._set_mass()
         return other
 
-    def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
+    def subsystem(self, sites: Any = None, boundary: Any = "periodic") -> Self:
         shape = self.few() if sites is None else checked_shape(sites, "sites")
         if len(shape) == 1:
             shape *= len(self.shape)
@@ -102,7 +102,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         other._set_mass()
         return other
 
-    has_piece = True
+    has_subsystem = True
 
     def judged(self) -> tuple[Any, ...]:
         if not self.uniform or self.ndof <= MOST_JUDGED:
@@ -116,7 +116,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return (tuple(max(MANY[len(self.shape) - 1], n) for n in self.few()),)
 
     def few(self) -> tuple[int, ...]:
-        """The sites along each axis of a piece of which nothing else is said."""
+        """The default number of sites along each axis of a subsystem."""
         least = 2 * max(self.bonds, default=0) + 1
         return (max(FEW[len(self.shape) - 1], least),) * len(self.shape)
 
@@ -363,7 +363,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return linear, [RestOfLattice(rest)] if rest.U != 0 or bonds else []
 
     def _quadratic(self, f: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[np.ndarray, sp.Expr]:
-        """K (F, F) of the terms ½ xᵀKx of a piece, with its numbers and the means of its arrays; and what remains."""
+        """K (F, F) of the terms ½ xᵀKx of a site or bond, with numbers and means of arrays; and what remains."""
         values = dict(zip(self.c, self.params.values(), strict=True))
         numbers = {s: v for s, v in values.items() if not isinstance(v, np.ndarray)}
         means = {s: float(v.mean()) for s, v in values.items() if isinstance(v, np.ndarray)}

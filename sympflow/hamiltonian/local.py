@@ -87,24 +87,24 @@ class LocalHamiltonian(Definition, ABC):
             "V, such as 'srkn6b'."
         )
 
-    def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
-        """Return the definition with the same terms on a few sites: see `HamiltonianSystem.piece`."""
+    def subsystem(self, sites: Any = None, boundary: Any = "periodic") -> Self:
+        """Return the definition with the same terms on a few sites: see `HamiltonianSystem.subsystem`."""
         raise TypeError(
-            f"`system` is not a lattice, and only lattices have pieces of a few sites: make a smaller one "
+            f"`system` is not a lattice, and only lattices have subsystems of a few sites: make a smaller one "
             f"by HamiltonianSystem.{self.loops}."
         )
 
     @property
-    def has_piece(self) -> bool:
-        """True if a few parts behave as those of a large system do: `piece` is defined."""
+    def has_subsystem(self) -> bool:
+        """True if a few parts behave as those of a large system do: `subsystem` is defined."""
         return False
 
     def judged(self) -> tuple[Any, ...]:
-        """Arguments of `piece` for a system that is large, and small enough to judge a flow on; () for itself."""
+        """Arguments of `subsystem` for a system that is large, and small enough to judge a flow on; () for itself."""
         return ()
 
     def many(self) -> tuple[Any, ...]:
-        """Arguments of `piece` for a system that is large enough to change as slowly as larger ones, of cheap runs."""
+        """Arguments of `subsystem` for one that is large enough to change as slowly as larger ones, of cheap runs."""
         return ()
 
     @property
@@ -147,7 +147,7 @@ class LocalHamiltonian(Definition, ABC):
         if entries > MOST_DENSE:
             raise ValueError(
                 f"`system` has {self.ndof:,} degrees of freedom, of which {what} is dense, with {entries:.3g} entries: "
-                "take a splitting method such as 'srkn6b', which needs no matrix, or a piece of the system."
+                "take a splitting method such as 'srkn6b', which needs no matrix, or a subsystem."
             )
 
     def energy_density(self, y: Array, *t: Array) -> Array:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, like, stack
+from sympflow.arrays import Array, concatenate, detached, is_tensor, library, like, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 from sympflow.hamiltonian.times import stage_time
@@ -330,7 +330,7 @@ def _reduced(theta: Array, low: Any, module: Any) -> tuple[Array, Array]:
     r = module.arctan2(s, c) + low
     # what rounding of Ω s leaves of whole quarter turns is none: its shears would round one way in every step
     none = abs(r) <= 4 * float(module.finfo(theta.dtype).eps) * abs(theta)
-    return k, module.where(none, r - r.detach() if is_tensor(r) else 0.0, r)
+    return k, module.where(none, r - detached(r), r)
 
 
 def _low(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> np.ndarray:

@@ -321,7 +321,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         from sympflow.hamiltonian.lattice import LatticeHamiltonian
 
         local = LatticeHamiltonian(onsite, bond, shape, boundary, kinetic, fields, params)
-        return cls._of_pieces(local, damping, Scene.given(scene, name="lattice"))
+        return cls._of_local(local, damping, Scene.given(scene, name="lattice"))
 
     @classmethod
     def pairs(
@@ -383,7 +383,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         from sympflow.hamiltonian.bodies import PairsHamiltonian
 
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
-        return cls._of_pieces(local, damping, Scene.given(scene, name="pairs", t_span=(0.0, 1.0)))
+        return cls._of_local(local, damping, Scene.given(scene, name="pairs", t_span=(0.0, 1.0)))
 
     @classmethod
     def planets(
@@ -453,9 +453,9 @@ class HamiltonianSystem(Hamiltonian, Shown):
         local = PlanetsHamiltonian(masses, G, y0, coordinates, encounter, extra, params)
         span, dt = (0.0, 1000 * float(local.frame.periods.max())), local.frame.longest_step
         given = {name: value for name, value in scene.items() if value is not None} | {"y0": y0}
-        return cls._of_pieces(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))
+        return cls._of_local(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))
 
-    def piece(
+    def subsystem(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
     ) -> HamiltonianSystem:
         """A few sites of a lattice with the same terms: what a flow for a large one is fitted on.
@@ -479,30 +479,30 @@ class HamiltonianSystem(Hamiltonian, Shown):
         Raises
         ------
         TypeError, ValueError
-            If the system has no piece, or has a rate of friction for each site, or the shape does not fit its bonds.
+            If the system is no lattice, or has a rate of friction for each site, or the shape does not fit its bonds.
 
         Examples
         --------
-        >>> HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=1024).piece(8).ndof
+        >>> HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=1024).subsystem(8).ndof
         8
         """
         if self.local is None:
             raise TypeError(
-                f"`system` {self.name!r} is not a lattice, and only lattices have pieces of a few sites: define it by "
-                "HamiltonianSystem.lattice."
+                f"`system` {self.name!r} is not a lattice, and only lattices have subsystems of a few sites: define it "
+                "by HamiltonianSystem.lattice."
             )
-        local = self.local.piece(sites, boundary)
+        local = self.local.subsystem(sites, boundary)
         if self.damping is not None and self.damping.ndim:
             raise ValueError(
-                f"`damping` of {self.name!r} differs from place to place, and a piece is of a system whose parts are "
-                "alike: give one rate."
+                f"`damping` of {self.name!r} differs from site to site, and a subsystem needs sites that are alike: "
+                "give one rate."
             )
         domain = None
         with suppress(ValueError):  # of states at rest none follow
             domain = self.local_states()
-        return HamiltonianSystem._of_pieces(local, self.damping, self._piece_scene(domain))
+        return HamiltonianSystem._of_local(local, self.damping, self._subsystem_scene(domain))
 
-    def _piece_scene(self, domain: Domain | None) -> Scene:
+    def _subsystem_scene(self, domain: Domain | None) -> Scene:
         """The scene of a few of the sites or bodies."""
         return Scene(self.name, domain, None, self.t_span, self.dt)
 
@@ -522,12 +522,12 @@ class HamiltonianSystem(Hamiltonian, Shown):
     @cached_property
     def _few_sites(self) -> HamiltonianSystem:
         assert self.local is not None
-        return HamiltonianSystem._of_pieces(self.local.piece(), self.damping, self._piece_scene(None))
+        return HamiltonianSystem._of_local(self.local.subsystem(), self.damping, self._subsystem_scene(None))
 
     @property
     def few_sites(self) -> HamiltonianSystem:
         local = self.local
-        alike = local is not None and local.uniform and local.has_piece
+        alike = local is not None and local.uniform and local.has_subsystem
         return self._few_sites if alike and (self.damping is None or not self.damping.ndim) else self
 
     @classmethod
@@ -583,10 +583,10 @@ class HamiltonianSystem(Hamiltonian, Shown):
         from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian
 
         local = WaveFunctionHamiltonian(onsite, dispersion, shape, length, params)
-        return cls._of_pieces(local, None, Scene.given(scene, name="schroedinger"))
+        return cls._of_local(local, None, Scene.given(scene, name="schroedinger"))
 
     @classmethod
-    def _of_pieces(cls, local: LocalHamiltonian, damping: float | ArrayLike | None, scene: Scene) -> HamiltonianSystem:
+    def _of_local(cls, local: LocalHamiltonian, damping: float | ArrayLike | None, scene: Scene) -> HamiltonianSystem:
         """A system by a definition of one piece."""
         self = cls.__new__(cls)
         Hamiltonian.__init__(self, scene.name, local, local.inverse_mass, local.quadratic_kinetic)
@@ -722,7 +722,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         {'k': 2.5}
         """
         if self.local is not None:
-            return HamiltonianSystem._of_pieces(self.local.with_params(values), self.damping, self.scene)
+            return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
         self.check_parameters(values)
         assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.named_time

@@ -11,9 +11,9 @@ import numpy as np
 
 from sympflow.arguments import real_number
 from sympflow.arrays import Array, concatenate, library
+from sympflow.arrays import like as as_like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.function_checks import as_like
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.scene import Scene
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters

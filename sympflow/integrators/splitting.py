@@ -259,7 +259,7 @@ class Splitting(FixedStep):
         expected: float,
         backend: str,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run on the logarithmic clock in one compiled pass: see `clocks.OnClock`."""
+        """Run on the logarithmic clock in one compiled pass: see `LogarithmicClock`."""
         transformed = clock.transformed
         if self.compensated or transformed.symbols is None:
             return None
@@ -354,7 +354,7 @@ class Splitting(FixedStep):
 
     def _force_times(self, system: HamiltonianSystem) -> list[float]:
         """The times of the forces in a step of length 1, of a driven system."""
-        return [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
+        return [] if self.clock != "physical" else self.composed(system).force_times()
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         clock = self.on_clock(system)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from sympflow.kernels.protocol import Batch
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.threads import BLOCK, NEVER, given, run_rows
-
-if TYPE_CHECKING:
-    from sympflow.kernels.splittings import SplittingCode
 
 __all__ = ["Recorded"]
 
@@ -29,11 +26,10 @@ class Recorded:
     the last step of each row that ends in a finite state.
     """
 
-    def __init__(
-        self, code: SplittingCode, table: np.ndarray, y0: np.ndarray, n_steps: int, save: np.ndarray, work: float
-    ) -> None:
+    def __init__(self, code: Any, table: Any, y0: np.ndarray, n_steps: int, save: np.ndarray, work: float) -> None:
         self._code, self._table, self._y0, self._work = code, table, given(y0), work
-        self._n_steps, self._save, self._link = n_steps, given(save, np.int64), table.shape[1] - 2
+        self._n_steps, self._save = n_steps, given(save, np.int64)
+        self._link = (len(table[1]) if isinstance(table, tuple) else table.shape[1]) - 2
         self._given, self._n_own = self._y0, (own := y0.shape[1] - code.n_out)
         if own and len(y0) == 1:  # a table of all trajectories, which is prepared once
             self._table, self._y0 = table.copy(), self._y0[:, : code.n_out]
@@ -94,9 +90,9 @@ class Recorded:
         """
         if (self.n_finite < self._n_steps).any():
             return self._pulled_apart(cotangents, slopes)
-        code, table, N = self._code, self._table, len(self._y0)
+        code, N = self._code, len(self._y0)
         of_states = np.zeros((N, code.n_values))
-        found = np.zeros((table.shape[1], code.size, N if slopes else 0))
+        found = np.zeros((self._link + 2, code.size, N if slopes else 0))
         sums: dict[int, np.ndarray] = {}
 
         def piece(i: slice, stop: np.ndarray) -> None:

@@ -136,6 +136,10 @@ class Rollouts(ABC):
         entries, kinds = table
         return entries[values[:, 0].astype(int)], kinds
 
+    def summed(self, kinds: np.ndarray) -> np.ndarray:
+        """The sums over trajectories that a reverse of columns of these kinds left, such as derivatives by weights."""
+        return np.zeros(0)
+
     @property
     def place(self) -> Callable[..., Memory] | None:
         """The class of states in memory; None where they are in registers."""
@@ -262,10 +266,6 @@ class SplittingRollouts(Rollouts):
         self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
     ) -> None:
         """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
-
-    def summed(self, kinds: np.ndarray) -> np.ndarray:
-        """The sums over trajectories that a reverse of columns of these kinds left, such as derivatives by weights."""
-        return np.zeros(0)
 
     def own_steps(self, table: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from every row of `y` (N, 2d) by its own numbers: a table (n, m N), a column of all rows each."""

@@ -10,7 +10,6 @@ import torch
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, get, solve, systems, train
 from sympflow.flow.scaling import Scaling
-from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trainer
 from sympflow.training.fits import PrimedFit
 from sympflow.training.least_squares import levenberg_marquardt
@@ -394,102 +393,6 @@ def test_by_default_it_makes_a_primed_flow():
     assert flow.figures["one_step_error"] < 1e-5
 
 
-def test_what_is_trained_is_a_copy_and_stages_are_recorded(tmp_path):
-    start = SympFlow.primed(PENDULUM, 2)
-    before = weights(start).clone()
-    first = train(PENDULUM, flow=start, **SHORT)
-    second = train(PENDULUM, flow=first, **SHORT, seed=1)
-    assert torch.equal(weights(start), before)
-    assert [stage["seed"] for stage in second.recipe["stages"]] == [0, 1]
-    second.save(tmp_path / "flow.safetensors")
-    loaded = sympflow.load(tmp_path / "flow.safetensors", system=PENDULUM)
-    assert (loaded.recipe, loaded.figures) == (second.recipe, second.figures)
-
-
-def test_the_same_seed_gives_the_same_weights():
-    def run(seed):
-        return weights(train(PENDULUM, flow=SympFlow.primed(PENDULUM, 2), **SHORT | {"restarts": 2}, seed=seed))
-
-    assert torch.equal(run(0), run(0))
-    assert not torch.equal(run(0), run(1))
-
-
-class Killed(Exception):
-    pass
-
-
-def test_a_resumed_run_ends_bit_identical(tmp_path):
-    path, arguments = tmp_path / "run.ckpt", {**SHORT, "restarts": 4}
-    start = SympFlow.primed(HH, 3)
-    whole = train(HH, flow=start, **arguments)
-
-    def kill(step, figures):
-        if step == 3:
-            raise Killed
-
-    with pytest.raises(Killed):
-        train(HH, flow=start, checkpoint=path, callback=kill, **arguments)
-    assert checkpoints.read(path)["step"] == 2
-    resumed = train(HH, flow=start, resume=path, **arguments)
-    assert torch.equal(weights(resumed), weights(whole))
-    assert resumed.history == whole.history
-    with pytest.raises(ValueError, match="`resume` is a run with another seed"):
-        train(HH, flow=start, resume=path, **{**arguments, "seed": 1})
-    with pytest.raises(ValueError, match="`resume` is a run with another architecture"):
-        train(HH, flow=SympFlow.primed(HH, 4), resume=path, **arguments)
-
-
-def test_an_interrupted_run_returns_its_best():
-    def interrupt(step, figures):
-        raise KeyboardInterrupt
-
-    start = SympFlow.primed(HH, 3)
-    with pytest.warns(RuntimeWarning, match="after 1 of 3 starts because it was interrupted"):
-        flow = train(HH, flow=start, callback=interrupt, **QUICK)
-    assert flow.figures["one_step_error"] < 1e-4
-
-
-def test_a_time_budget_ends_the_run(clock):
-    clock.tick = 1e-3
-    with pytest.warns(RuntimeWarning, match="the time budget was used up"):
-        flow = train(HH, flow=SympFlow.primed(HH, 6), time_budget=5.0, **{**QUICK, "restarts": 10**6})
-    assert flow.recipe["stages"][0]["restarts_taken"] < 10**6
-    assert math.isfinite(flow.figures["one_step_error"])
-
-
-def test_progress(capsys):
-    train(PENDULUM, flow=SympFlow.primed(PENDULUM, 1), **{**SHORT, "progress": True})
-    assert "one-step" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"learning_rate": 1e-2}, TypeError, r"^`learning_rate` is not an option of the optimizer 'gauss-newton'"),
-        ({"pairs": 3}, TypeError, r"^`pairs` is not an option"),
-        ({"optimizer": "adam"}, TypeError, r"^`restarts` is not an option of the optimizer 'adam'"),
-        ({"restarts": 0}, ValueError, r"^`restarts` must be a positive integer"),
-        ({"loss": "energy"}, ValueError, r"^`loss` 'energy' is unknown"),
-        ({"residual_weight": 2.0}, TypeError, r"^`residual_weight` is not an option .* without a `loss`"),
-        ({"frozen_weight": math.nan}, ValueError, r"^`frozen_weight` must be positive"),
-        ({"energy_weight": -1.0}, ValueError, r"^`energy_weight` must be finite and at least 0; got -1.0"),
-        ({"label_times": 2.0}, ValueError, r"^`label_times` must be"),
-        ({"seed": -1}, ValueError, r"^`seed` must be"),
-        ({"flow": SympFlow(2)}, TypeError, r"^`restarts` is not an option of the .* of kind 'sympflow'"),
-        ({"flow": SympFlow.primed(PENDULUM)}, ValueError, r"^`system` .* degrees of freedom"),
-    ],
-)
-def test_bad_arguments_are_named(arguments, error, message):
-    with pytest.raises(error, match=message):
-        train(HH, **{**QUICK, **arguments})
-
-
-def test_systems_it_does_not_apply_to():
-    relativistic = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2/2", domain=sympflow.Ball([0.0, 0.0], 1.0))
-    with pytest.raises(ValueError, match=r"^`system` .* must have a kinetic energy"):
-        train(relativistic, flow=SympFlow.primed(relativistic), **QUICK)
-
-
 def test_training_states_are_not_the_held_out_ones():
     assert not np.array_equal(states(HH.domain, 3, 0, Stream.RESIDUAL), states(HH.domain, 3, 0, Stream.REFERENCE))
 
@@ -529,11 +432,6 @@ def test_a_fit_returns_nothing_worse_than_its_start():
         torch.testing.assert_close(flow.state_dict()[name], value, rtol=0, atol=1e-15)
     assert flow.recipe["stages"][-1]["kept_start"] is True
     assert flow.figures["one_step_error"] < 0.05
-
-
-def test_a_loss_is_named_once():
-    with pytest.raises(ValueError, match=r"^`loss` 'labels\+labels' names a loss twice"):
-        train(PENDULUM, loss="labels+labels", restarts=1, steps=1, progress=False)
 
 
 def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatch):

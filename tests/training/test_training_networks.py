@@ -292,19 +292,6 @@ def test_labels_are_a_function_of_seed_and_draw():
 # what train() chooses --------------------------------------------------------------------------------------------
 
 
-def test_what_is_refused():
-    for arguments, message in (
-        ({"optimizer": "lbfgs", "learning_rate": 1e-3}, "`learning_rate` is not an option of the optimizer 'lbfgs'"),
-        ({"optimizer": "gauss-newton", "restarts": 3}, "`restarts` is not an option of the .* kind 'sympflow'"),
-        ({"optimizer": "gauss-newton", "dtype": torch.float32}, "`optimizer` 'gauss-newton' fits flows in float64"),
-        ({"stages": 3}, "`stages` is not an option of flows of kind 'sympflow'"),
-    ):
-        with pytest.raises(TypeError, match=rf"^{message}"):
-            train(HH, **arguments, **QUICK)
-    with pytest.raises(TypeError, match=r"^`pairs` is not an option of flows of kind 'primed'"):
-        train(HH, stages=3, pairs=2)
-
-
 def test_other_systems_get_a_network():
     quick = {"steps": 1, "points": 40, "validation_points": 40, "reference_states": 2, "progress": False}
     box = Box([-1.0, -1.0], [1.0, 1.0])

@@ -142,17 +142,3 @@ def test_what_cannot_be_pickled_is_named(monkeypatch):
     flow = SympFlow.primed(system, 2, dt=0.1, processor=0)
     with pytest.raises(TypeError, match=r"`system` cannot be sent to `workers` .*define its functions in a module"):
         train(system, flow=flow, workers=2, **QUICK)
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"workers": 0}, ValueError, "`workers` must be a positive number"),
-        ({"workers": "two"}, TypeError, "`workers` must be a number, an object with .map"),
-        ({"workers": 2, "kind": "mlp"}, TypeError, "`workers` share the starts of a search by 'gauss-newton'"),
-        ({"workers": 2, "optimizer": "bfgs"}, TypeError, "`workers` share the starts"),
-    ],
-)
-def test_what_workers_cannot_share_is_refused(options, error, message):
-    with pytest.raises(error, match=message):
-        train(PENDULUM, **options)

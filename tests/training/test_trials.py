@@ -12,7 +12,7 @@ from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.least_squares import Minimum
 from sympflow.training.points import Stream, states
-from sympflow.training.session import OutOfTime, Session
+from sympflow.training.session import Session
 from sympflow.training.starts import SEED, default_primed
 from sympflow.training.table_fit import TableFit, TableRun
 
@@ -129,26 +129,6 @@ def test_the_error_of_long_runs_is_that_of_solve():
     assert trials.long_errors([flow], PENDULUM, PENDULUM.domain) == pytest.approx([expected], rel=1e-6)
 
 
-@pytest.mark.parametrize("best", [0, 1], ids=["first", "second"])
-def test_of_those_that_are_nearly_as_good_the_best_in_long_runs_is_chosen(monkeypatch, best):
-    """Two differ by a tenth in estimated work; a third, by a half, makes no long run."""
-    starts = [replace(default_primed(HH), processor=n) for n in (3, 6, 9)]
-    work = dict(zip(starts, (1.0, 1.1, 1.5), strict=True))
-    found = {start: trials.Trial(start, 1e-9, start) for start in starts}
-    ran = []
-
-    def errors(flows, *_):
-        ran.extend(flows)
-        return [1e-9 if start == starts[best] else 1e-7 for start in flows]
-
-    monkeypatch.setattr(trials, "long_errors", errors)
-    long = trials._long_work(work, found, HH, HH.domain)
-    assert ran == starts[:2] == list(long)
-    assert min(long, key=long.__getitem__) == starts[best]
-    assert trials._long_work({starts[0]: 1.0, starts[2]: 1.5}, found, HH, HH.domain) == {}
-    assert ran == starts[:2]
-
-
 @pytest.mark.slow
 def test_the_choice_is_the_same_however_slow_the_machine_is(monkeypatch):
     """Clocks that run at another speed, now faster and now slower, change nothing: no time is measured."""
@@ -230,20 +210,3 @@ def test_a_run_is_resumed_without_trials(monkeypatch, tmp_path):
         train(HH, resume=path, time_budget=100.0, progress=False)
     with pytest.raises(ValueError, match="`resume` is a run with another architecture"):
         train(HH, flow=SympFlow.primed(HH, 4), resume=path, progress=False)
-
-
-def test_a_trial_that_runs_out_of_time_on_the_exact_orbits_of_friction_says_nothing(monkeypatch):
-    asked = []
-
-    def out_of_time(*arguments):
-        asked.append(arguments)
-        raise OutOfTime
-
-    monkeypatch.setattr(trials, "reference_step", out_of_time)
-    for name in ("STARTS", "STEPS", "FINAL_STEPS"):
-        monkeypatch.setattr(trials, name, 1)
-    system = systems.damped_pendulum()
-    found = trials._trial_of((system, system.domain, Session().deadline), default_primed(system))
-    assert asked
-    assert found.flow is None
-    assert found.error == float("inf")
