@@ -210,11 +210,11 @@ def sampled_parameter(name: str, samples: Samples, time: sp.Symbol) -> sampled:
     return sampled(Str(f"{name}_{samples.digest}"), sp.S.Zero, time)
 
 
-def with_letters(f: list[sp.Expr]) -> tuple[list[sp.Expr], dict[sampled, sp.Symbol]]:
-    """Expressions with a letter for each value of samples in them, and these letters."""
+def with_symbols(f: list[sp.Expr]) -> tuple[list[sp.Expr], dict[sampled, sp.Symbol]]:
+    """Expressions with a symbol for each value of samples in them, and these symbols."""
     found = sorted({a for each in f for a in each.atoms(sampled)}, key=str)
-    letters = {a: sp.Symbol(f"sample_{i}", real=True) for i, a in enumerate(found)}
-    return ([each.xreplace(letters) for each in f] if letters else f), letters
+    symbols = {a: sp.Symbol(f"sample_{i}", real=True) for i, a in enumerate(found)}
+    return ([each.xreplace(symbols) for each in f] if symbols else f), symbols
 
 
 # drifts of T(p, t) ---------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from sympflow.hamiltonian.driving import (
     is_spline,
     sampled,
     sampled_parameter,
-    with_letters,
+    with_symbols,
 )
 from sympflow.hamiltonian.expression import COORDINATE, FUNCTIONS, complex_part, of_sympy, stated
 from sympflow.hamiltonian.jumps import (
@@ -186,15 +186,15 @@ class SymbolicHamiltonian(Definition):
             return self
         written, values = self._written
         samples = {s: value for s, value in values.items() if isinstance(value, sampled)}
-        letters = _Letters({s: value for s, value in values.items() if s not in samples})
+        symbols = _ParameterSymbols({s: value for s, value in values.items() if s not in samples})
         try:
-            H = letters.put_into(written.xreplace(samples))
+            H = symbols.put_into(written.xreplace(samples))
         except (TypeError, OverflowError):  # a value that is no real number
             return self
         states = {*self.q, *self.p}
         form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
         used = form.H.free_symbols - states - {self.time}
-        kept = [(part, *letter) for part, letter in letters.found.items() if letter[0] in used]
+        kept = [(part, *symbol) for part, symbol in symbols.found.items() if symbol[0] in used]
         form.meanings, form.parameters, form.values = (tuple(row[i] for row in kept) for i in range(3))
         alike = (
             used == {*form.parameters}
@@ -208,12 +208,12 @@ class SymbolicHamiltonian(Definition):
         key = tuple(names)
         if key not in self._named:
             written, values = self.written
-            letters = {name: sp.Symbol(f"parameter_{i}", real=True) for i, name in enumerate(names)}
-            H = written.xreplace({s: letters.get(s.name, value) for s, value in values.items()})
+            symbols = {name: sp.Symbol(f"parameter_{i}", real=True) for i, name in enumerate(names)}
+            H = written.xreplace({s: symbols.get(s.name, value) for s, value in values.items()})
             states = {*self.q, *self.p}
             form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
             known = {s.name: s for s in values}
-            form.parameters, form.meanings = tuple(letters.values()), tuple(known[name] for name in names)
+            form.parameters, form.meanings = tuple(symbols.values()), tuple(known[name] for name in names)
             form.values = tuple(float(values[s]) for s in form.meanings)
             self._named[key] = form
         return self._named[key]
@@ -229,10 +229,10 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def parametric_parts(self) -> tuple[list[sp.Expr], set[sp.Symbol]]:
-        """Parts of H that are letters or 0, ±1 in the `parametric` form, and parameters that stay numbers."""
-        letters = _Letters(self.written[1])
-        letters.put_into(self.written[0])
-        return [*letters.found, *letters.numbers], letters.replaced
+        """Parts of H that are symbols or 0, ±1 in the `parametric` form, and parameters that stay numbers."""
+        symbols = _ParameterSymbols(self.written[1])
+        symbols.put_into(self.written[0])
+        return [*symbols.found, *symbols.numbers], symbols.replaced
 
     @property
     def symbols(self) -> SymbolicHamiltonian:
@@ -433,10 +433,10 @@ class SymbolicHamiltonian(Definition):
         def function(x: Array, *times: Array, numbers: Sequence[Any] = ()) -> Array:
             library = library_name(x)
             if library not in generated:
-                wanted, letters = with_letters([printable(f) for f in expressions()])
-                values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in letters]
+                wanted, sample_symbols = with_symbols([printable(f) for f in expressions()])
+                values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in sample_symbols]
                 generated[library] = generate(
-                    wanted, (*variables, *moving, *self.parameters, *letters.values()), library
+                    wanted, (*variables, *moving, *self.parameters, *sample_symbols.values()), library
                 )
             columns = [x[..., i] for i in range(n)]
             times = times[: len(moving)]
@@ -605,7 +605,7 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
             )
 
 
-class _Letters:
+class _ParameterSymbols:
     """Symbols for the parts of H that depend on parameters alone, with the values of these parts."""
 
     def __init__(self, values: Mapping[sp.Symbol, sp.Expr]) -> None:

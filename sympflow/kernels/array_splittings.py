@@ -17,7 +17,7 @@ from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, POINTER, Rows, Value
 from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
-from sympflow.hamiltonian.formulas import Letter
+from sympflow.hamiltonian.formulas import Variable
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splittings import Splitting, SplittingCode
@@ -144,7 +144,7 @@ def function_code(
 ) -> ArrayCode:
     """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
     forces = Functions(gradient, hessian_vector if level else None, inverse_mass, driven)
-    sizes: Any = Sizes(ndof, (Letter("time"),) if driven else ())
+    sizes: Any = Sizes(ndof, (Variable("time"),) if driven else ())
     clock: Any = Clock() if driven else None
     return ArrayCode(Splitting(sizes, level, monomials, compensated, friction, clock), forces)
 
@@ -153,7 +153,7 @@ class Sizes(NamedTuple):
     """In place of the symbols of a system that has none."""
 
     ndof: int
-    parameters: tuple[Letter, ...]
+    parameters: tuple[Variable, ...]
     values: tuple[()] = ()
     samples: tuple[()] = ()
 

@@ -158,9 +158,9 @@ class TestPhysicalSolution:
 
     def test_a_system_that_is_no_doubled_one_refuses(self):
         sol = solve(systems.pendulum(), "verlet", (0, 1))
-        with pytest.raises(ValueError, match="no doubled one"):
+        with pytest.raises(ValueError, match="is not doubled"):
             sol.physical()
-        with pytest.raises(ValueError, match="no doubled one"):
+        with pytest.raises(ValueError, match="is not doubled"):
             solve(systems.pendulum(), "projected", (0, 1), of="verlet")
 
 
