@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -25,9 +25,9 @@ from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
-from sympflow.kernels.runs import Memory, Numbers, Room, finished
+from sympflow.kernels.runs import Numbers, Room, finished
 from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
-from sympflow.kernels.teams import Member, SharedRollouts, meet
+from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
@@ -309,44 +309,28 @@ def place(context: Value, name: str) -> Value:
     return context.code.address(field(context, name))
 
 
-class BodiesInMemory(Memory):
+class BodiesInMemory(SharedMemory):
     """A state as arrays (sets, dim, size) of q, p and, compensated, their errors."""
 
-    def __init__(self, dim: int, sets: int, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
-        super().__init__(code, width, arguments, before)
-        self._dim, self._sets, self._context = dim, sets, arguments[3]
+    def __init__(self, dim: int, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._dim = dim
 
     def block(self, every: int) -> Value:
         return field(self._context, "block")
 
-    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
-        state, code = self._running.state, self.code
-        with code.over(self.n_values) as i:
-            code.store(code.constant(0.0), state, i)
-        sets = self._sets if given is None else 2
-        for at, place, row in self._numbers(sets, rows, begin):
-            code.store(code.load(row, place), state, at)
-
-    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        self._written(self._end, 2, out, begin * stride + at)
-
-    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
-        self._written(self._running, self._sets, running, begin)
-
-    def _written(self, room: Room, sets: int, out: Value, row: Value) -> None:
-        """Write a state to a row, which one thread does."""
-        with self.code.given(self.code.apply("eq", (field(self._context, "member"), 0))):
-            for at, place, to in self._numbers(sets, out, row):
-                self.code.store(self.code.load(room.state, at), to, place)
-
-    def _numbers(self, sets: int, rows: Value, row: Value) -> Iterator[tuple[Value, Value, Value]]:
-        """The place of each number in a state and in a row; the code that is written next is that of all numbers."""
+    def copied(self, room: Room, rows: Value, row: Value, sets: int, loads: bool) -> None:
         code, n, size = self.code, field(self._context, "bodies"), field(self._context, "size")
         start = code.at(rows, row * (n * (sets * self._dim)))
+        writes = code.apply("eq", (field(self._context, "member"), 0))  # which one thread does
         for s in range(sets):
-            with code.over(n) as i:
+            with code.over(n) as i, nullcontext() if loads else code.given(writes):
                 for k in range(self._dim):
-                    yield size * (s * self._dim + k) + i, (n * s + i) * self._dim + k, start
+                    at, place = size * (s * self._dim + k) + i, (n * s + i) * self._dim + k
+                    if loads:
+                        code.store(code.load(start, place), room.state, at)
+                    else:
+                        code.store(code.load(room.state, at), start, place)
 
 
 class PairStages:
