@@ -84,16 +84,9 @@ class NetworkTangents:
     ) -> np.ndarray:
         """J (n, 2d, N), the derivatives of 2d functions of ψ̄ and d/dt ψ̄ by the parameters.
 
-        The next call for as many points overwrites it: it is tens of megabytes.
-
-        Parameters
-        ----------
-        by_state : ndarray, shape (N, 2d, 2d)
-            The derivatives of the functions by ψ̄_t(x).
-        by_velocity : ndarray, shape (2d,), optional
-            Those of each function by its component of d/dt ψ̄_t(x), if they depend on that.
-        by_start : ndarray, shape (2d, 2d, N), optional
-            Filled with the derivatives of the functions by x, without those of constants.
+        `by_state` (N, 2d, 2d) are the derivatives of the functions by ψ̄_t(x), `by_velocity` (2d,) those of each by its
+        component of d/dt ψ̄_t(x), if they depend on that; `by_start` (2d, 2d, N) is filled with those by x, without
+        those of constants. The next call for as many points overwrites J: it is tens of megabytes.
         """
         velocity, m, N = by_velocity is not None, 2 * self.ndof, len(t)
         key, shape = (velocity, N), (len(parameters), m, max(N, LANES))

@@ -111,28 +111,12 @@ class TableLoops:
 class LabelErrors:
     """Weighted errors of labels after a step, and their derivatives by parameters on which its numbers depend affinely.
 
-    Errors are in the order of the label times, of the components, of the states.
-
-    Parameters
-    ----------
-    loops : TableLoops
-    x : (2d, N)
-        States at the start.
-    t0 : (N,) or None
-        Their times, of a driven system.
-    y : (R, J N)
-        Where they go, times first: of a driven system with its work, or without.
-    scale : (R, J N)
-        Weights of the errors of the first components.
-    slope : (R', J N)
-        Weights of one more error, a sum over the components; none with R' = 0.
-    design : (J, n, f)
-        The derivatives of the numbers, in the order of the stages, by the parameters.
-
-    Attributes
-    ----------
-    matrices : (J, k, f)
-        The derivatives by the parameters, at each time, of k numbers to which all others are in proportion.
+    States x (2d, N) start, of a driven system at times t0 (N,), and go to y (R, J N), times first: of a driven system
+    with its work, or without. `scale` (R, J N) are weights of the errors of the first components, `slope` (R', J N)
+    those of one more error, a sum over the components; `design` (J, n, f) the derivatives of the numbers, in the order
+    of the stages, by the parameters. Errors are in the order of the label times, of the components, of the states.
+    `matrices` (J, k, f) are the derivatives by the parameters, at each time, of k numbers to which all others are in
+    proportion.
     """
 
     def __init__(
