@@ -348,8 +348,9 @@ class _Errors:
                 error = self.error(row) * self.weight(self.scale, row)
                 code.store(error, self.r, (j * n_errors + row) * n + start)
             with code.over(n_errors - self.n_rows):
-                (total,) = code.loop(self.n_slopes, [self.zero], self.summed)
-                code.store(total, self.r, (j * n_errors + self.n_rows) * n + start)
+                code.store(
+                    code.fold(self.n_slopes, self.zero, self.summed), self.r, (j * n_errors + self.n_rows) * n + start
+                )
             if self.linearized:
                 with code.over(n_errors) as row:
                     self.back(row)
@@ -388,8 +389,8 @@ class _Errors:
     def error(self, row: Value) -> Value:
         return self.W[self.place(row)] - self.weight(self.Y, row)
 
-    def summed(self, k: Value, total: Sequence[Value]) -> list[Value]:
-        return [fma(self.error(k), self.weight(self.slope, k), total[0])]
+    def summed(self, k: Value, total: Value) -> Value:
+        return fma(self.error(k), self.weight(self.slope, k), total)
 
     # the way there ----------------------------------------------------------------------------------------------------
 
@@ -477,10 +478,8 @@ class _Errors:
         code = self.code
         with code.over(self.n_parameters) as f:
             begin, end = (code.load(self.places, f + i, INT) for i in range(2))
-
-            def more(k: Value, total: Sequence[Value]) -> list[Value]:
+            total = code.variable(self.zero)
+            with code.over(end - begin) as k:
                 number = code.load(self.places, self.n_parameters + 1 + begin + k, INT)
-                return [fma(code.splat(code.load(self.design, begin + k), LANES), self.B[number], total[0])]
-
-            (total,) = code.loop(end - begin, [self.zero], more)
-            code.store(total, self.J, f * stride + place)
+                total.value = fma(code.splat(code.load(self.design, begin + k), LANES), self.B[number], total.value)
+            code.store(total.value, self.J, f * stride + place)
