@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from itertools import combinations
@@ -12,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import check_kept, checked_count, checked_number, plain
+from sympflow.arguments import check_kept, checked_count, checked_number, plain, real_array
 from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
@@ -480,13 +479,8 @@ def _added(out: Array, ends: np.ndarray, values: Array) -> Array:
 
 
 def checked_column(name: str, values: Any) -> np.ndarray:
-    check_kept(name, values)
-    values = to_numpy(values) if is_tensor(values) else values
-    check_memory(float(np.size(values)), f"`{name}`")
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise TypeError(f"`{name}` must be an array (n,) of numbers; got {reprlib.repr(values)}.") from None
+    array = real_array(name, values)
+    check_memory(float(array.size), f"`{name}`")
     if array.ndim != 1:
         raise ValueError(f"`{name}` must have shape (n,), one number for each body; got {array.shape}.")
     if not np.isfinite(array).all():
@@ -506,11 +500,9 @@ def _checked_length(name: str, value: Any) -> float | None:
 def _checked_box(box: Any, dim: int) -> np.ndarray | None:
     if box is None:
         return None
-    check_kept("box", box)
     try:
-        lengths = np.array(to_numpy(box), dtype=float)
-        lengths = np.broadcast_to(lengths, (dim,)).copy()
-    except (TypeError, ValueError):
+        lengths = np.broadcast_to(real_array("box", box), (dim,)).copy()
+    except ValueError:
         raise ValueError(f"`box` must be a length, or {dim} of them, one along each axis; got {box!r}.") from None
     if not (np.isfinite(lengths) & (lengths > 0)).all():
         raise ValueError(f"`box` must have positive, finite lengths; got {box!r}.")

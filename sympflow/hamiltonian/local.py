@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import as_float, check_kept, plain, real_number
+from sympflow.arguments import as_float, check_kept, plain, real_array, real_number
 from sympflow.arrays import Array, is_tensor, like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.expression import complex_part, stated
@@ -225,11 +225,7 @@ def checked_params(params: Any, shape: tuple[int, ...] = (), remedy: str = "") -
                 raise ValueError(f"`params` has {name} = {shown}: give a finite real number{remedy}.")
             checked[name] = value
             continue
-        try:
-            array = np.array(value, dtype=float)
-        except (TypeError, ValueError):
-            shown = reprlib.repr(value)
-            raise TypeError(f"`params` has {name} = {shown}: give a number or an array of them.") from None
+        array = real_array(f"params[{name!r}]", value)
         if array.shape != shape:
             raise ValueError(
                 f"`params` has {name} of shape {array.shape}, and that of the lattice is {shape}: give one value for "

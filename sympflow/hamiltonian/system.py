@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, check_positive, warn
+from sympflow.arguments import check_flag, check_positive, checked_count, warn
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, domain_of
@@ -171,17 +171,14 @@ class HamiltonianSystem(Hamiltonian, Shown):
                 raise TypeError(
                     f"`{argument}` must be a function; got the text {H!r}: HamiltonianSystem.from_sympy takes it."
                 )
-        number = isinstance(ndof, int | float | np.number) and not isinstance(ndof, bool) and 1 <= ndof <= MOST_DEGREES
-        if ndof is None or not number or int(ndof) != ndof:
-            raise ValueError(
-                f"`ndof` must be a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom; got {ndof!r}."
-            )
+        what = f"a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom"
+        d = checked_count("ndof", ndof, 1, MOST_DEGREES, what)
         if isinstance(time, str):
             raise TypeError(f"`time` must be True for functions with t first; got {time!r}: names are for from_sympy.")
         check_flag("time", time)
-        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector, check, bool(time))
+        definition = CallableHamiltonian(d, potential, hamiltonian, gradient, hessian_vector, check, bool(time))
         if definition.separable:
-            super().__init__(settled.name, definition, matrices.inverse_mass(mass, int(ndof)), True)
+            super().__init__(settled.name, definition, matrices.inverse_mass(mass, d), True)
         elif mass is not None:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
