@@ -16,10 +16,10 @@ from sympflow.learning.learner import (
     MOST_VALUES,
     Replicas,
     Search,
+    _constraints,
     _cut,
     _divided,
     _few,
-    _said,
     replica,
     without_growth,
 )
@@ -238,8 +238,8 @@ def test_bodies_whose_total_momentum_changes_are_no_bodies():
     """Two momenta cancel along each axis of coordinates in the order x1, x2, y1, y2."""
     x, y = np.random.default_rng(0).normal(size=(2, 50))
     runs = [(np.arange(50.0), np.stack([x, y, y, x, x, -x, y, -y]))]
-    said = _said(Trajectories.read([*runs, *runs]), None, None, False, None, None)
-    names = [candidate.name for candidate in FAMILIES["pairs"].models(said)]
+    constraints = _constraints(Trajectories.read([*runs, *runs]), None, None, False, None, None)
+    names = [candidate.name for candidate in FAMILIES["pairs"].models(constraints)]
     names = [name for name in names if "origin" not in name]
     assert len(names) == 2
     assert all("one axis after another" in name for name in names)
@@ -262,8 +262,8 @@ def test_central_fields_are_found(force, V, observed):
     rows = [0, 1] if observed == "q" else [0, 1, 2, 3]
     runs = [(t, y[rows] + 1e-3 * rng.normal(size=(len(rows), 81))) for y in orbits]
     data = Trajectories.read(runs, observed=observed)
-    said = _said(data, None, None, False, None, None)
-    found = [fitted(candidate.model, data, Setting()) for candidate in FAMILIES["central"].models(said)]
+    constraints = _constraints(data, None, None, False, None, None)
+    found = [fitted(candidate.model, data, Setting()) for candidate in FAMILIES["central"].models(constraints)]
     best = min(found, key=lambda one: one.loss(np.full(4, 1e-3)))
     y = np.concatenate(orbits, axis=1)
     H = (y[2:] ** 2).sum(0) / 2 + V(np.hypot(*y[:2]))
@@ -399,13 +399,13 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         sympflow.learn(runs, dt=0.5, checkpoint=path, callback=interrupt)
     data = Trajectories.read(runs)
-    search = Search(data, data.folds(0.2, 0), _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, data.folds(0.2, 0), _constraints(data, None, None, False, None, None), Setting(), 0)
     with pytest.raises(ValueError, match="`resume` is a run with another"):
         sympflow.learn(trajectories(6, 12, noise=0.02), dt=0.5, resume=path)
     state = checkpoints.read(path)
     assert state["step"] == 2
     name, numbers = next(iter(state["optimizer"].items()))
-    (candidate,) = [c for c in FAMILIES["polynomial"].models(search.said) if c.name == name]
+    (candidate,) = [c for c in FAMILIES["polynomial"].models(search.constraints) if c.name == name]
     again = restored(candidate.model, search.data, numbers, Setting())
     assert np.array_equal(again.theta, numbers["theta"].numpy())
     assert again.sigma == pytest.approx(fitted(candidate.model, search.data, Setting()).sigma)
@@ -414,7 +414,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
 def test_data_of_no_hamiltonian_are_called_so():
     """A damped oscillator, without a word of friction: the areas shrink at its rate."""
     data = Trajectories.read(trajectories(8, 15, rate=RATE))
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match=r"No symplectic map explains.*rate of -0\.2") as record:
         search.diagnose(Session())
@@ -446,7 +446,7 @@ def forced(request):
 
 def test_drives_and_drag_are_named_with_the_remedy(forced):
     _, data, remedy, _ = forced
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match=f"pass {remedy}|Pass {remedy}"):
         search.diagnose(Session())
@@ -465,7 +465,7 @@ def test_drives_and_drag_are_learned(forced):
 
 def test_orbits_that_diverge_are_left_out_of_the_region_of_a_flow():
     data = Trajectories.read(trajectories(8, 15))
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     for lost, kept in ((np.array([[np.nan, 1.0], [2.0, 3.0]]), [[2.0, 3.0]]), (np.full((2, 2), np.inf), data.states)):
         search.final = SimpleNamespace(states=lost)
         assert np.array_equal(search._states(), kept)
@@ -572,7 +572,7 @@ def test_residuals_beyond_the_noise_of_the_data_are_not_explained():
 def test_noise_alone_and_a_noise_that_is_too_small_are_called_so():
     random, t = np.random.default_rng(0), np.linspace(0, 4, 21)
     data = Trajectories.read((t, random.normal(size=(6, 2, 21))))
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match="explains next to nothing"):
         search.diagnose(Session())
@@ -628,7 +628,7 @@ def test_models_that_increments_rule_out_are_tried_last():
     t = np.linspace(0, 8, 81)
     runs = [(t, solve_ivp(field, (0, 8), rng.uniform(-1, 1, 2), t_eval=t, rtol=1e-9).y) for _ in range(5)]
     data = Trajectories.read([(t, y + 0.003 * rng.normal(size=y.shape)) for t, y in runs])
-    search = Search(data, data.folds(), _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0)
     names = ["polynomial", "network", "whole-polynomial", "whole-network"]
     groups = [[c.name for c in some] for _, some in search._ask(names, Setting(), Session())]
     assert groups[0][0] == "H(q, p) a polynomial of degree 4"
@@ -641,7 +641,7 @@ def test_a_family_is_climbed_by_its_own_best():
     """Two models are worse than another family, the third is far better; two that are no better end it."""
     losses = {"other": 0.0, "2": 5.0, "3": 5.1, "4": -9.0, "5": -9.0, "6": -9.0, "8": -9.0}
     data = Trajectories.read(trajectories(8, 15))
-    search, tried = Search(data, data.folds(), _said(data, None, None, False, None, None), Setting(), 0), []
+    search, tried = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0), []
 
     def fit(candidate, setting, session):
         tried.append(candidate.name)
