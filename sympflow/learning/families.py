@@ -44,44 +44,20 @@ MOST_TERMS = 400
 
 @dataclass(frozen=True)
 class Constraints:
-    """Knowledge of H.
+    """Knowledge of H."""
 
-    Attributes
-    ----------
-    scales : ndarray of shape (2d,)
-        The spread of each coordinate in the data.
-    separable : bool or None
-        None for not known.
-    inverse_mass : ndarray of shape (d, d) or None
-    force : callable or None
-        Friction or drag whose factors are to be learned, as `models.friction`.
-    periods : ndarray of shape (2d,)
-        Of the coordinates that are angles, infinite for the others.
-    known : tuple of Formula
-        Parts of H.
-    momenta : ndarray of shape (d, d) or None
-        The covariance of the momenta along a trajectory, in their mean; None where it is not known.
-    flow_scaling : Scaling or None
-        The units of a flow that is fitted itself, and its Δt; None for none.
-    velocities : bool
-        True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or M₁₁ in the middle of the data.
-    middle : ndarray of shape (d,) or None
-        The mean of q.
-    frequency : float or None
-        ω of a drive, about.
-    """
-
-    scales: np.ndarray
-    separable: bool | None
-    inverse_mass: np.ndarray | None
-    force: Force | None
-    periods: np.ndarray
-    known: tuple[Formula, ...] = ()
+    scales: np.ndarray  # (2d,): The spread of each coordinate in the data
+    separable: bool | None  # None for not known
+    inverse_mass: np.ndarray | None  # (d, d)
+    force: Force | None  # Friction or drag whose factors are to be learned, as `models.friction`
+    periods: np.ndarray  # (2d,): Of the coordinates that are angles, infinite for the others
+    known: tuple[Formula, ...] = ()  # Parts of H
+    # (d, d): The covariance of the momenta along a trajectory, in their mean; None where it is not known
     momenta: np.ndarray | None = None
-    flow_scaling: Scaling | None = None
-    velocities: bool = False
-    middle: np.ndarray | None = None
-    frequency: float | None = None
+    flow_scaling: Scaling | None = None  # The units of a flow that is fitted itself, and its Δt; None for none
+    velocities: bool = False  # True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or M₁₁ in the middle of the data
+    middle: np.ndarray | None = None  # (d,): The mean of q
+    frequency: float | None = None  # ω of a drive, about
 
     @property
     def ndof(self) -> int:
@@ -275,25 +251,15 @@ def _quadratic(of: str, scales: np.ndarray, periods: np.ndarray) -> Polynomial:
 
 @dataclass(frozen=True)
 class Family:
-    """Models of one kind.
+    """Models of one kind."""
 
-    Attributes
-    ----------
-    separable : bool
-        True of the form T(p) + V(q).
-    models : callable
-        models(constraints): candidates from simple to rich, none where the family does not apply.
-    linear : bool
-        True of models that are linear in their numbers, and soon fitted. Before those that are not, the data are asked
-        whether any H explains them.
-    observed : str
-        What its numbers can be told by: "qp" for states, "qv" for velocities, "both".
-    """
-
-    separable: bool
+    separable: bool  # True of the form T(p) + V(q)
+    # models(constraints): candidates from simple to rich, none where the family does not apply
     models: Callable[[Constraints], Iterator[Candidate]]
+    # True of models that are linear in their numbers, and soon fitted. Before those that are not, the data are asked
+    # whether any H explains them
     linear: bool = True
-    observed: str = "both"
+    observed: str = "both"  # What its numbers can be told by: "qp" for states, "qv" for velocities, "both"
 
     def tells(self, constraints: Constraints) -> bool:
         """True if what is observed can tell the numbers of its models."""
@@ -375,14 +341,6 @@ def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, value
 
     Terms are left out one by one, that one first which, by the quadratic approximation of χ² at its minimum, raises it
     least, as long as Schwarz's criterion gains: by less than the logarithm of the number of values.
-
-    Parameters
-    ----------
-    theta : ndarray of shape (n,)
-    precision : ndarray of shape (n, n)
-        Half the second derivative of χ² by θ.
-    values : int
-        Numbers observed.
 
     References
     ----------

@@ -36,6 +36,7 @@ from sympflow.learning.fitting import (
     kept,
     left_out,
     limit_of,
+    noise_of,
     restored,
 )
 from sympflow.learning.library import library_for
@@ -59,7 +60,7 @@ from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.storage.identity import digest
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
-from sympflow.training.starts import suited_step
+from sympflow.training.starts import step_of
 from sympflow.training.trainer import train
 from sympflow.workers import WorkerPool
 
@@ -74,6 +75,7 @@ HOPELESS = 2.0  # squares of increments, over those of the best model, from whic
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
 DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
+TABLE_SECONDS = 2.5  # that a flow takes, which is no more than 60 % of a time budget
 TABLE_SHARE = 0.3  # of a time budget, likewise
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
 MOST_VALUES = 40_000  # numbers observed by which models are chosen; the chosen one is fitted to all
@@ -197,6 +199,7 @@ def learn(
     data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()
     data.check_angles(None if period is None else np.isinf(periods_of(period, data.ndof)))
+    seed, damping = plain(seed), plain(damping)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     constraints = _constraints(data, separable, mass, damping, period, known)
@@ -209,7 +212,7 @@ def learn(
     smooth = smoothed(data)
     rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
     seen = smooth.sigma if data.n_points >= ROUGH else None
-    setting = Setting(_noise(noise, data), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
+    setting = Setting(noise_of(noise, data.ndof), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
     if drive is not False:
         constraints = replace(constraints, frequency=_frequency(constraints, smooth) if drive is True else float(drive))
     constraints = replace(
@@ -277,7 +280,7 @@ def check_drive(drive: Any) -> None:
 def _constraints(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Constraints:
     if separable is not None:
         check_flag("separable", separable)
-    if damping not in DAMPINGS:
+    if not isinstance(damping, bool | str) or damping not in DAMPINGS:
         raise ValueError(
             f'`damping` must be True for one rate that is learned, "each" for one of each p, "quadratic" for drag, or '
             f"False; got {damping!r}."
@@ -347,18 +350,6 @@ def _identity(
     known = [str(part.formula) for part in constraints.known]
     of_data = digest([data, constraints.inverse_mass, constraints.periods, setting.noise])
     return {"config": json.dumps(options), "architecture": json.dumps(known), "system": of_data}
-
-
-def _noise(noise: Any, data: Trajectories) -> np.ndarray | None:
-    if noise is None:
-        return None
-    sigma = floats("noise", noise)
-    if sigma.shape not in ((), (2 * data.ndof,)) or not ((sigma >= 0) & (sigma < np.inf)).all():
-        raise ValueError(
-            f"`noise` must be a standard deviation, 0 or more, or one for each of the {2 * data.ndof} coordinates; got "
-            f"{noise!r}: leave it out where it is not known."
-        )
-    return np.broadcast_to(sigma, 2 * data.ndof).astype(float)
 
 
 @dataclass(frozen=True)
@@ -447,27 +438,13 @@ Chosen = tuple[Candidate, Fitted, Held]
 
 @dataclass(frozen=True)
 class Freedom:
-    """A vector field that need not be Hamiltonian, or another order of the coordinates, beside the best H.
+    """A vector field that need not be Hamiltonian, or another order of the coordinates, beside the best H."""
 
-    Attributes
-    ----------
-    said : str
-        The field in words.
-    remedy : str
-        What to do where it has a form that is known; empty where it has none.
-    share : float
-        Of the squares of held-out residuals, that it leaves.
-    defect : float
-        The size of LᵀJ + JL, over that of JL, L its Jacobian: 0 for a Hamiltonian.
-    rate : float
-        At which volumes of phase space grow.
-    """
-
-    said: str
-    remedy: str
-    share: float
-    defect: float
-    rate: float
+    said: str  # The field in words
+    remedy: str  # What to do where it has a form that is known; empty where it has none
+    share: float  # Of the squares of held-out residuals, that it leaves
+    defect: float  # The size of LᵀJ + JL, over that of JL, L its Jacobian: 0 for a Hamiltonian
+    rate: float  # At which volumes of phase space grow
 
 
 def _certain(numbers: slice, fit: Fitted, held: Held) -> bool:
@@ -545,7 +522,9 @@ class Search:
 
     def run(self, names: list[str], session: Session) -> None:
         """Fit models of these families until one explains the held-out trajectories, or no richer one does better."""
-        deadline = session.deadline.part(1 - TABLE_SHARE) if session.time_budget is not None else session.deadline
+        deadline = session.deadline
+        if session.time_budget is not None:
+            deadline = deadline.part(1 - max(TABLE_SHARE, min(0.6, TABLE_SECONDS / session.time_budget)))
         self.late = deadline.over
         setting = replace(self.setting, stop=deadline.over)
         total = sum(1 for name in names for _ in FAMILIES[name].models(self.constraints))
@@ -745,6 +724,14 @@ class Search:
             elif self.unseen:
                 warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
             return
+        if not math.isfinite(held.loudness):
+            warnings.warn(
+                f"The time budget ended before the best model, {candidate.name}, was compared with held-out "
+                "trajectories: give it more.",
+                UserWarning,
+                stacklevel=4,
+            )
+            return
         said = (
             f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: "
             f"{held.complaint}."
@@ -930,7 +917,7 @@ class Search:
             warnings.warn(str(warning.message), warning.category, stacklevel=3)
         flow.figures = {**flow.figures, **self.figures(flow.dt)}
         whole = system.autonomous and not isinstance(system, DoubledSystem)
-        flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole else None
+        flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole and not session.deadline.over() else None
         if self._is_worse(flow):
             error, noise = flow.figures["one_step_error"], flow.figures["noise"]
             warnings.warn(
@@ -978,17 +965,19 @@ class Search:
 
     def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
         """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
-        states = self._states()
+        states, model = self._states(), self.winner[0].model
         states = states[np.random.default_rng(self.seed).permutation(len(states))[:STEPPED]]
+        slopes = model.field(self.final.theta, states.T, True, False).slope
+        rates = np.abs(np.linalg.eigvals(np.moveaxis(np.broadcast_to(slopes, (*slopes.shape[:2], len(states))), -1, 0)))
+        step = min(step_of(rates.max(axis=1)), max(run.span for run in self.data.runs))
         if isinstance(system, DoubledSystem):
-            step = suited_step(system, system.lift(states)) if dt is None else dt
-            return SympFlow.collocated(system, dt=step, steps=DRAG_STEPS)
+            return SympFlow.collocated(system, dt=step if dt is None else dt, steps=DRAG_STEPS)
         if dt is not None:
             try:
                 return SympFlow.collocated(system, dt=dt, states=states)
             except ValueError as error:
                 warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
-        return SympFlow.collocated(system, dt=suited_step(system, states), states=states)
+        return SympFlow.collocated(system, dt=step, states=states)
 
     def _is_worse(self, flow: FlowMap) -> bool:
         """True of a flow that is worse than the H of which it is."""

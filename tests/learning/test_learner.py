@@ -318,7 +318,8 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
     asked = {}
 
     def learned(data, **options):
-        asked.update(options, span=data.runs[0].span)
+        y = data.runs[0].y
+        asked.update(options, span=data.runs[0].span, velocities=data.velocities, missing=np.isnan(y[1]).all())
         return noisy
 
     monkeypatch.setattr("sympflow.learning.learner.learn", learned)
@@ -352,6 +353,19 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
     assert plot.stat().st_size > 10_000
     assert CliRunner().invoke(app, [*arguments, "--mass", "1,2", "--not-separable"]).exit_code == 0
     assert (asked["separable"], asked["mass"]) == (False, [1.0, 2.0])
+    for observed, letters in (("qv", "q,v"), ("q", "q")):
+        table = "\n".join(
+            [f"orbit,t,{letters}", *(row.rsplit(",", 1)[0] if observed == "q" else row for row in rows[1:])]
+        )
+        (tmp_path / "seen.csv").write_text(table)
+        seen = ["learn", str(tmp_path / "seen.csv"), "--observed", observed, "--out", str(to)]
+        found = CliRunner().invoke(app, seen)
+        assert found.exit_code == 0, found.output
+        assert asked["velocities"]
+        assert asked["missing"] == (observed == "q")
+    found = CliRunner().invoke(app, [*seen, "--observed", "p"])
+    assert found.exit_code == 2
+    assert "`--observed` must be one of qp, qv, q" in " ".join(found.output.split())
     for option, message in (
         ("--mass", "`--mass` must be a number, or numbers with commas"),
         ("--known", "`--known` 'nonsense' is unknown"),
@@ -667,3 +681,63 @@ def test_a_long_run_is_cut_and_the_only_one_divided():
     assert _cut(one.pieces(20), rate=1.0).runs[0].n_points == 20
     with pytest.raises(ValueError, match="one trajectory only"):
         _divided(one.subset([0]).pieces(40).subset([0]), 0)
+
+
+HOSTILE = [
+    ({}, 1e80, ValueError, "`trajectories` have q1 up to .*give `units`"),
+    ({"ndof": "1"}, 1, ValueError, "`ndof` must be a positive integer"),
+    ({"ndof": True}, 1, ValueError, "`ndof` must be a positive integer"),
+    ({"noise": "a"}, 1, TypeError, "`noise` must be made of real numbers"),
+    ({"noise": np.nan}, 1, ValueError, "`noise` must be a standard deviation"),
+]
+
+
+@pytest.mark.parametrize("make", [sympflow.learn, sympflow.discover])
+@pytest.mark.parametrize(("options", "factor", "error", "message"), HOSTILE)
+def test_hostile_input_is_refused_by_learn_and_discover(make, options, factor, error, message):
+    with pytest.raises(error, match=message):
+        make([(t, factor * y) for t, y in trajectories(4, 12)], **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "error"),
+    [
+        (sympflow.learn, {"damping": [1]}, ValueError),
+        (sympflow.learn, {"drive": np.nan}, ValueError),
+        (sympflow.discover, {"terms": 3}, TypeError),
+        (sympflow.discover, {"held_out": "x"}, ValueError),
+        (sympflow.discover, {"piece": "x"}, ValueError),
+        (sympflow.discover, {"progress": 3}, TypeError),
+        (sympflow.discover, {"degree": 100}, ValueError),
+    ],
+)
+def test_hostile_options_are_refused_by_name(make, options, error):
+    with pytest.raises(error, match=f"^`{next(iter(options))}`"):
+        make(trajectories(4, 12), **options)
+
+
+def test_units_of_any_size_give_the_same_formula():
+    """A step of the fit knows no unit: q in 1e20, p in 1e-20, and all as integers, single numbers or objects."""
+    t = np.linspace(0, 6, 31)
+    y = np.array([y for _, y in orbits(t)]) * np.ones((1, 2, 1))
+    terms = ["p**2", "q**2", "q**3", "q**4", "q*p"]
+    found = [sympflow.discover((t, y.astype(kind)), terms).discovery for kind in (float, np.float32)]
+    found.append(sympflow.discover((t, y.astype(object) * np.array([[1e20], [1e-20]])), terms).discovery)
+    for one in found:
+        assert [str(f) for f in one.terms] == ["p1**2", "q1**2", "q1**4"]
+    mixed = found[2].coefficients / found[0].coefficients
+    assert mixed == pytest.approx([1e40, 1e-40, 1e-80], rel=1e-3)
+
+
+def orbits(t):
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        y = solve_ivp(lambda t, y: [y[1], -y[0] - y[0] ** 3], (0, t[-1]), rng.uniform(-1, 1, 2), t_eval=t, rtol=1e-9).y
+        yield t, y + 0.005 * rng.normal(size=y.shape)
+
+
+def test_a_coordinate_far_from_zero_and_booleans_are_told():
+    with pytest.warns(UserWarning, match="q1 about 1e.06, .* subtract that"):
+        Trajectories.read([(t, y + np.array([[1e6], [0]])) for t, y in trajectories(4, 12)]).check_moving()
+    with pytest.raises(TypeError, match="booleans"):
+        Trajectories.read([(t, y > 0) for t, y in trajectories(4, 12)])
