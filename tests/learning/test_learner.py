@@ -358,17 +358,29 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
             [f"orbit,t,{letters}", *(row.rsplit(",", 1)[0] if observed == "q" else row for row in rows[1:])]
         )
         (tmp_path / "seen.csv").write_text(table)
-        seen = ["learn", str(tmp_path / "seen.csv"), "--observed", observed, "--out", str(to)]
+        seen = [
+            "learn",
+            str(tmp_path / "seen.csv"),
+            "--observed",
+            observed,
+            "--out",
+            str(to),
+            "--drive",
+            "1.5",
+            "--drag",
+        ]
         found = CliRunner().invoke(app, seen)
         assert found.exit_code == 0, found.output
         assert asked["velocities"]
         assert asked["missing"] == (observed == "q")
+        assert (asked["drive"], asked["damping"]) == (1.5, "quadratic")
     found = CliRunner().invoke(app, [*seen, "--observed", "p"])
     assert found.exit_code == 2
     assert "`--observed` must be one of qp, qv, q" in " ".join(found.output.split())
     for option, message in (
         ("--mass", "`--mass` must be a number, or numbers with commas"),
         ("--known", "`--known` 'nonsense' is unknown"),
+        ("--drive", "`--drive` must be an angular frequency, or find"),
     ):
         found = CliRunner().invoke(app, [*arguments, option, "nonsense"])
         assert found.exit_code == 2
