@@ -213,10 +213,27 @@ def substeps_of(sequence: Sequence[Kind], columns: Columns, sign: int) -> list[S
     return made
 
 
-class Tables:
+class Memory:
+    """What was made of fixed numbers, each once for its key, up to so many."""
+
+    def __init__(self, most: int) -> None:
+        self._kept: dict[Any, Any] = {}
+        self._most = most
+
+    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what `make` gives, made once for each key."""
+        if key not in self._kept:
+            if len(self._kept) >= self._most:
+                self._kept.clear()
+            self._kept[key] = make()
+        return self._kept[key]
+
+
+class Tables(Memory):
     """The numbers of kicks and drifts of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials."""
 
     def __init__(self, substeps: Sequence[Substep], outer: int, dt: float, monomials: Monomials = ()) -> None:
+        super().__init__(MOST_KEPT)
         last = len(substeps) - outer
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.substeps, self.dt, self.processed = substeps, dt, outer > 0
@@ -228,15 +245,6 @@ class Tables:
         self._coefficients = {id(c): c.numbers for c in columns_of(substeps)}
         self._exponents = np.array(exponents, dtype=float)
         self._even = exponents[1:2] != (1,)
-        self._kept: dict[Any, Any] = {}
-
-    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return what `make` gives, made once for each key."""
-        if key not in self._kept:
-            if len(self._kept) > MOST_KEPT:
-                self._kept.clear()
-            self._kept[key] = make()
-        return self._kept[key]
 
     def scheme(self, part: str, t: float | None, back: bool = False) -> Scheme:
         """The part at t ∈ (0, Δt], the default Δt; `back` its inverse."""

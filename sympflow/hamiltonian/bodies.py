@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,10 +12,11 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import check_kept, plain, real_number
+from sympflow.arguments import check_kept, checked_count, checked_number, plain
 from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
+from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
-from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, named_values, parsed
 from sympflow.hamiltonian.poles import PairsPoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
@@ -54,8 +54,8 @@ class PairsHamiltonian(LocalHamiltonian):
         params: Mapping[str, Any] | None,
         bodies: Mapping[str, Any] | None,
     ) -> None:
-        self.dim = _checked_dim(dim)
-        self.masses = _checked_column("masses", masses)
+        self.dim = checked_count("dim", plain(dim), 1, MOST_AXES, "1, 2 or 3, the coordinates of a body")
+        self.masses = checked_column("masses", masses)
         self._check_masses()
         self.n_bodies = len(self.masses)
         if self.n_bodies < 2:
@@ -69,10 +69,14 @@ class PairsHamiltonian(LocalHamiltonian):
                 f"`cutoff` {self.cutoff:g} is longer than half the box, {self.box.min() / 2:g}: a body would meet "
                 "another and its image. Take a shorter one, or a larger `box`."
             )
-        self.params = checked_params(params)
+        self._set_params(params)
         self._read(potential, {"m": self.masses, **self._checked_bodies(bodies)})
         mass = np.repeat(1 / self.inertia, self.dim)
         self.inverse_mass = None if (mass == 1).all() else mass
+
+    def _set_params(self, params: Any) -> None:
+        remedy = "; what differs from body to body goes to `bodies`"
+        self.params = {name: float(value) for name, value in checked_params(params, remedy=remedy).items()}
 
     def _check_masses(self) -> None:
         if not (self.masses > 0).all():
@@ -85,13 +89,9 @@ class PairsHamiltonian(LocalHamiltonian):
         return self.masses
 
     def _checked_bodies(self, bodies: Any) -> dict[str, np.ndarray]:
-        if not isinstance(bodies, Mapping | None):
-            raise TypeError(f"`bodies` must be a mapping of names to arrays; got {type(bodies).__name__}: pass a dict.")
         columns = {}
-        for name, given in (bodies or {}).items():
-            if not isinstance(name, str) or not name.isidentifier():
-                raise ValueError(f"`bodies` must have names as keys; got {name!r}.")
-            columns[name] = _checked_column(f"bodies[{name!r}]", given)
+        for name, given in named_values("bodies", bodies, "arrays").items():
+            columns[name] = checked_column(f"bodies[{name!r}]", given)
             if columns[name].shape != self.masses.shape:
                 raise ValueError(
                     f"`bodies` has {name} of {columns[name].size} values, and there are {self.n_bodies} `masses`: give "
@@ -157,11 +157,9 @@ class PairsHamiltonian(LocalHamiltonian):
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
-        other = copy.copy(self)
-        other.params = checked_params({**self.params, **values})
+        other = bare_copy(self)
+        other._set_params({**self.params, **values})
         other.constants = (*other.params.values(), *self.constants[len(self.params) :])
-        for name in ("bond_length", "written", "poles"):
-            vars(other).pop(name, None)
         other._check_continuous()
         return other
 
@@ -481,14 +479,7 @@ def _added(out: Array, ends: np.ndarray, values: Array) -> Array:
     return out + sums.reshape(out.shape).astype(out.dtype)
 
 
-def _checked_dim(dim: Any) -> int:
-    dim = plain(dim)
-    if not isinstance(dim, int) or isinstance(dim, bool) or not 1 <= dim <= MOST_AXES:
-        raise ValueError(f"`dim` must be 1, 2 or 3, the coordinates of a body; got {dim!r}.")
-    return dim
-
-
-def _checked_column(name: str, values: Any) -> np.ndarray:
+def checked_column(name: str, values: Any) -> np.ndarray:
     check_kept(name, values)
     values = to_numpy(values) if is_tensor(values) else values
     check_memory(float(np.size(values)), f"`{name}`")
@@ -508,10 +499,8 @@ def _checked_length(name: str, value: Any) -> float | None:
     if value is None:
         return None
     check_kept(name, value)
-    value = plain(value)
-    if not real_number(value) or not 0 <= value < math.inf or (name == "cutoff" and value == 0):
-        raise ValueError(f"`{name}` must be a positive, finite length; got {value!r}.")
-    return float(value)
+    low = 0.0 if name == "softening" else math.ulp(0.0)
+    return float(checked_number(name, plain(value), "a positive, finite length", lambda x: low <= x < math.inf))
 
 
 def _checked_box(box: Any, dim: int) -> np.ndarray | None:
@@ -526,21 +515,3 @@ def _checked_box(box: Any, dim: int) -> np.ndarray | None:
     if not (np.isfinite(lengths) & (lengths > 0)).all():
         raise ValueError(f"`box` must have positive, finite lengths; got {box!r}.")
     return lengths
-
-
-def checked_params(params: Any) -> dict[str, float]:
-    if not isinstance(params, Mapping | None):
-        raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
-    checked = {}
-    for name, given in (params or {}).items():
-        if not isinstance(name, str) or not name.isidentifier():
-            raise ValueError(f"`params` must have names as keys; got {name!r}.")
-        check_kept(f"params[{name!r}]", given)
-        value = plain(given)
-        if not real_number(value) or not math.isfinite(value):
-            raise ValueError(
-                f"`params` has {name} = {reprlib.repr(given)}: give a finite real number; what differs from body to "
-                "body goes to `bodies`."
-            )
-        checked[name] = float(value)
-    return checked

@@ -61,13 +61,15 @@ class Cancelling(NamedTuple):
 class Poles(Protocol):
     """The places at which H of a system may be infinite, in columns."""
 
-    @property
-    def cancelling(self) -> Sequence[Cancelling]:
-        """Terms of H that cancel where each is infinite."""
+    cancelling: Sequence[Cancelling]
+    """Terms of H that cancel where each is infinite."""
+    watched: bool
+    """False if H has cancelling terms alone."""
 
     @property
-    def watched(self) -> bool:
-        """False if H has cancelling terms alone."""
+    def exact(self) -> Poles | None:
+        """The places by which runs are judged, where these may have passed one; None if they are not known."""
+        return self
 
     def look(
         self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()
@@ -87,7 +89,7 @@ class Poles(Protocol):
         """The values (..., m) of the letter of terms that cancel, at states (..., 2d)."""
 
 
-class SymbolicPoles:
+class SymbolicPoles(Poles):
     """The places of H, as it is written."""
 
     def __init__(self, symbols: Any) -> None:
@@ -95,7 +97,7 @@ class SymbolicPoles:
         letters = (*symbols.q, *symbols.p, *((symbols.time,) if symbols.timed else ()))
         parts = [symbols.V, symbols.T] if symbols.separable else [symbols.H]
         self._letters, self._places = letters, [(place, f) for f in parts for place in places(f, letters)]
-        self._m = len(self._places)
+        self._m, self.watched = len(self._places), bool(self._places)
         self.cancelling = [c for f in parts for c in cancelling(f, letters)]
         if not self._places:
             return
@@ -105,11 +107,7 @@ class SymbolicPoles:
         self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
 
     def __bool__(self) -> bool:
-        return bool(self._places or self.cancelling)
-
-    @property
-    def watched(self) -> bool:
-        return bool(self._places)
+        return self.watched or bool(self.cancelling)
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values = self._look(y, *self._time(y, t), numbers=numbers)
@@ -152,7 +150,7 @@ class _Lattice(Protocol):
     def of_terms(self, key: str, expressions: Any, q: Any) -> list[tuple[int | None, int, list[Any]]]: ...
 
 
-class LatticePoles:
+class LatticePoles(Poles):
     """The places of the terms of a lattice, at each site and bond."""
 
     def __init__(self, lattice: _Lattice) -> None:
@@ -240,7 +238,7 @@ class LatticePoles:
         return f"the bond of {ends[0]} and {ends[1]}"
 
 
-class PairsPoles:
+class PairsPoles(Poles):
     """The places of V of two bodies, at a distance r or, of free bodies on a line, a difference."""
 
     def __init__(self, pairs: Any) -> None:
@@ -249,14 +247,11 @@ class PairsPoles:
         self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if pairs.on_a_line else self._x for s in own})
         found = places(self._f, (self._x,))
         self._places = [place for place in found if pairs.on_a_line or place.cell != sp.sign(self._x)]
+        self.watched = bool(self._places)
         self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
 
     def __bool__(self) -> bool:
         return self.watched or bool(self.cancelling)
-
-    @property
-    def watched(self) -> bool:
-        return bool(self._places)
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         q, end = y[..., : self._pairs.ndof], self._pairs.cutoff
@@ -484,6 +479,8 @@ def infinite_between(
                 middle = (low + high) / 2
                 low, high = (middle, high) if number(*at(middle)) == first else (low, middle)
             for side in (-1, 1):
+                if (low if side < 0 else 1 - high) == 0:  # the way begins or ends there
+                    continue
                 values = [function(*at(low + side * mpmath.mpf(d))) for d in BESIDE]
                 if any(mpmath.im(value) != 0 or not mpmath.isfinite(value) for value in values):
                     return True

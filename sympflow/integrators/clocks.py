@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,7 +19,6 @@ import numpy as np
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.grid_runs import Run, broken_off
@@ -63,42 +62,14 @@ ARRAYS_ONLY = (
 )
 
 
-class OnClock(Protocol):
-    """A method that is run on the logarithmic clock."""
-
-    name: ClassVar[str]
-
-    def check_library(self, y0: Array) -> None:
-        """Refuse tensors: see `Integrator`."""
-        ...
-
-    def reach_times(
-        self,
-        clock: LogarithmicClock,
-        h: float,
-        start: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        backend: str,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run in one compiled pass: see `kernels.elapsed_times.reach_times`. None where there is none."""
-        ...
-
-    @property
-    def inner(self) -> FixedStep:
-        """The method that is applied to the transformed system."""
-        ...
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count evaluations on the transformed system, as `FixedStep.evaluations`."""
-        ...
-
-
 class LogarithmicClock(NamedTuple):
-    """A method with equal steps in s, on one system."""
+    """A method with equal steps in s, on one system.
 
-    method: OnClock
+    The method has an `inner` one, which is applied to the transformed system, with `evaluations` on that; and
+    `reach_times`, a run in one compiled pass as `kernels.elapsed_times.reach_times`, None where there is none.
+    """
+
+    method: Any
     system: HamiltonianSystem
     transformed: HamiltonianSystem
     dt: float

@@ -330,7 +330,7 @@ class MemoryRun(GridRun):
         first = first_window(self.stepper, problem, last, len(save))
         if not first:
             self.saved, finite = self.stepper.rollout(problem.y0, self.grid.h, last, save, problem.t0)
-            self.checkpoint = RunCheckpoint(last), finite
+            self.checkpoint = self.checkpoint[0], finite
             return
         pace, most = Pace(first), max(2, MOST_SAVED // math.prod(problem.y0.shape))
         self.saved = rows_of_nan(len(save), problem.y0)

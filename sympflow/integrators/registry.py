@@ -6,7 +6,7 @@ import difflib
 import re
 import sys
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from sympflow.arrays import Array
@@ -184,15 +184,7 @@ def register(name: str, integrator: type[Integrator] | Scheme) -> None:
 
 
 def build(method: Any, options: dict[str, Any]) -> Integrator:
-    """The integrator that `solve(method=..., **options)` means: a name, a class, an instance or a trained flow.
-
-    Raises
-    ------
-    TypeError
-        If an option is not one of the method's.
-    RuntimeError
-        If the class of a plug-in fails, with the name of its distribution.
-    """
+    """The integrator that `solve(method=..., **options)` means: a name, a class, an instance or a trained flow."""
     if isinstance(method, Integrator):
         if options:
             raise TypeError(
@@ -213,7 +205,16 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
             f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes {', '.join(known) or 'none'}: "
             f"{_INSTEAD.get(unknown[0], 'remove it or choose another method')}."
         )
-    return cls(**options) if own else _made(method, lambda: cls(**options))
+    if not own:
+        return _made(method, lambda: cls(**options))
+    plain = all(type(value) in (bool, int, float, str) for value in options.values())
+    return _configured(cls, **options) if plain else cls(**options)  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=256, typed=True)
+def _configured(cls: type[Integrator], **options: Any) -> Integrator:
+    """A built-in method with plain options, made once."""
+    return cls(**options)
 
 
 def _made(method: Any, make: Callable[[], T]) -> T:
@@ -253,7 +254,7 @@ def _load(point: EntryPoint) -> type[Integrator]:
         integrator = load_announced(point, "method")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise ImportError(
-            f"`method` {point.name!r} of the plug-in {distribution(point)} is no Integrator class: report it there."
+            f"`method` {point.name!r} of the plug-in {distribution(point)} is not an Integrator class: report it there."
         )
     if not named(integrator):
         raise ImportError(

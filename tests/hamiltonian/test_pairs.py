@@ -258,7 +258,7 @@ def test_a_run_that_passes_a_place_without_v_ends_there(V, more, y0, dt, where):
 
 @pytest.mark.parametrize("V", ["1/r", "r**-12 - r**-6", "sin(r)/r", "exp(-r)/r", "erfc(r)/r", "log(1 + r**2)", "r"])
 def test_where_there_is_none_nothing_is_looked_at(V):
-    assert not HamiltonianSystem.pairs(V, masses=np.ones(3), dim=3).poles
+    assert not HamiltonianSystem.pairs(V, masses=np.ones(3), dim=3).definition.poles
 
 
 class TestBadInput:
