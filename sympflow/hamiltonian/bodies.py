@@ -173,9 +173,12 @@ class PairsHamiltonian(LocalHamiltonian):
         """True of so few bodies that their pairs are written out."""
         return self.n_bodies * (self.n_bodies - 1) // 2 * self.dim <= MOST_WRITTEN
 
-    @cached_property
+    @property
     def written(self) -> SymbolicHamiltonian | None:  # type: ignore[override]
-        if not self.is_few or self.box is not None or self.cutoff is not None:
+        return self.spelled if self.is_few else None
+
+    def in_symbols(self) -> SymbolicHamiltonian | None:
+        if self.box is not None or self.cutoff is not None:
             return None
         q, p = (sp.symbols(f"{name}1:{self.ndof + 1}", real=True) for name in "qp")
         masses = np.repeat(self.masses, self.dim).tolist()
