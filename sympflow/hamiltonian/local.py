@@ -135,7 +135,7 @@ class LocalHamiltonian(Definition, ABC):
 
     @cached_property
     def spelled(self) -> SymbolicHamiltonian | None:
-        """H in symbols with all terms one by one, for loops that are made of these, of a system that is not too large."""
+        """H in symbols, all terms one by one, for loops that are made of these; None where there are too many."""
         return None if self.timed or self.arrays_only or self.ndof > MOST_SPELLED else self.in_symbols()
 
     def in_symbols(self) -> SymbolicHamiltonian | None:
