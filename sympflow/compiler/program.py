@@ -109,6 +109,12 @@ def _product(a: Any, b: Any, name: str = "mul") -> Any:
                 return (x * factor) * y.args[1]
         if isinstance(x, Traced) and x.name == "neg":
             return -apply(name, x.args[0], y)
+        if isinstance(x, Traced) and x.name == "where":  # nothing of what is chosen against, not even NaN
+            c, u, v = x.args
+            if _is(u, 1.0) and _is(v, 0.0):
+                return apply("where", c, y, 0.0)
+            if _is(u, 0.0) and _is(v, 1.0):
+                return apply("where", c, 0.0, y)
     return None
 
 
@@ -273,6 +279,13 @@ def traced(function: Callable[..., Sequence[Any]], *names: str) -> Program:
 
 
 def _partials(x: Traced) -> Iterator[tuple[Traced, Any]]:
+    base, *rest = x.args
+    if x.name == "pow" and isinstance(base, Traced) and base.name == "sqrt" and isinstance(rest[0], float):
+        yield (
+            base.args[0],
+            0.5 * rest[0] * base ** (rest[0] - 2.0),
+        )  # where that of the root is infinite, it need not be
+        return
     rule = FUNCTIONS[x.name].partials
     if rule is None:
         return
