@@ -29,10 +29,10 @@ from sympflow.hamiltonian.lattice import BOUNDARIES
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.fits import PrimedFit
+from sympflow.training.least_squares import Check
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors
 from sympflow.training.starts import frequency
 from sympflow.training.table_fit import RunsFit, Table
-from sympflow.training.table_step import Check
 
 MOST_FITTED = 16
 """Degrees of freedom up to which a lattice is fitted as it is, and not by a piece."""
@@ -99,7 +99,9 @@ class LatticePiece:
         local = self.lattice.local
         if self.lattice.damping is None and local is not None and local.uniform and local.ends:
             flow.figures |= {f"ends_{end}": self._error_at(flow, end) for end in BOUNDARIES}
-        judged, own = self._judged, flow
+        assert local is not None
+        smaller = local.judged()  # with the same ends
+        judged, own = self.lattice.subsystem(*smaller) if smaller else self.lattice, flow
         assert judged.local is not None
         if judged is not self.lattice:
             own = flow.bound(judged)
@@ -118,13 +120,6 @@ class LatticePiece:
                 "judged_on": float(judged.ndof),
             }
         return flow
-
-    @property
-    def _judged(self) -> HamiltonianSystem:
-        """The system, or a smaller one with the same ends."""
-        assert self.lattice.local is not None
-        judged = self.lattice.local.judged()
-        return self.lattice.subsystem(*judged) if judged else self.lattice
 
     @torch.no_grad()
     def _step_figures(self, flow: PrimedFlow, system: HamiltonianSystem, domain: Domain, n: int) -> dict[str, float]:
