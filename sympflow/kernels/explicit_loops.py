@@ -138,12 +138,10 @@ class Field:
             code.store(code.load(g, m + d), out, m)
             force = -code.load(g, m)
             if self._damping is not None:
-                damping = data[-1]
-
-                def damped(j: Value, values: list[Value], m: Value = m) -> list[Value]:
-                    return [values[0] - code.load(damping, m * d + j) * code.load(y, j + d)]
-
-                (force,) = code.loop(d, [force], damped)
+                moved = code.variable(force)
+                with code.over(d) as j:
+                    moved.value = moved.value - code.load(data[-1], m * d + j) * code.load(y, j + d)
+                force = moved.value
             code.store(force, out, m + d)
 
 

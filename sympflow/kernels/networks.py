@@ -42,17 +42,8 @@ STEP = 1000  # about how many nanoseconds one takes
 class NetworkLayer:
     """The weights of a kick or a drift, whose potential is V(t, x) = w · σ(… σ(K x + k t + b_1) …).
 
-    Attributes
-    ----------
-    is_kick : bool
-    activation : str
-        The name of σ.
-    K, k : ndarrays of shape (h_1, d) and (h_1,)
-    biases : sequence of ndarrays of shape (h_l,)
-    weights : sequence of ndarrays of shape (h_{l+1}, h_l)
-    w : ndarray of shape (h_n,)
-    slopes : callable, optional
-        Where the loops do not know σ by its name: a function of a number a that returns σ(a) and σ'(a).
+    K is (h_1, d), k (h_1,), the biases (h_l,), the weights (h_{l+1}, h_l), w (h_n,). Where the loops do not know σ by
+    its name, `slopes` is a function of a number a that returns σ(a) and σ'(a).
     """
 
     is_kick: bool

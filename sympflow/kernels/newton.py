@@ -331,11 +331,10 @@ class _InMemory(NewtonCode):
         h = code.load(numbers)
         with code.over(self.stages) as i:
             with code.over(n) as m:
-
-                def moved(j: Value, values: list[Value], i: Value = i, m: Value = m) -> list[Value]:
-                    return [values[0] + code.load(A, i * self.stages + j) * code.load(K, j * n + m)]
-
-                code.store(code.loop(self.stages, [code.load(state, m)], moved)[0], Y, m)
+                x = code.variable(code.load(state, m))
+                with code.over(self.stages) as j:
+                    x.value = x.value + code.load(A, i * self.stages + j) * code.load(K, j * n + m)
+                code.store(x.value, Y, m)
             if self._damped:
                 grown, shrunk = self._growths(code, numbers, i)
                 with code.over(d) as m:
