@@ -134,7 +134,7 @@ class LatticeSubsystem:
 
     @torch.no_grad()
     def _error_at(self, flow: PrimedFlow, end: str) -> float:
-        """The relative energy error, above rest, of a few subsystems in a row with such ends: the median over states."""
+        """The relative energy error, above rest, of a few in a row with such ends: the median over states."""
         few = self.lattice.subsystem()
         assert few.local is not None
         row = self.lattice.subsystem((COPIES * few.local.shape[0], *few.local.shape[1:]), (end, *few.local.ends[1:]))
@@ -218,7 +218,7 @@ def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
         )
     if fit.data is not None:
         raise ValueError(
-            "`runs` begin in states of a larger subsystem of the system, and `data` are of itself: leave out one of them."
+            "`runs` begin in states of a larger piece of the system, and `data` are of itself: leave out one of them."
         )
 
 

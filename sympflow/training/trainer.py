@@ -47,7 +47,7 @@ from sympflow.training.fits import (
     keywords,
     said,
 )
-from sympflow.training.lattice_fit import LatticeSubsystem, check_runs, by_subsystem, runs_of
+from sympflow.training.lattice_fit import LatticeSubsystem, by_subsystem, check_runs, runs_of
 from sympflow.training.network_fit import LossRun
 from sympflow.training.points import Stream, handed_in, start_times, unlabelled, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted

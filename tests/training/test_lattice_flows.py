@@ -150,7 +150,7 @@ def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
     pendulum = HamiltonianSystem.from_sympy("p**2/2 - cos(q)", domain=Box([-1, -1], [1, 1]))
     with pytest.raises(ValueError, match=r"^`runs` need a lattice that conserves its energy, and"):
         train(pendulum, dt=0.5, runs=4, **FIT)
-    with pytest.raises(ValueError, match=r"^`runs` begin in states of a larger subsystem of the system, and `data`"):
+    with pytest.raises(ValueError, match=r"^`runs` begin in states of a larger piece of the system, and `data`"):
         train(lattice, runs=4, data=([0.1], np.zeros((1, 512)), np.zeros((1, 512))))
     with pytest.raises(TypeError, match=r"^`runs` is not an option of the optimizer 'adam' for flows of kind 'sympf"):
         train(lattice, runs=4, kind="sympflow")
