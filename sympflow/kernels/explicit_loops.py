@@ -60,7 +60,7 @@ class Field:
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
-        symbols, force = system.form, system.external_force
+        symbols, force = system.spelled, system.external_force
         assert symbols is not None
         forces = getattr(force, "expressions", None)
         if force is not None and (forces is None or system.symbols is None):
