@@ -567,6 +567,11 @@ class Hamiltonian:
         form = self.form
         return form.written if isinstance(form, TracedHamiltonian) else form
 
+    @property
+    def spelled(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
+        """`form`, or that of a lattice or of pairs with all terms one by one, if they are not too many; else None."""
+        return self.form if self.local is None else self.local.spelled
+
     @cached_property
     def expression(self) -> str | None:
         """H as a text, in q1 … qd, p1 … pd, the time t and numbers, of a symbolic system; else None."""

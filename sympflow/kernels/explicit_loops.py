@@ -60,7 +60,7 @@ class Field:
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
-        symbols, force = system.form, system.external_force
+        symbols, force = system.spelled, system.external_force
         assert symbols is not None
         forces = () if force is None else force.expressions
         if force is not None and not (forces and system.symbols):
