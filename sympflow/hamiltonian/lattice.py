@@ -18,6 +18,7 @@ from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, numbered, parsed
+from sympflow.hamiltonian.parts import RestOfPotential
 from sympflow.hamiltonian.poles import LatticePoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, exact
 
@@ -361,7 +362,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         linear = SpectralPart.of_matrices(transform, inverse_mass, np.ascontiguousarray(K), interval)
         rest = bare_copy(self)
         rest.U, rest.bonds = U if U.free_symbols & set(self.x) else sp.S.Zero, bonds
-        return linear, [RestOfLattice(rest)] if rest.U != 0 or bonds else []
+        return linear, [RestOfPotential(rest)] if rest.U != 0 or bonds else []
 
     def _quadratic(self, f: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[np.ndarray, sp.Expr]:
         """K (F, F) of the terms ½ xᵀKx of a site or bond, with numbers and means of arrays; and what remains."""
@@ -534,26 +535,6 @@ class LatticeHamiltonian(LocalHamiltonian):
             return _cut(values, at, 0, n - k)
         before = [_cut(values, at, n - k, n)] if boundary == "periodic" else [_cut(values, at, 0, 1)] * k
         return concatenate([*before, values], at)
-
-
-class RestOfLattice:
-    """U(q) of a lattice, the potential without its linear part, as `sympflow.hamiltonian.parts` has them."""
-
-    of_positions, turns, timed = True, False, False
-
-    def __init__(self, lattice: LatticeHamiltonian) -> None:
-        self.lattice, self.ndof = lattice, lattice.ndof
-
-    def hamiltonian(self, y: Array) -> Array:
-        return self.lattice.potential(y[..., : self.ndof])
-
-    def gradient(self, y: Array) -> Array:
-        q = y[..., : self.ndof]
-        return concatenate([self.lattice.potential_gradient(q), 0 * q])
-
-    def hessian_vector(self, y: Array, v: Array) -> Array:
-        """∇²U(q)·v: (..., 2d), (..., d) to (..., d)."""
-        return self.lattice.hessian_vector(y[..., : self.ndof], v)
 
 
 def _slopes(f: sp.Expr, x: Sequence[sp.Symbol], *along: Sequence[sp.Symbol]) -> list[sp.Expr]:

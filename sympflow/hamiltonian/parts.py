@@ -66,25 +66,34 @@ class PartFunctions(SymbolicHamiltonian):
 
 
 class RestOfPotential:
-    """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a system given by functions."""
+    """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a definition by functions; V, where the linear part is left out of that."""
 
     of_positions, turns = True, False
 
-    def __init__(self, system: HamiltonianSystem, linear: LinearPart) -> None:
-        self.system, self.K, self.center, self.ndof = system, linear.stiffness_matrix, linear.center, system.ndof
-        self.timed = system.definition.timed
+    def __init__(self, definition: Any, linear: LinearPart | None = None) -> None:
+        self.definition, self.ndof, self.timed = definition, definition.ndof, definition.timed
+        self.K: np.ndarray | None = None if linear is None else linear.stiffness_matrix
+        self.center: Any = 0.0 if linear is None else linear.center
 
     def hamiltonian(self, y: Array, *t: Any) -> Array:
         q = y[..., : self.ndof]
+        V = self.definition.potential(q, *t)
+        if self.K is None:
+            return V
         x = q - like(self.center, q)
-        return self.system.potential(q, *t) - (x * (x @ like(self.K, q))).sum(-1) / 2
+        return V - (x * (x @ like(self.K, q))).sum(-1) / 2
 
     def gradient(self, y: Array, *t: Any) -> Array:
         q = y[..., : self.ndof]
-        return concatenate([-self.system.force(q, *t) - (q - like(self.center, q)) @ like(self.K, q), 0 * q])
+        slope = self.definition.potential_gradient(q, *t)
+        if self.K is not None:
+            slope = slope - (q - like(self.center, q)) @ like(self.K, q)
+        return concatenate([slope, 0 * q])
 
     def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
-        return self.system.hessian_vector(y[..., : self.ndof], v, *t) - v @ like(self.K, v)
+        """∇²U(q)·v: (..., 2d), (..., d) to (..., d)."""
+        product = self.definition.hessian_vector(y[..., : self.ndof], v, *t)
+        return product if self.K is None else product - v @ like(self.K, v)
 
 
 class ExactParts:
@@ -369,7 +378,7 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
             local, rest = system.local.linear_and_rest(abs(system.t_span[1] - system.t_span[0]))
             return ExactParts(local, rest, system.ndof)
         linear = system.linear_part
-        return ExactParts(linear, [RestOfPotential(system, linear)], system.ndof)
+        return ExactParts(linear, [RestOfPotential(system.definition, linear)], system.ndof)
     if expressions is None:
         return _detected(system)
     return _given(system, tuple(expressions))
