@@ -145,7 +145,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             if told:
                 warn(told, RuntimeWarning)
         end = open_end(t0, t_bound, dt)
-        self._pieces, self._length = spans(t0, end, [], jumps)[::-1], dt
+        self._pieces, self._length = spans(float(t0), float(end), [], jumps)[::-1], dt
         self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, end, self.y))
         self._parts = max(1, math.ceil(dt / max_step * (1 - 1e-12)))
         self._part = 0  # the sample after the grid point before the state
