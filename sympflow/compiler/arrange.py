@@ -64,7 +64,7 @@ class _Body(Recording):
 
     def record(self, name: str, args: Sequence[Any]) -> Any:
         value = super().record(name, args)
-        if isinstance(value, Traced) and value.order not in self.known:
+        if isinstance(value, Traced) and value.name in FUNCTIONS and value.order not in self.known:
             self.known[value.order] = max(map(self.depth, value.args)) + FUNCTIONS[value.name].cost
         return value
 

@@ -109,12 +109,6 @@ def _product(a: Any, b: Any, name: str = "mul") -> Any:
                 return (x * factor) * y.args[1]
         if isinstance(x, Traced) and x.name == "neg":
             return -apply(name, x.args[0], y)
-        if isinstance(x, Traced) and x.name == "where":  # nothing of what is chosen against, not even NaN
-            c, u, v = x.args
-            if _is(u, 1.0) and _is(v, 0.0):
-                return apply("where", c, y, 0.0)
-            if _is(u, 0.0) and _is(v, 1.0):
-                return apply("where", c, 0.0, y)
     return None
 
 
@@ -294,6 +288,18 @@ def _partials(x: Traced) -> Iterator[tuple[Traced, Any]]:
             yield a, slope
 
 
+def _through(slope: Any, partial: Any) -> Any:
+    """The product of two derivatives, 0 where a choice makes one of them 0, even if the other is no number there."""
+    for x, y in ((slope, partial), (partial, slope)):
+        if isinstance(x, Traced) and x.name == "where":
+            condition, a, b = x.args
+            if _is(a, 0.0):
+                return apply("where", condition, 0.0, _through(b, y))
+            if _is(b, 0.0):
+                return apply("where", condition, _through(a, y), 0.0)
+    return slope * partial
+
+
 def gradient(y: Any, x: Sequence[Traced]) -> list[Any]:
     """Return ∂y/∂x of recorded numbers, in the same recording, by the reverse mode."""
     if not isinstance(y, Traced):
@@ -307,7 +313,7 @@ def gradient(y: Any, x: Sequence[Traced]) -> list[Any]:
             continue
         for a, partial in _partials(number):
             if a.order in depends:
-                slopes[a.order] = slopes.get(a.order, 0.0) + slope * partial
+                slopes[a.order] = slopes.get(a.order, 0.0) + _through(slope, partial)
     return [slopes.get(s.order, 0.0) for s in x]
 
 
@@ -319,7 +325,7 @@ def tangent(outputs: Sequence[Any], x: Sequence[Traced], v: Sequence[Any]) -> li
             total: Any = 0.0
             for a, partial in _partials(number):
                 if a.order in dots:
-                    total = total + partial * dots[a.order]
+                    total = total + _through(partial, dots[a.order])
             dots[number.order] = total
     return [dots.get(y.order, 0.0) if isinstance(y, Traced) else 0.0 for y in outputs]
 
@@ -344,7 +350,7 @@ def adjoint(program: Program) -> Program:
         for number in reversed(program.operations):
             if number.order in within and number.order in slopes:
                 for a, partial in _slopes_of(number, within):
-                    slopes[a.order] = slopes.get(a.order, 0.0) + slopes[number.order] * partial
+                    slopes[a.order] = slopes.get(a.order, 0.0) + _through(slopes[number.order], partial)
         found.append(fused(Program([*program.inputs, *cotangents], [slopes.get(x.order, 0.0) for x in program.inputs])))
     return min(found, key=lambda each: 2 * _waiting(each, cotangents) + 3 * len(each))
 
@@ -360,7 +366,7 @@ def _slopes_of(y: Traced, ends: set[int]) -> Iterator[tuple[Traced, Any]]:
             yield number, slope
             continue
         for a, partial in _partials(number):
-            slopes[a.order], known[a.order] = slopes.get(a.order, 0.0) + slope * partial, a
+            slopes[a.order], known[a.order] = slopes.get(a.order, 0.0) + _through(slope, partial), a
 
 
 def _waiting(program: Program, late: Sequence[Traced]) -> int:

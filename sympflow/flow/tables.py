@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -116,20 +116,10 @@ class PrimedShape:
         return (*reversed(outer[-1]), *substeps_of(self.kernel, inside, 1), *outer[1])
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {
-            "first": self.first,
-            "maps": self.maps,
-            "degree": self.degree,
-            "palindromic": self.palindromic,
-            "force_gradient": self.force_gradient,
-            "processor": self.processor,
-            "curvature": self.curvature,
-            **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
-            **({"timed": True} if self.timed else {}),
-            **({} if self.gradient_kicks is None else {"gradient_kicks": list(self.gradient_kicks)}),
-            **({} if self.curvature_kicks is None else {"curvature_kicks": list(self.curvature_kicks)}),
-        }
+        """JSON-able, the later entries where they are not what they are by default."""
+        told = asdict(self)
+        later = {f.name: f.default for f in fields(self)[7:]}
+        return {n: list(v) if isinstance(v, tuple) else v for n, v in told.items() if n not in later or v != later[n]}
 
     @classmethod
     def from_dict(cls, plan: Any, ndof: int) -> Self:

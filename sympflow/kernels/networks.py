@@ -304,20 +304,20 @@ def _slopes(layer: NetworkLayer) -> tuple[Callable[[Any], Any] | None, int]:
     function: Any = layer.slopes
     try:
         return traced(getattr(function, "py_func", function), "a"), 0
-    except (TypeError, ValueError, AttributeError):
-        return None, _by_numba(function).address
+    except (TypeError, ValueError, AttributeError) as reason:
+        return None, _by_numba(function, str(reason)).address
 
 
 @cache
-def _by_numba(function: Any) -> Any:
-    """A function (n, a, values, slopes) of addresses."""
+def _by_numba(function: Any, reason: str) -> Any:
+    """A function (n, a, values, slopes) of addresses, of one that cannot be traced for a reason."""
     try:
         from numba import carray, cfunc, njit, types
         from numba.extending import is_jitted
     except ImportError as error:
         raise ValueError(
-            "`compiled`, with which the activation of the flow was registered, has branches or calls functions, which "
-            f"Numba compiles: {needed('numba', 'numba')}, or write it by operators."
+            "`compiled`, with which the activation of the flow was registered, cannot be traced, so that Numba must "
+            f"compile it ({reason.rstrip('.')}): {needed('numba', 'numba')}, or write it by operators."
         ) from error
 
     compiled = function if is_jitted(function) else njit(error_model="numpy")(function)

@@ -52,7 +52,7 @@ _KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneSte
 
 
 def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
-    written = system.written if system.form is None else system.form
+    written = system.spelled
     if written is None:
         raise ValueError(
             "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "

@@ -44,6 +44,8 @@ SILENT = {
     "q**1.5": [0.0, 5.0],
     "Max(q - 1, 0)**2.5": [0.0, 0.5],
     "Abs(q)**2.5": [0.0, 0.5],
+    "Piecewise((q**2*log(q), q > 0), (0, True))": [1.0, -3.0],
+    "Piecewise((0, q <= 0), (q**2.5, True))": [1.0, -3.0],
 }
 """V that are finite along a run, of which some divisors vanish."""
 
