@@ -484,8 +484,8 @@ def _added(out: Array, ends: np.ndarray, values: Array) -> Array:
 
 
 def checked_column(name: str, values: Any) -> np.ndarray:
+    check_memory(float(math.prod(getattr(values, "shape", ()))), f"`{name}`")  # before any is taken
     array = real_array(name, values)
-    check_memory(float(array.size), f"`{name}`")
     if array.ndim != 1:
         raise ValueError(f"`{name}` must have shape (n,), one number for each body; got {array.shape}.")
     if not np.isfinite(array).all():
