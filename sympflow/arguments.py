@@ -6,8 +6,9 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -187,10 +188,31 @@ def as_float(value: Any) -> float:
         return math.nan
 
 
-def check_positive(name: str, value: Any, most: float = sys.float_info.max) -> None:
-    """Raise unless the argument `name` is a positive and finite real number."""
+def check_positive(name: str, value: Any, most: float = sys.float_info.max) -> Any:
+    """Return the argument `name`; raise unless it is a positive and finite real number."""
     if not (real_number(value) and 0 < value <= most):
         raise ValueError(f"`{name}` must be positive and finite; got {value!r}: give a number above 0.")
+    return value
+
+
+def checked_number(name: str, value: Any, what: str = "a finite number", fits: Callable[[Any], bool] = isfinite) -> Any:
+    """Return the argument `name`; raise unless it is a real number that fits, which the message says in words."""
+    if not (real_number(value) and fits(value)):
+        raise ValueError(f"`{name}` must be {what}; got {value!r}.")
+    return value
+
+
+NOT_NEGATIVE = "finite and not negative"
+
+
+def not_negative(x: Any) -> bool:
+    """Return True for a finite number that is 0 or more."""
+    return 0 <= x < math.inf
+
+
+def checked_count(name: str, value: Any, low: int, high: int, what: str) -> int:
+    """Return the argument `name`, a whole number from `low` to `high`, which the message says in words."""
+    return int(checked_number(name, value, what, lambda n: low <= n <= high and int(n) == n))
 
 
 def check_one_of(name: str, value: Any, known: Iterable[str]) -> None:

@@ -72,6 +72,13 @@ def moveaxis(y: Array, source: int, target: int) -> Array:
     return y.movedim(source, target) if is_tensor(y) else np.moveaxis(y, source, target)
 
 
+def expanded(y: Array, shape: tuple[int, ...]) -> Array:
+    """Return y broadcast to a shape: itself where it has that."""
+    if tuple(y.shape) == shape:
+        return y
+    return y.expand(shape) if is_tensor(y) else np.broadcast_to(y, shape)
+
+
 def masked(y: Array, mask: Any, value: float) -> Array:
     """Return y with a value where the mask, an array that broadcasts against it, is True."""
     if is_tensor(y):
@@ -119,10 +126,8 @@ def to_numpy(x: Array) -> np.ndarray:
         If `x` has no such values: inside `torch.func.vmap` it stands for many arrays, and in a graph that
         `torch.compile` traces for none.
     """
-    if not is_tensor(x):
-        return np.asarray(x)
     found = values(x)
-    if found is None or found.ndim != x.ndim:
+    if found is None or (is_tensor(x) and found.ndim != x.ndim):
         where = "in a graph that torch.compile traces" if found is None else "inside torch.func.vmap"
         raise TypeError(
             f"The values of a tensor of shape {tuple(x.shape)} are needed as numbers, which it has not {where}: make "
@@ -141,10 +146,12 @@ def differentiable(*arrays: Any) -> bool:
 
 
 def values(x: Any) -> np.ndarray | None:
-    """Return the values of a tensor, (*lanes, *x.shape), the axes first over which `torch.func.vmap` maps.
+    """Return the values of x, of a tensor (*lanes, *x.shape), the axes first over which `torch.func.vmap` maps.
 
     None where there are none to be read, in a graph that `torch.compile` traces.
     """
+    if not is_tensor(x):
+        return np.asarray(x)
     plain, order = _behind(x)
     if plain is None:
         return None
@@ -183,7 +190,7 @@ def one_lane(x: Array) -> np.ndarray:
     TypeError
         If there are none, in a graph that `torch.compile` traces.
     """
-    found = values(x) if is_tensor(x) else np.asarray(x)
+    found = values(x)
     return to_numpy(x) if found is None else found[(0,) * (found.ndim - x.ndim)]
 
 
@@ -349,6 +356,20 @@ def like(values: Any, x: Array) -> Array:
 
         return torch.as_tensor(values if is_tensor(values) else np.array(values), dtype=x.dtype, device=x.device)
     return np.asarray(values, dtype=x.dtype)
+
+
+def beside(t: Any, x: Array) -> Any:
+    """Return a time, a number or (...), as it stands beside x: of a tensor as doubles on its device."""
+    if not is_tensor(x):
+        return t
+    import torch
+
+    return torch.as_tensor(t, dtype=torch.float64, device=x.device)
+
+
+def detached(x: Any) -> Any:
+    """Return a tensor without the graph that it is in; all else as it is."""
+    return x.detach() if is_tensor(x) else x
 
 
 def opaque(function: Any, *x: Array) -> Array:

@@ -619,7 +619,7 @@ def scheme_named(name: str) -> Scheme:
         return checked_scheme(scheme)
     except (TypeError, ValueError) as error:
         raise ImportError(
-            f"`scheme` {name!r} of the plug-in {distribution(point)} is no usable scheme ({error}): report it there."
+            f"`scheme` {name!r} of the plug-in {distribution(point)} is not a usable scheme ({error}): report it there."
         ) from error
 
 

@@ -467,7 +467,7 @@ def _run_stored(integrator: Integrator, problem: Problem, action: str) -> tuple[
             system.check_functions_along(y)
         if integrator.trained:
             check_system_along(piece, integrator, system, y0)
-        if problem.diagnosed and system.poles is not None:
+        if problem.diagnosed and system.definition.poles is not None:
             nonlocal before
             if before is None:
                 before = replace(problem, store=None, progress=None, diagnosed=False)

@@ -75,7 +75,9 @@ def applies(method, form):
     return True
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "method", [pytest.param(m, marks=pytest.mark.slow) if m in ("fehlberg2", "bosh3") else m for m in METHODS]
+)
 def test_methods(method):
     adaptive = "rtol" in sympflow.get(method)().options()
     forms = [form for form in FORMS if applies(method, form)]
@@ -182,7 +184,7 @@ RELATIVE = {"compare": 1e-4, "stability": 1e-3, "frequencies": 1e-6}  # by diffe
 
 
 @pytest.mark.parametrize("form", ["well", "kepler", "bent"])
-@pytest.mark.parametrize("name", MEASURES)
+@pytest.mark.parametrize("name", [pytest.param(m, marks=pytest.mark.slow) if m == "stability" else m for m in MEASURES])
 def test_metrics(name, form):
     assert_alike(MEASURES[name], form, RELATIVE.get(name, 1e-8))
 

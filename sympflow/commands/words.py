@@ -182,7 +182,9 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
             if name not in known:
                 takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
                 option = name.replace("_", "-")
-                raise Usage(f"`--{option}` is no option, nor a parameter of {', '.join(names)} ({takes}): see --help.")
+                raise Usage(
+                    f"`--{option}` is neither an option nor a parameter of {', '.join(names)} ({takes}): see --help."
+                )
         return _told_apart([_scene(name, factory, pairs, shared) for name, factory, pairs in parted])
     except (ValueError, TypeError) as error:  # of what the system is made of, which is no option of the command
         raise Usage(str(error)) from error
@@ -228,10 +230,10 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
             continue
         name, equals, value = word.partition("=")
         if not name.startswith("--"):
-            raise ValueError(f"`{name}` is no option: see --help.")
+            raise ValueError(f"`{name}` is not an option: see --help.")
         if not equals:
             if not rest:
-                raise ValueError(f"`{name}` is no option, or lacks its value: see --help.")
+                raise ValueError(f"`{name}` is not an option, or lacks its value: see --help.")
             value = rest.pop(0)
         key = name[2:].replace("-", "_")
         if key in shared:
@@ -373,7 +375,7 @@ def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
     for word in words:
         key, equals, value = word.partition("=")
         if not (key and equals and value):
-            raise Usage(f"`{word}` behind a colon is no option with a value: write name:{key or 'option'}=value.")
+            raise Usage(f"`{word}` behind a colon is not an option with a value: write name:{key or 'option'}=value.")
         if key in found:
             raise Usage(f"`{key}` is given twice: give it once.")
         found[key] = value

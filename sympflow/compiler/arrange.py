@@ -245,9 +245,9 @@ class Arrangement:
         (((order, _),),) = x.terms
         return self._nodes[order]
 
-    def written(self, x: Polynomial) -> Any:
-        """Write a polynomial into the body, with a short chain, and return its number."""
-        return self._plan(x.terms).write()
+    def written(self, x: Polynomial | float) -> Any:
+        """Write a polynomial into the body, with a short chain, and return its number; that of a constant is itself."""
+        return x if isinstance(x, float) else self._plan(x.terms).write()
 
     def moved(self, base: Any, factor: Any, x: Any) -> Any:
         """base + factor·x, of numbers of the body, with the shortest chain.

@@ -30,26 +30,9 @@ LONGEST_MESSAGE = 400
 class Chunk:
     """Some orbits of an ensemble, one after another in its order; a reduction makes its fields of them.
 
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    integrator : Integrator
-    t_span : (float, float)
-    t_eval : ndarray of shape (m,) or None
-        Times of the states that a reduction sees; None for every step.
-    y0 : ndarray of shape (n, 2d)
-    params : mapping of str to ndarray of shape (n,)
-        Values of the parameters of each orbit, where they are others than the system's.
-    backend : str
-    first : int
-        Number of the first orbit within the ensemble.
-
-    Attributes
-    ----------
-    status : ndarray of shape (n,), of int8
-        0, or −1 for an orbit that failed.
-    messages : dict of int to str
-        Of the orbits that failed.
+    `t_eval` (m,) are the times of the states that a reduction sees, None for every step; `y0` is (n, 2d); `params` are
+    values (n,) of the parameters of each orbit, where they are others than the system's; `first` is the number of the
+    first orbit within the ensemble. `status` (n,) is 0, or −1 for an orbit that failed, `messages` say why.
     """
 
     system: HamiltonianSystem
@@ -111,13 +94,7 @@ class Chunk:
 
     @cached_property
     def times(self) -> np.ndarray:
-        """The times (m,) of the states that a reduction sees.
-
-        Raises
-        ------
-        ValueError
-            If they are the method's own, of each orbit others.
-        """
+        """The times (m,) of the states that a reduction sees."""
         if self.t_eval is not None:
             return self.t_eval
         length = self.integrator.step_length(self.system) if self.integrator.on_grid else None
@@ -136,7 +113,7 @@ class Chunk:
         times = self.times
         stepper = self._stepper
         most = max(1, MOST_VALUES // self.y0.size)
-        alike = self.t_eval is None and not self.params and self.system.autonomous
+        alike = self.t_eval is None and not self.params
         kernel = None if stepper is None else stepper.kernel
         if len(times) <= most or not alike or stepper is None or kernel is None or len(self) == 1:
             yield times, self.states(times)
@@ -145,14 +122,15 @@ class Chunk:
         carry, last = RunCheckpoint(), np.full(len(self), grid.n_steps)
         for start in range(0, grid.n_steps + 1, most):
             save = np.arange(start, min(start + most, grid.n_steps + 1))
-            y, last, _ = kernel.run(grid.h, self.y0, int(save[-1]), save, carry=carry)
+            y, last, _ = kernel.run(grid.h, self.y0, int(save[-1]), save, carry, grid.t0)
             ran_out = np.flatnonzero((last < save[-1]) & (self.status == 0))
             for row in ran_out.tolist():
                 self.fail(row, self._reason(grid.time(int(last[row])), ""))
             yield times[save], y.swapaxes(1, 2)
         if grid.remainder:
             with np.errstate(all="ignore"):
-                yield times[-1:], stepper.shorter(y[:, -1], np.full(len(self), grid.remainder))[..., None]
+                end = stepper.shorter(y[:, -1], np.full(len(self), grid.remainder), grid.time(grid.n_steps))
+                yield times[-1:], end[..., None]
 
     def orbits(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
         """Yield the row of each orbit, the times (m,), and its states (2d, m), NaN from where it failed."""

@@ -120,13 +120,7 @@ class Drawn:
 
 
 def initial_states(system: HamiltonianSystem, y0: Any, n: Any, seed: Any) -> Given | Drawn:
-    """The initial states that `y0`, `n` and `seed` mean.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If they are none.
-    """
+    """The initial states that `y0`, `n` and `seed` mean."""
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     if isinstance(y0, Domain) or (callable(y0) and not isinstance(y0, type)):

@@ -217,13 +217,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 
 
 def reduction(reduce: Any) -> Reduction:
-    """Return the reduction that `reduce` means: None for the states, a name, a Reduction, or a function of (t, y).
-
-    Raises
-    ------
-    ValueError, TypeError
-        If it is none.
-    """
+    """Return the reduction that `reduce` means: None for the states, a name, a Reduction, or a function of (t, y)."""
     if reduce is None:
         return States()
     if isinstance(reduce, Reduction):

@@ -110,20 +110,9 @@ class Variable:
 
 @dataclass(frozen=True)
 class Layout:
-    """The axes of an ensemble, and what is kept of each orbit.
+    """The axes of an ensemble, `n` orbits at each of their values, and the fields that are kept of each orbit.
 
-    Parameters
-    ----------
-    axes : dict of str to ndarray
-        The values of the parameters that are axes.
-    n : int
-        Orbits at each.
-    ndof : int
-    times : ndarray of shape (m,)
-    fields : dict
-        Names, shapes and dtypes of the fields of an orbit.
-    state : str
-        The field that holds states [q, p], along its first axis; "" if there is none.
+    `state` is the field that holds states [q, p] along its first axis; "" if there is none.
     """
 
     axes: dict[str, np.ndarray]
@@ -168,13 +157,7 @@ class Layout:
         return found
 
     def stored(self, sizes: Index) -> dict[str, Field]:
-        """Return the arrays of a store with chunks of such a shape along the axes.
-
-        Raises
-        ------
-        ValueError, TypeError
-            If a store takes none of such a name, or of such things.
-        """
+        """Return the arrays of a store with chunks of such a shape along the axes."""
         for name, (_, dtype) in self.fields.items():
             if not is_name(name):
                 raise ValueError(f"`reduce` returns {name!r}, which no array of a `store` can be called: rename it.")

@@ -64,15 +64,7 @@ def identity(
 
 @dataclass(frozen=True)
 class EnsembleStore:
-    """The store of an ensemble: a path, which is small when it is sent to a worker.
-
-    Parameters
-    ----------
-    path : str
-    layout : Layout
-    sizes : tuple of int
-        Shape of a chunk, along the axes of the grid.
-    """
+    """The store of an ensemble, with chunks of `sizes`: a path, which is small when it is sent to a worker."""
 
     path: str
     layout: Layout
@@ -82,15 +74,7 @@ class EnsembleStore:
     def at(
         cls, path: Any, layout: Layout, sizes: Index, attributes: dict[str, Any], known: Known, resume: bool, same: bool
     ) -> EnsembleStore:
-        """Make the store of an ensemble, or, with `resume`, find the one that is there, with chunks of its own.
-
-        Raises
-        ------
-        ValueError
-            If there is one without `resume`, or one of something else.
-        StoreError
-            If it cannot be made.
-        """
+        """Make the store of an ensemble, or, with `resume`, find the one that is there, with chunks of its own."""
         if isinstance(path, bytes) or not isinstance(path, str | os.PathLike):
             raise TypeError(f"`store` must be the path of a folder; got {type(path).__name__}.")
         place = Path(os.path.abspath(os.fspath(path)))
@@ -124,13 +108,7 @@ class EnsembleStore:
         return tuple(start // size for (start, _), size in zip(block.ranges, self.sizes, strict=True))
 
     def write(self, block: Block, done: Done, y0: np.ndarray) -> None:
-        """Write the orbits of a block, their statuses last.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be written.
-        """
+        """Write the orbits of a block, their statuses last."""
         store, number = self._store, self._number(block)
         for v in self.layout.variables():
             values = v.of(done.fields[v.field], 1).reshape(*block.shape, *v.shape)
@@ -170,13 +148,7 @@ class EnsembleStore:
         return _Read(self)
 
     def read(self, field: str) -> np.ndarray:
-        """Return a field, NaN where orbits have not been run.
-
-        Raises
-        ------
-        StoreError
-            If what has been run is damaged, or not there.
-        """
+        """Return a field, NaN where orbits have not been run."""
         store = self._store
         for number in np.ndindex(*store.fields["status"].grid):
             if store.has("status", number) and (name := self._missing(number)):

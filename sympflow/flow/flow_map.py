@@ -45,7 +45,7 @@ def check_system(system: Any) -> None:
             "define one with HamiltonianSystem.from_sympy."
         )
     if system.functions_given:
-        system.check_functions(torch.empty(0, dtype=torch.float64) if system.takes_tensors else None)
+        system.check_functions(torch.empty(0, dtype=torch.float64) if system.definition.takes_tensors else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,8 @@ class FlowMap(KnownFlow, Shown, nn.Module):
     def hamiltonian(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.
 
-        That of a driven system is near H(t0 + t, x).
+        The sum over the layers of ∂_tV at the point pulled back through the layers after it (Canizares et al. 2024,
+        section 2.2), defined up to a function of t alone. That of a driven system is near H(t0 + t, x).
 
         Raises
         ------
@@ -191,29 +192,26 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         ValueError, TypeError
             If an argument has the wrong type, shape, dtype or device, t or t0 is not finite, or t0 is missing.
         """
-        t = self._checked_time(t, x)
-        self.warn_of_times(t)
-        self.warn_of_drive(t0, t)
-        x = self.lift(x, t0)
-        if isinstance(t, float):
-            return self.project(self._whole(whole_steps(abs(t), self.dt), t < 0, x))
-        k, r, back, x = self._split(t, x)
-        x = self._repeat(k * ~back, False, x)
-        x = self._repeat(k * back, True, x)
-        return self.project(self._remainder(r, back, x))
+        return self._continued(t, x, t0)
 
     def inverse(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """The exact inverse of ψ_t, for every t: arguments as for the call, x being at the time t0 + t."""
+        return self._continued(t, x, t0, inverse=True)
+
+    def _continued(self, t: Any, x: Tensor, t0: Any, inverse: bool = False) -> Tensor:
         t = self._checked_time(t, x)
         self.warn_of_times(t)
         self.warn_of_drive(t0, t)
-        x = self.lift(x, t0, t)
+        x = self.lift(x, t0, t if inverse else 0.0)
         if isinstance(t, float):
-            return self.project(self._whole(whole_steps(abs(t), self.dt), t >= 0, x, remainder_first=True))
-        k, r, back, x = self._split(t, x)
-        x = self._remainder(r, ~back, x)
-        x = self._repeat(k * ~back, True, x)
-        return self.project(self._repeat(k * back, False, x))
+            return self.project(self._whole(whole_steps(abs(t), self.dt), (t < 0) is not inverse, x, inverse))
+        k, r, negative, x = self._split(t, x)
+        back = negative ^ inverse
+        if inverse:
+            x = self._remainder(r, back, x)
+        for rows in (back, ~back) if inverse else (~back, back):
+            x = self._repeat(k * rows, rows is back, x)
+        return self.project(x if inverse else self._remainder(r, back, x))
 
     # the time as a coordinate -------------------------------------------------------------------------
 

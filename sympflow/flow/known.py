@@ -139,7 +139,7 @@ class KnownFlow:
                 "accurate. Fit one to the damped system by sympflow.train(system), or from these numbers by "
                 "sympflow.train(system, flow=flow.transferred(system))."
             )
-        if system.local is not None and system.local.has_piece and self.lattice_terms:
+        if system.local is not None and system.local.has_subsystem and self.lattice_terms:
             reason = _difference(self.lattice_terms, system.local.terms)
             damped = system.damping is not None or len(self.fingerprint or ()) > PROBES
             reason = reason or " (its friction is another)" * damped

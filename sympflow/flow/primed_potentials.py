@@ -48,7 +48,7 @@ class Sum:
 
 def _called(f: Callable[..., Array], system: HamiltonianSystem, q: Tensor, t: Tensor | None) -> Tensor:
     """f(q, t), by way of NumPy where the functions of the system take nothing else."""
-    if system.takes_tensors:
+    if system.definition.takes_tensors:
         return f(q, t)
     if q.requires_grad:
         raise TypeError(

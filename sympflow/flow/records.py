@@ -177,7 +177,7 @@ def read(path: Path) -> tuple[bytes, dict[str, Any], dict[str, Any], bool]:
             raise Refused("it is truncated")
         (length,) = struct.unpack("<Q", content)
         if length > MAX_HEADER:
-            raise Refused(f"it is no safetensors file, or its header is oversized ({length:,} bytes)")
+            raise Refused(f"it is not a safetensors file, or its header is oversized ({length:,} bytes)")
         content += file.read(length)
         if len(content) < 8 + length:
             raise Refused("it is truncated")

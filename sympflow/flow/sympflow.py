@@ -561,14 +561,6 @@ class SympFlow(FlowMap):
     def step_constants(self, x: Tensor, *t0: Tensor) -> Tensor:
         return self._opened(self._columns(0.0, self.lift(x, *t0))[1], 0.0)[0][self.ndof :]
 
-    def hamiltonian(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
-        """𝓗(ψ̄)(t, x), (...), for t ∈ [0, Δt]: the Hamiltonian of which ψ̄_t is the exact flow.
-
-        The sum over the layers of ∂_tV at the point pulled back through the layers after it (the recursion of [1]_,
-        section 2.2). It is defined up to a function of t alone.
-        """
-        return super().hamiltonian(t, x, t0)
-
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
         """`hamiltonian` without checks, for inner loops."""
         t, y, batch = self._columns(t, self.lift(x, t0, t))

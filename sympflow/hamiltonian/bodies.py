@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,10 +12,12 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import check_kept, plain, real_number
+from sympflow.arguments import check_kept, checked_count, checked_number, plain
 from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
+from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
-from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, named_values, parsed
+from sympflow.hamiltonian.poles import PairsPoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 MOST_AXES = 3
@@ -53,8 +54,8 @@ class PairsHamiltonian(LocalHamiltonian):
         params: Mapping[str, Any] | None,
         bodies: Mapping[str, Any] | None,
     ) -> None:
-        self.dim = _checked_dim(dim)
-        self.masses = _checked_column("masses", masses)
+        self.dim = checked_count("dim", plain(dim), 1, MOST_AXES, "1, 2 or 3, the coordinates of a body")
+        self.masses = checked_column("masses", masses)
         self._check_masses()
         self.n_bodies = len(self.masses)
         if self.n_bodies < 2:
@@ -68,10 +69,14 @@ class PairsHamiltonian(LocalHamiltonian):
                 f"`cutoff` {self.cutoff:g} is longer than half the box, {self.box.min() / 2:g}: a body would meet "
                 "another and its image. Take a shorter one, or a larger `box`."
             )
-        self.params = checked_params(params)
+        self._set_params(params)
         self._read(potential, {"m": self.masses, **self._checked_bodies(bodies)})
         mass = np.repeat(1 / self.inertia, self.dim)
         self.inverse_mass = None if (mass == 1).all() else mass
+
+    def _set_params(self, params: Any) -> None:
+        remedy = "; what differs from body to body goes to `bodies`"
+        self.params = {name: float(value) for name, value in checked_params(params, remedy=remedy).items()}
 
     def _check_masses(self) -> None:
         if not (self.masses > 0).all():
@@ -84,13 +89,9 @@ class PairsHamiltonian(LocalHamiltonian):
         return self.masses
 
     def _checked_bodies(self, bodies: Any) -> dict[str, np.ndarray]:
-        if not isinstance(bodies, Mapping | None):
-            raise TypeError(f"`bodies` must be a mapping of names to arrays; got {type(bodies).__name__}: pass a dict.")
         columns = {}
-        for name, given in (bodies or {}).items():
-            if not isinstance(name, str) or not name.isidentifier():
-                raise ValueError(f"`bodies` must have names as keys; got {name!r}.")
-            columns[name] = _checked_column(f"bodies[{name!r}]", given)
+        for name, given in named_values("bodies", bodies, "arrays").items():
+            columns[name] = checked_column(f"bodies[{name!r}]", given)
             if columns[name].shape != self.masses.shape:
                 raise ValueError(
                     f"`bodies` has {name} of {columns[name].size} values, and there are {self.n_bodies} `masses`: give "
@@ -132,7 +133,7 @@ class PairsHamiltonian(LocalHamiltonian):
         self.columns = np.array([x for x, is_used in zip(columns.values(), used, strict=True) if is_used])
         self.columns = self.columns.reshape(-1, self.n_bodies)
         self.c, self.constants = c, tuple(self.params.values())
-        self._written = V
+        self.of_distance = V
         V = V.subs(r, sp.sqrt(self.s))
         if self.cutoff is not None:
             end = sp.Symbol("end", positive=True)
@@ -147,8 +148,8 @@ class PairsHamiltonian(LocalHamiltonian):
         columns = [*self.columns, *self.columns, *self.params.values()]
         letters_of = (*self.first, *self.second, *self.c[: len(self.params)])
         names = dict(zip(self.c, self.params, strict=False))
-        distance = [s for s in self._written.free_symbols if s.name == "r"]
-        check_continuous("potential", self._written, distance, dict(zip(letters_of, columns, strict=True)), names)
+        distance = [s for s in self.of_distance.free_symbols if s.name == "r"]
+        check_continuous("potential", self.of_distance, distance, dict(zip(letters_of, columns, strict=True)), names)
 
     def identity_parts(self) -> Any:
         made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
@@ -156,11 +157,9 @@ class PairsHamiltonian(LocalHamiltonian):
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
-        other = copy.copy(self)
-        other.params = checked_params({**self.params, **values})
+        other = bare_copy(self)
+        other._set_params({**self.params, **values})
         other.constants = (*other.params.values(), *self.constants[len(self.params) :])
-        for name in ("bond_length", "written"):
-            vars(other).pop(name, None)
         other._check_continuous()
         return other
 
@@ -292,6 +291,30 @@ class PairsHamiltonian(LocalHamiltonian):
         return density[..., 0]
 
     @property
+    def on_a_line(self) -> bool:
+        """True of bodies that would pass through each other to change places, so that differences have signs."""
+        return self.dim == 1 and self.box is None and not self.softening
+
+    @cached_property
+    def poles(self) -> Poles | None:  # type: ignore[override]
+        return PairsPoles(self) or None
+
+    def met(self, q: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]]:
+        """The ends i, j (P,) of pairs, their distances, or differences on a line, (..., P), and values of letters."""
+        for pairs in self._pairs(q):
+            x = pairs.x[0][..., 0] if self.on_a_line else np.sqrt(pairs.s)
+            yield pairs.i, pairs.j, x, pairs.letters
+
+    def values_of(
+        self, key: str, expressions: list[sp.Expr], x: sp.Symbol, distances: np.ndarray, letters: list[Any]
+    ) -> list[Any]:
+        """The values of expressions in a distance and the letters of two bodies."""
+        names = (x, *self.first, *self.second, *self.c)
+        with np.errstate(all="ignore"):
+            values = self._values(f"potential {key}", lambda: expressions, names, distances, *letters)
+        return [np.broadcast_to(value, distances.shape) for value in values]
+
+    @property
     def leaps(self) -> bool:  # type: ignore[override]
         """Bodies may meet at r = 0 without softening."""
         return not self.softening and self.n_bodies > 1
@@ -412,11 +435,15 @@ class Pairs:
         self.local, self.i, self.j, self.x = local, i, j, x
         self.s = _dot(x[0], x[0]) + local.softening**2
 
+    @property
+    def letters(self) -> list[Any]:
+        """The values of the letters of V: (P,) of the bodies, and numbers."""
+        return [*(column[ends] for ends in (self.i, self.j) for column in self.local.columns), *self.local.constants]
+
     def values(self, k: int) -> Array:
         """2ᵏ times the k-th derivative of V by s, 0 beyond the cut-off: (..., P)."""
         local, s = self.local, self.s
-        columns = [column[ends] for ends in (self.i, self.j) for column in local.columns]
-        given = [like(x, s) for x in (*columns, *local.constants)]
+        given = [like(x, s) for x in self.letters]
         variables = (local.s, *local.first, *local.second, *local.c)
         with np.errstate(all="ignore"):  # bodies at one place
             value = local._values(f"potential {k}", lambda: [local.slopes[k]], variables, s, *given)[0] + 0 * s
@@ -452,14 +479,7 @@ def _added(out: Array, ends: np.ndarray, values: Array) -> Array:
     return out + sums.reshape(out.shape).astype(out.dtype)
 
 
-def _checked_dim(dim: Any) -> int:
-    dim = plain(dim)
-    if not isinstance(dim, int) or isinstance(dim, bool) or not 1 <= dim <= MOST_AXES:
-        raise ValueError(f"`dim` must be 1, 2 or 3, the coordinates of a body; got {dim!r}.")
-    return dim
-
-
-def _checked_column(name: str, values: Any) -> np.ndarray:
+def checked_column(name: str, values: Any) -> np.ndarray:
     check_kept(name, values)
     values = to_numpy(values) if is_tensor(values) else values
     check_memory(float(np.size(values)), f"`{name}`")
@@ -479,10 +499,8 @@ def _checked_length(name: str, value: Any) -> float | None:
     if value is None:
         return None
     check_kept(name, value)
-    value = plain(value)
-    if not real_number(value) or not 0 <= value < math.inf or (name == "cutoff" and value == 0):
-        raise ValueError(f"`{name}` must be a positive, finite length; got {value!r}.")
-    return float(value)
+    low = 0.0 if name == "softening" else math.ulp(0.0)
+    return float(checked_number(name, plain(value), "a positive, finite length", lambda x: low <= x < math.inf))
 
 
 def _checked_box(box: Any, dim: int) -> np.ndarray | None:
@@ -497,21 +515,3 @@ def _checked_box(box: Any, dim: int) -> np.ndarray | None:
     if not (np.isfinite(lengths) & (lengths > 0)).all():
         raise ValueError(f"`box` must have positive, finite lengths; got {box!r}.")
     return lengths
-
-
-def checked_params(params: Any) -> dict[str, float]:
-    if not isinstance(params, Mapping | None):
-        raise TypeError(f"`params` must be a mapping of names to numbers; got {type(params).__name__}: pass a dict.")
-    checked = {}
-    for name, given in (params or {}).items():
-        if not isinstance(name, str) or not name.isidentifier():
-            raise ValueError(f"`params` must have names as keys; got {name!r}.")
-        check_kept(f"params[{name!r}]", given)
-        value = plain(given)
-        if not real_number(value) or not math.isfinite(value):
-            raise ValueError(
-                f"`params` has {name} = {reprlib.repr(given)}: give a finite real number; what differs from body to "
-                "body goes to `bodies`."
-            )
-        checked[name] = float(value)
-    return checked

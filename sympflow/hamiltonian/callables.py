@@ -15,6 +15,7 @@ from sympflow.arguments import check_flag
 from sympflow.arrays import (
     Array,
     as_tensor,
+    beside,
     concatenate,
     differentiable,
     is_tensor,
@@ -29,7 +30,7 @@ from sympflow.arrays import (
 )
 from sympflow.compiler.tracing import WEIGHTS, Untraceable, trace, trace_chain
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.formulas import TracedHamiltonian
+from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedPoles
 from sympflow.hamiltonian.function_checks import Tested, check_writes, probe_states, test
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.hamiltonian.times import probe_times
@@ -144,6 +145,10 @@ class CallableHamiltonian(Definition):
         self._known = states[0], 0.0, np.nan
         return found
 
+    @cached_property
+    def poles(self) -> TracedPoles | None:  # type: ignore[override]
+        return None if self.form is None else TracedPoles(self.form) or None
+
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]
         *_, gradient, product = self._functions
@@ -237,7 +242,7 @@ class CallableHamiltonian(Definition):
             try:
                 given = zip(q, times, *more, strict=True)
                 rows = [self._single(function, x, t, *v) for x, t, *v in given]
-                found = np.stack([to_numpy(row) if is_tensor(row) else np.asarray(row, dtype=float) for row in rows])
+                found = np.stack([to_numpy(row).astype(float) for row in rows])
             except Exception as error:  # whatever a user's function raises
                 raise Untraceable(f"`{name}` fails where `{self._name}` does not ({error})") from error
             if found.shape != exact.shape or not _alike(found, exact):
@@ -284,13 +289,7 @@ class CallableHamiltonian(Definition):
                 return False
         return _alike(found, self.form.gradient(state, *times))
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the program, which is traced again."""
-        return {
-            name: value
-            for name, value in vars(self).items()
-            if name not in ("form", "takes_tensors", "_follows_tensors")
-        }
+    _generated = ("form", "poles", "takes_tensors", "_follows_tensors")
 
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None or (self.form is not None and self.library == "numpy"):
@@ -308,6 +307,8 @@ class CallableHamiltonian(Definition):
 
     def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
         """Test them against each other at states (n, 2d) in the library and dtype of `like`: see `function_checks`."""
+        if self.form is not None:
+            self.form.check_continuous(self._name)
         if self.form is not None and self.library == "numpy":
             like = np.empty(0) if is_tensor(like) or self._gradient is None else like
         elif self.differentiates_itself and not is_tensor(like):
@@ -546,13 +547,13 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
     if tensor._version != version:
         raise ValueError(f"`{name}` writes into its argument, the state of the run: let it work on a copy, q.clone().")
     value = _checked(value, tensor, name, tail)
-    return value if is_tensor(x) else to_numpy(value)
+    return of_library(value, x)
 
 
 def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
     """Return the user's result for x, checked: real numbers of the right shape, in the library and dtype of x."""
-    expected = (*x.shape[:-1], *tail)
-    if isinstance(value, int | float) and not is_tensor(x):
+    expected, tensor = (*x.shape[:-1], *tail), is_tensor(x)
+    if isinstance(value, int | float) and not tensor:
         value = np.asarray(value)
     shape = getattr(value, "shape", None)
     if shape is None or tuple(shape) != expected:
@@ -560,19 +561,15 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
             f"`{name}` must return shape {expected} for a state part of shape {tuple(x.shape)}; got "
             f"{type(value).__name__ if shape is None else tuple(shape)}. Reduce over the last axis only."
         )
-    if is_tensor(value) != is_tensor(x):
-        given, got = ("a torch tensor", "NumPy's") if is_tensor(x) else ("a NumPy array", "torch's")
+    if is_tensor(value) != tensor:
+        given, got = ("a torch tensor", "NumPy's") if tensor else ("a NumPy array", "torch's")
         raise TypeError(
             f"`{name}` must return an array of the library that it is given, {given}; got one of {got}. Write it for "
             "both, leave `gradient` out, or take a method that runs on the other, such as 'rk45' or 'dopri5'."
         )
-    if is_tensor(value):
-        if value.is_complex():
-            raise TypeError(f"`{name}` must return real numbers; got {value.dtype}. Take the real part.")
-        return value.to(x.dtype)
-    if value.dtype.kind not in "fiub":
+    if value.is_complex() if tensor else value.dtype.kind not in "fiub":
         raise TypeError(f"`{name}` must return real numbers; got {value.dtype}. Take the real part.")
-    return value.astype(x.dtype, copy=False)
+    return value.to(x.dtype) if tensor else value.astype(x.dtype, copy=False)
 
 
 _ARGUMENTS = {"potential": "q", "hamiltonian": "q, p", "gradient": "q", "hessian_vector": "q, v"}
@@ -588,9 +585,9 @@ class _OverTimes:
         if not getattr(t, "ndim", 0):
             return self._at(t, *states)
         flat, times = [x.reshape(-1, x.shape[-1]) for x in states], t.reshape(-1)
+        if (found := values(times)) is not None and (found == found[..., :1]).all():
+            return self._at(times[0], *states)
         if is_tensor(times):
-            if (found := values(times)) is not None and (found == found[..., :1]).all():
-                return self._at(times[0], *states)
             each = [self._at(s, *(x[i] for x in flat)) for i, s in enumerate(times)]
             return stack(each, axis=0).reshape(*t.shape, *each[0].shape)
         distinct, which = np.unique(times, return_inverse=True)
@@ -603,11 +600,7 @@ class _OverTimes:
         return result.reshape(*t.shape, *result.shape[1:])
 
     def _at(self, t: Any, *states: Array) -> Any:
-        if is_tensor(states[0]):
-            import torch
-
-            t = torch.as_tensor(t, dtype=torch.float64, device=states[0].device)
-        return self.function(t if is_tensor(states[0]) else float(t), *states)
+        return self.function(beside(t, states[0]) if is_tensor(states[0]) else float(t), *states)
 
 
 def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:

@@ -7,7 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, stack, values
+from sympflow.arrays import (
+    Array,
+    beside,
+    concatenate,
+    detached,
+    is_tensor,
+    library,
+    like,
+    per_state,
+    stack,
+    values,
+)
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 
@@ -35,11 +46,7 @@ def stage_times(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, h
         return None
     nodes, batch = stage_nodes(tableau), y.shape[:-1]
     times = [stage_time(t, c, h) for c in nodes]
-    if is_tensor(y):
-        import torch
-
-        times = [torch.as_tensor(s, dtype=torch.float64, device=y.device).expand(batch) for s in times]
-    return stack(times if is_tensor(y) else [np.broadcast_to(s, batch) for s in times], axis=-1)
+    return stack([library(y).broadcast_to(beside(s, y), batch) for s in times], axis=-1)
 
 
 def advanced(system: HamiltonianSystem, tableau: Tableau, y: Array, K: Array, h: Any) -> Array:
@@ -52,38 +59,19 @@ def advanced(system: HamiltonianSystem, tableau: Tableau, y: Array, K: Array, h:
 
 
 def stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times: Any) -> tuple[Array, int]:
-    """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states."""
-    if is_tensor(y):
-        return _tensor_stages(system, tableau, y, h, times)
-    A, _, scale = (np.array(c, dtype=y.dtype) for c in tableau)
-    eps = float(np.finfo(y.dtype).eps)
-    K = np.zeros((*y.shape[:-1], len(A), y.shape[-1]), dtype=y.dtype)
-    done = np.zeros(y.shape[:-1], dtype=bool)
-    before = np.full(y.shape[:-1], np.inf)
-    iteration = 0
-    with np.errstate(all="ignore"):
-        while not done.all() and iteration < MOST_ITERATIONS:
-            iteration += 1
-            M, residual = _equations(system, y, K, h, times, A, scale)
-            change = solved(M, residual[..., None], variable_sizes(y, K, residual))[..., 0].reshape(K.shape)
-            K = np.where(done[..., None, None], K, K - change)
-            size = _relative_size(change, y, K, system.ndof)
-            small = (size <= eps**0.7) | ((size <= eps**0.57) & (size >= before / 2))
-            lost = ~(size < np.inf) & ~done
-            K[lost] = np.nan
-            done, before = done | small | lost, size
-    K[~done] = np.nan
-    return K, iteration * done.size
+    """The K (..., s, 2d) of a step, NaN where the step was not solved; and the iterations, over all states.
 
-
-def _tensor_stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times: Any) -> tuple[Array, int]:
-    """`stages` of tensors: solved without a graph, then three more iterations in it, which give it derivatives."""
+    Of tensors they are solved without a graph, then by three more iterations in it, which give them derivatives.
+    """
+    A, _, scale = (like(c, y) for c in tableau)
+    if not is_tensor(y):
+        with np.errstate(all="ignore"):
+            return _solved_stages(system, y, h, times, A, scale)
     import torch
 
-    A, _, scale = (torch.as_tensor(c, dtype=y.dtype, device=y.device) for c in tableau)
     with torch.no_grad():
-        start, length = y.detach(), h.detach() if is_tensor(h) else h
-        K, iterations = _solved_tensors(system, start, length, times, A, scale)
+        start, length = y.detach(), detached(h)
+        K, iterations = _solved_stages(system, start, length, times, A, scale)
         M, _ = newton_matrix(system, start[..., None, :] + A @ K, length, times, A, scale)
         sizes = variable_sizes(start, K, 0 * M[..., 0])
         inverse = sizes[..., :, None] * torch.linalg.inv_ex(_scaled(M, sizes))[0] / sizes[..., None, :]
@@ -92,29 +80,27 @@ def _tensor_stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any
     return K, iterations
 
 
-def _solved_tensors(system: HamiltonianSystem, y: Any, h: Any, times: Any, A: Any, scale: Any) -> tuple[Any, int]:
-    """The K of `stages` for tensors, by the same iteration, and its count over all states."""
-    import torch
-
-    eps = torch.finfo(y.dtype).eps
-    K = y[..., None, :] * torch.zeros_like(A[:, :1])
-    before = y[..., 0] * 0 + torch.inf
+def _solved_stages(
+    system: HamiltonianSystem, y: Array, h: Any, times: Any, A: Array, scale: Array
+) -> tuple[Array, int]:
+    """The K of `stages` by Newton's iteration, until it is at rounding in every state, and its count over all."""
+    xp, eps = library(y), float(library(y).finfo(y.dtype).eps)
+    K = y[..., None, :] * xp.zeros_like(A[:, :1])
+    before = y[..., 0] * 0 + xp.inf
     done = before < 0
     for iteration in range(1, MOST_ITERATIONS + 1):
         M, residual = _equations(system, y, K, h, times, A, scale)
-        sizes = variable_sizes(y, K, residual)
-        change = torch.linalg.solve_ex(_scaled(M, sizes), (residual / sizes)[..., None])[0][..., 0] * sizes
-        change = change.reshape(K.shape)
-        K = torch.where(done[..., None, None], K, K - change)
+        change = solved(M, residual[..., None], variable_sizes(y, K, residual))[..., 0].reshape(K.shape)
+        K = xp.where(done[..., None, None], K, K - change)
         size = _relative_size(change, y, K, system.ndof)
         small = (size <= eps**0.7) | ((size <= eps**0.57) & (size >= before / 2))
-        lost = ~(size < torch.inf) & ~done
-        K = torch.where(lost[..., None, None], torch.nan, K)
+        lost = ~(size < xp.inf) & ~done
+        K = xp.where(lost[..., None, None], xp.nan, K)
         done, before = done | small | lost, size
         found = values(done)
         if iteration == TRACED_ITERATIONS if found is None else found.all():
             break
-    return torch.where(done[..., None, None], K, torch.nan), iteration * done.numel()
+    return xp.where(done[..., None, None], K, xp.nan), iteration * math.prod(done.shape)
 
 
 def stage_nodes(tableau: Tableau) -> tuple[float, ...]:
@@ -196,9 +182,11 @@ def _scaled(M: Array, sizes: Array) -> Array:
     return M * (sizes[..., None, :] / sizes[..., :, None])
 
 
-def solved(M: np.ndarray, x: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """M⁻¹x by elimination in units of the sizes of the unknowns, NaN where M is singular."""
+def solved(M: Array, x: Array, sizes: Array) -> Array:
+    """M⁻¹x by elimination in units of the sizes of the unknowns; of arrays NaN where M is singular."""
     M, x = _scaled(M, sizes), x / sizes[..., None]
+    if is_tensor(M):
+        return library(M).linalg.solve_ex(M, x)[0] * sizes[..., None]
     try:
         return np.linalg.solve(M, x) * sizes[..., None]
     except np.linalg.LinAlgError:

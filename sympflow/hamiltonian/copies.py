@@ -52,7 +52,7 @@ class FunctionsOfCopies:
 
     def __init__(self, system: HamiltonianSystem, first: bool) -> None:
         self.system, self.first, self.ndof = system, first, 2 * system.ndof
-        self.timed = not system.autonomous
+        self.timed = system.definition.timed
 
     def hamiltonian(self, x: Array, *t: Any) -> Array:
         return self.system.hamiltonian(self._state(x), *t)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
+from functools import cached_property
 from math import inf
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +14,14 @@ from sympflow.arrays import Array
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.poles import Poles
+
+
+def bare_copy(x: Any) -> Any:
+    """Return a copy of an object without what was found out of it, its cached properties."""
+    other = copy.copy(x)
+    for name in [name for name in vars(other) if isinstance(getattr(type(x), name, None), cached_property)]:
+        del vars(other)[name]
+    return other
 
 
 class Definition:
@@ -24,6 +35,7 @@ class Definition:
 
     ndof: int
     separable: bool
+    symbols: Any = None  # the definition itself, if it is a SymbolicHamiltonian
     numba_functions: tuple[Any, Any, Any] | None = None  # V, gradient, hessian_vector
     differentiates_itself: bool = False  # by torch alone, in which the functions are written
     has_hessian_vector: bool = True  # of arrays: not where a gradient was given without it
@@ -42,6 +54,11 @@ class Definition:
     untraced: str = ""  # the reason for which they could not, a clause, known after `form`
     given_functions: bool = False  # of Python, which are traced where that is possible
     instead: str = "an implicit method such as 'gauss_legendre6', or a Runge–Kutta method"
+
+    _generated: tuple[str, ...] = ("_functions",)  # what cannot be pickled, and is made again
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in self._generated}
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
         """The times (n,) between two others at which H is known to jump; `step` as of `Hamiltonian.jump_times`."""
@@ -66,7 +83,7 @@ class Definition:
     def check_unchanged(self) -> None:
         """Raise a ValueError if a function has another value than when it was traced."""
 
-    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
+    def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
         """Test the functions of a user at states (n, 2d): see `sympflow.hamiltonian.function_checks`."""
 
     def learns(self, y: Array) -> bool:

@@ -258,7 +258,7 @@ def domain_of(domain: Domain, system: Hamiltonian) -> Domain:
 def remedy_for(system: Hamiltonian) -> str:
     """Domains that a system of which none is known may be given, as code."""
     local = system.local
-    own = ["LatticeStates(density)"] if local is not None and local.has_piece else []
+    own = ["LatticeStates(density)"] if local is not None and local.has_subsystem else []
     names = [*own, "Box(low, high)", "Ball(center, radius)", "EnergySublevel(energy, box)"]
     return ", ".join(f"sympflow.{name}" for name in names[:-1]) + f" or sympflow.{names[-1]}"
 
@@ -271,25 +271,15 @@ def domain_from_dict(description: dict[str, Any]) -> Ball | Box | EnergySublevel
     ValueError
         If the description is not one of a known domain.
     """
+    kinds: dict[str, Any] = {kind.__name__: kind for kind in (Ball, Box, EnergySublevel, LatticeStates, Tube)}
     try:
-        fields = {k: v for k, v in description.items() if k != "kind"}
-        match description["kind"]:
-            case "Ball":
-                return Ball(**_numbers(fields))
-            case "Box":
-                return Box(**_numbers(fields))
-            case "EnergySublevel":
-                box = domain_from_dict(fields.pop("box"))
-                if not isinstance(box, Box):
-                    raise ValueError(f"the box of an EnergySublevel is a {type(box).__name__}")
-                return EnergySublevel(box=box, **_numbers(fields))
-            case "LatticeStates":
-                return LatticeStates(**_numbers(fields))
-            case "Tube":
-                return Tube(**_numbers(fields))
+        fields = {k: v for k, v in description.items() if k not in ("kind", "box")}
+        box = {"box": domain_from_dict(description["box"])} if "box" in description else {}
+        if (kind := description["kind"]) in kinds:
+            return kinds[kind](**box, **_numbers(fields))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"`description` is not a domain: {error}.") from error
-    raise ValueError(f"`description` is of an unknown kind of domain: {description['kind']!r}.")
+    raise ValueError(f"`description` is of an unknown kind of domain: {kind!r}.")
 
 
 def _numbers(fields: dict[str, Any]) -> dict[str, Any]:

@@ -207,7 +207,7 @@ def _floats(values: Any, ndim: int) -> np.ndarray:
         raise ValueError("its numbers are not in lists")
     for v in (v for row in rows for v in row):
         if v is not None and (isinstance(v, bool) or not isinstance(v, int | float)):
-            raise ValueError(f"it has {v!r}, which is no number")
+            raise ValueError(f"it has {v!r}, which is not a number")
     try:
         return np.array([np.nan if v is None else v for v in values] if ndim == 1 else values, dtype=float)
     except (ValueError, OverflowError, TypeError):
@@ -244,9 +244,7 @@ def _read(expression: str | None, ndof: int) -> Hamiltonian | None:
             continue
     if symbols is None:
         return None
-    system = Hamiltonian("", symbols, None, False)
-    system.symbols = symbols
-    return system if system.ndof == ndof else None
+    return Hamiltonian("", symbols, None, False) if symbols.ndof == ndof else None
 
 
 def _spread_states(system: Hamiltonian, domain: Domain, seed: int) -> np.ndarray:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy as sp
 
-from sympflow.arrays import Array, assemble, library_name
+from sympflow.arrays import Array, concatenate
 from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
 from sympflow.hamiltonian.jumps import refuse_deltas
-from sympflow.hamiltonian.symbolic import checked_params, generate, printable
+from sympflow.hamiltonian.symbolic import checked_params, exact, printable
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -28,6 +27,7 @@ class SymbolicForce:
         symbols = system.symbols
         assert symbols is not None
         self.q, self.p, self.time = symbols.q, symbols.p, symbols.time
+        self.form = symbols.like(symbols.H)  # with functions of its own
         d = system.ndof
         several = isinstance(force, Sequence | np.ndarray | sp.MatrixBase) and not isinstance(force, str)
         written = list(force) if several else [force]
@@ -47,7 +47,7 @@ class SymbolicForce:
     def _valued(self, f: sp.Expr, values: Mapping[str, float]) -> sp.Expr:
         """The expression in the system's coordinates, its parameters replaced by their values."""
         d = len(self.q)
-        known: dict[sp.Symbol, sp.Expr] = {sp.Symbol(name, real=True): _number(value) for name, value in values.items()}
+        known: dict[sp.Symbol, sp.Expr] = {sp.Symbol(name, real=True): exact(value) for name, value in values.items()}
         if d == 1:
             known |= {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
         f = f.xreplace(known)
@@ -67,28 +67,12 @@ class SymbolicForce:
         return f
 
     def __call__(self, q: Array, p: Array, *t: Any) -> Array:
-        return self._evaluated(self.expressions, q, p, *t)
+        return self.form.evaluated("force", self.expressions)(concatenate([q, p]), *t)
 
     def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         x = (*self.q, *self.p)
-        flat = self._evaluated([sp.diff(f, s) for f in self.expressions for s in x], q, p, *t)
-        return flat.reshape(*p.shape, len(x))
-
-    def _evaluated(self, expressions: list[sp.Expr], q: Array, p: Array, *t: Any) -> Array:
-        key = len(expressions), library_name(p)
-        times = () if self.time is None else (self.time,)
-        if key not in self._functions:
-            self._functions[key] = generate([printable(f) for f in expressions], (*self.q, *self.p, *times), key[1])
-        columns = [each[..., i] for each in (q, p) for i in range(p.shape[-1])]
-        return assemble(self._functions[key](*columns, *t), columns[0])
-
-    @cached_property
-    def _functions(self) -> dict[tuple[int, str], Any]:
-        return {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the generated functions, which cannot be pickled and are generated again."""
-        return {name: value for name, value in vars(self).items() if name != "_functions"}
+        slopes = [sp.diff(f, s) for f in self.expressions for s in x]
+        return self.form.evaluated("force 1", slopes)(concatenate([q, p]), *t).reshape(*p.shape, len(x))
 
     @property
     def has_potential(self) -> bool:
@@ -109,14 +93,10 @@ def doubled_hamiltonian(system: HamiltonianSystem, force: SymbolicForce) -> sp.E
     mean = dict(zip((*symbols.q, *symbols.p), (*q[:d], *p[d:]), strict=True))
     terms = []
     for i, F in enumerate(force.expressions):
-        drag = sp.Add(*[_number(g) * s for g, s in zip(G[i], symbols.p, strict=True) if g])
+        drag = sp.Add(*[exact(g) * s for g, s in zip(G[i], symbols.p, strict=True) if g])
         terms.append(p[i] * sp.diff(symbols.H, symbols.p[i]).xreplace(mean))
         terms.append(q[d + i] * (sp.diff(symbols.H, symbols.q[i]) + drag - F).xreplace(mean))
     return printable(sp.Add(*terms))
-
-
-def _number(x: float) -> sp.Expr:
-    return sp.Integer(int(x)) if float(x).is_integer() else sp.Float(x)
 
 
 def _read(f: Any, names: Mapping[str, float]) -> sp.Expr:

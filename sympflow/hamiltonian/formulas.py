@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,9 +22,24 @@ from sympflow.compiler.program import Program, Recording, Traced, gradient, tang
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["Formula", "Letter", "TracedDriving", "TracedHamiltonian", "TracedLetters", "evaluator", "recorded"]
+__all__ = [
+    "Formula",
+    "Letter",
+    "TracedDriving",
+    "TracedHamiltonian",
+    "TracedLetters",
+    "TracedPoles",
+    "evaluator",
+    "recorded",
+]
 
 MOST_IN_SYMBOLS = 300  # operations
+_JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}
+_SINGULAR = {"div": 1} | dict.fromkeys(
+    ("pow", "log", "log1p", "tan", "sqrt", "acos", "asin", "acosh", "atanh", "gamma", "lgamma", "digamma", "ellipk"), 0
+)
+"""The argument by which an operation is infinite or no number."""
+_AS_THEIR_ARGUMENTS = {"abs", "neg", "sqrt", "pow", "mul", "times"}
 _POLYNOMIAL = {"add", "sub", "mul", "times", "neg", "fma"}
 
 
@@ -133,6 +149,17 @@ class TracedHamiltonian:
     def parametric(self) -> TracedHamiltonian:
         return self
 
+    def check_continuous(self, argument: str) -> None:
+        """Refuse a function that jumps in q or p."""
+        if not any(x.name in _JUMPING for x in self.program.operations) or len(self.program) > MOST_IN_SYMBOLS:
+            return
+        from sympflow.hamiltonian.jumps import check_continuous
+        from sympflow.hamiltonian.recorded import NotRecorded, in_symbols
+
+        with suppress(NotRecorded):
+            f = in_symbols(self.program)
+            check_continuous(argument, f, [s for s in f.free_symbols if self.time is None or s.name != self.time.name])
+
     @cached_property
     def written(self) -> SymbolicHamiltonian | None:
         """The same in symbols, for methods that look for parts of H; None of a long one."""
@@ -234,6 +261,79 @@ class TracedHamiltonian:
         with np.errstate(all="ignore"):
             values = program(*t[: self.time is not None], *columns)
         return assemble(values, sum(columns[:: max(x.shape[-1], 1)]) if more else columns[0])
+
+
+class TracedPoles:
+    """The places of H as it was traced: divisors and the like, and once a run may have passed one, those in symbols."""
+
+    cancelling: Sequence[Any] = ()
+    watched = True
+
+    def __init__(self, form: TracedHamiltonian) -> None:
+        self._form, program = form, form.H.program
+        inputs, self._vanishing = program.inputs[form.time is not None :], dict[int, Traced]()
+        for x in program.operations:
+            if x.name in _SINGULAR and not (x.name == "pow" and _is_whole(x.args[1])):
+                self._add(x.args[_SINGULAR[x.name]])
+        if self._vanishing:
+            H = program.outputs[0]
+            T: Any = 0.0
+            for x, slope in zip(
+                inputs[form.separable * form.ndof :], gradient(H, inputs)[form.separable * form.ndof :], strict=True
+            ):
+                T = T + abs(x * slope)
+            cells = [apply("sign", g) for g in self._vanishing.values()]
+            self._program = Program(program.inputs, [*cells, H, T])
+
+    def __bool__(self) -> bool:
+        return bool(self._vanishing)
+
+    def _add(self, g: Any) -> None:
+        """Add what changes its sign where a divisor vanishes."""
+        if isinstance(g, Traced):
+            if g.name in _AS_THEIR_ARGUMENTS:
+                for x in g.args:
+                    self._add(x)
+            elif _least(g) < POSITIVE:
+                self._vanishing[g.order] = g
+
+    def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        times = () if self._form.time is None else (np.broadcast_to(t, y.shape[:-1]),)
+        found = self._program(*times, *np.moveaxis(y, -1, 0))
+        values = np.stack([np.broadcast_to(x, y.shape[:-1]) for x in found], axis=-1)
+        return values[..., :-2], values[..., -2], values[..., -1]
+
+    @property
+    def exact(self) -> Any:
+        """The places in symbols, None if they cannot be written."""
+        return self._form.written and self._form.written.poles
+
+
+def _is_whole(x: Any) -> bool:
+    return isinstance(x, float) and x >= 0 and x % 1 == 0
+
+
+POSITIVE, NOT_NEGATIVE, ANY = 2, 1, 0
+
+
+def _least(x: Any) -> int:
+    """The sign that a number has whatever the letters are, as 1 + q² has."""
+    if isinstance(x, float):
+        return POSITIVE if x > 0 else NOT_NEGATIVE if x == 0 else ANY
+    if x.name in ("exp", "cosh"):
+        return POSITIVE
+    if x.name == "abs" or (x.name == "pow" and _is_whole(x.args[1]) and x.args[1] % 2 == 0):
+        return max(NOT_NEGATIVE, _least(x.args[0]))
+    if x.name in ("sqrt", "pow"):
+        return _least(x.args[0])
+    signs = [_least(a) for a in x.args[:2]] if x.name in ("mul", "times", "div", "fma", "add") else [ANY]
+    sign = max(signs) if x.name == "add" and min(signs) else min(signs)
+    if x.name != "add" and len(signs) > 1 and x.args[0] is x.args[1]:
+        sign = max(NOT_NEGATIVE, sign)
+    if x.name == "fma":
+        other = _least(x.args[2])
+        sign = max(sign, other) if min(sign, other) else ANY
+    return sign
 
 
 class TracedDriving:

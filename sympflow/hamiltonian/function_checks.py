@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, one_lane
+from sympflow.arrays import Array, like, one_lane
 from sympflow.hamiltonian.domain import Domain
 
 SPREAD = 0.05
@@ -94,10 +94,10 @@ class Tested:
     time: float | None = None
 
 
-def test(functions: Tested, states: np.ndarray, like: Array, n_given: int) -> None:
-    """Test the functions at states (N, n), in the library and dtype of `like`; `n_given` must be in their domain."""
+def test(functions: Tested, states: np.ndarray, example: Array, n_given: int) -> None:
+    """Test the functions at states (N, n), in the library and dtype of `example`; `n_given` must be in their domain."""
     with np.errstate(all="ignore"):
-        kept = _evaluated(functions, as_like(states, like), n_given)
+        kept = _evaluated(functions, like(states, example), n_given)
         if kept is None:
             return
         x, V, g = kept
@@ -108,15 +108,6 @@ def test(functions: Tested, states: np.ndarray, like: Array, n_given: int) -> No
             _check_gradient(functions, x, V, g)
         if functions.hessian_vector is not None:
             _check_hessian_vector(functions, x, g)
-
-
-def as_like(states: np.ndarray, like: Array) -> Array:
-    """Return states in the library, dtype and on the device of `like`."""
-    if not is_tensor(like):
-        return states.astype(like.dtype)
-    import torch
-
-    return torch.as_tensor(states, dtype=like.dtype, device=like.device)
 
 
 def _precision(x: Array) -> np.dtype:
@@ -159,13 +150,14 @@ def _check_types(functions: Tested, x: Array) -> None:
             )
 
 
+def _given(functions: Tested, V: np.ndarray, g: np.ndarray) -> list[tuple[str, Callable[[Array], Array], np.ndarray]]:
+    """The names of the value and of the gradient, where it is one to be tested, and their values at single states."""
+    rows = zip(functions.names, (functions.value, functions.gradient), (V, g), strict=False)
+    return [(name, function, values) for name, function, values in rows if function is not None]
+
+
 def _check_repetition(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
-    for name, function, before in (
-        (functions.names[0], functions.value, V[0]),
-        (functions.names[1], functions.gradient, g[0]),
-    ):
-        if function is None:
-            continue
+    for name, function, (before, *_) in _given(functions, V, g):
         again = _numbers(function(x[0]))
         if not np.allclose(again, before, rtol=1e-6, atol=1e-12 * np.abs(before).max(), equal_nan=True):
             raise ValueError(
@@ -178,29 +170,28 @@ def _check_batches(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) ->
     """In a square batch, d states of d components, a transposed result has the right shape."""
     n = x.shape[-1]
     rows = np.arange(n if 2 <= n <= EVERY_COMPONENT else 3) % len(x)
-    tolerance = 1e-7 if _precision(x) == np.float64 else 1e-3
-    for name, function, single in (
-        (functions.names[0], functions.value, V),
-        (functions.names[1], functions.gradient, g),
-    ):
-        if function is None:
-            continue
-        batch, expected = _numbers(function(x[rows])), single[rows]
-        if batch.shape != expected.shape:
-            raise ValueError(
-                f"`{name}` must return shape {expected.shape} for a batch of shape {tuple(x[rows].shape)}; got "
-                f"{batch.shape}. Write it for states on the last axis, q[..., 0] in place of q[0]; {REMEDY}"
-            )
-        size = np.abs(expected).max(axis=tuple(range(1, expected.ndim)), keepdims=True)
-        wrong = ~(np.abs(batch - expected) <= tolerance * size + 1e-300)
-        if wrong.any():
-            i = tuple(np.argwhere(wrong)[0].tolist())
-            part = f"component {i[1]} of its result" if len(i) == 2 else "its result"
-            raise ValueError(
-                f"`{name}` gives a batch other values than single states: {part} at {_shown(functions, x[rows][i[0]])}"
-                f" is {expected[i]:g} alone, {batch[i]:g} in a batch of shape {tuple(x[rows].shape)}. Write it for "
-                f"states on the last axis, q[..., 0] in place of q[0]; {REMEDY}"
-            )
+    for name, function, single in _given(functions, V, g):
+        _check_batch(functions, name, x[rows], single[rows], _numbers(function(x[rows])))
+
+
+def _check_batch(functions: Tested, name: str, x: Array, single: np.ndarray, batch: np.ndarray) -> None:
+    """Refuse values for a batch of states that are not those for each of them."""
+    if batch.shape != single.shape:
+        raise ValueError(
+            f"`{name}` must return shape {single.shape} for a batch of shape {tuple(x.shape)}; got {batch.shape}. "
+            f"Write it for states on the last axis, q[..., 0] in place of q[0]; {REMEDY}"
+        )
+    size = np.abs(single).max(axis=tuple(range(1, single.ndim)), keepdims=True)
+    tolerance = (1e-7 if _precision(x) == np.float64 else 1e-3) * size + 1e-300
+    wrong = ~(np.abs(batch - single) <= tolerance) & np.isfinite(single)
+    if wrong.any():
+        i = tuple(np.argwhere(wrong)[0].tolist())
+        part = f"component {i[1]} of its result" if len(i) == 2 else "its result"
+        raise ValueError(
+            f"`{name}` gives a batch other values than single states: {part} at {_shown(functions, x[i[0]])} is "
+            f"{single[i]:g} alone, {batch[i]:g} in a batch of shape {tuple(x.shape)}. Write it for states on the last "
+            f"axis, q[..., 0] in place of q[0]; {REMEDY}"
+        )
 
 
 def _directions(x: np.ndarray, chosen: Sequence[int] | None, parts: int, own: bool = False) -> np.ndarray:
@@ -247,7 +238,7 @@ def _differences(
     at = _numbers(x)[:, None, :]
     lengths = np.array([h, -h, 2 * eps, -2 * eps, 4 * eps, 0.0]).reshape(-1, 1, 1, 1)
     states = at + lengths * w
-    values = _values(function, as_like(states.reshape(-1, x.shape[-1]), x))
+    values = _values(function, like(states.reshape(-1, x.shape[-1]), x))
     values = values.reshape(*states.shape[:-1], *values.shape[1:])
     up, down, *near, here = values
     rounding = np.max([np.abs(v - here) for v in near], axis=0) + 4 * eps * np.abs(here)
@@ -324,52 +315,34 @@ def _refuse(functions: Tested, state: Array, k: int, given: float, found: float,
 def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
     assert functions.hessian_vector is not None
     assert functions.gradient is not None
-    v = _vectors(x)
-    claimed = _products(functions, x, v)
-    batch = _numbers(functions.hessian_vector(x, as_like(v, x)))
     name = "hessian_vector"
-    if claimed.shape != g.shape or batch.shape != g.shape:
-        got = claimed.shape[1:] if claimed.shape != g.shape else batch.shape
-        expected = g.shape[1:] if claimed.shape != g.shape else g.shape
+    v, claimed = _products(functions, x, own=False)
+    if claimed.shape != g.shape:
         raise ValueError(
-            f"`{name}` must return shape {expected}, that of its arguments; got {got}. Write it for states on the last "
-            f"axis; {REMEDY}"
+            f"`{name}` must return shape {g.shape[1:]}, that of its arguments; got {claimed.shape[1:]}. Write it for "
+            f"states on the last axis; {REMEDY}"
         )
+    _check_batch(functions, name, x, claimed, _numbers(functions.hessian_vector(x, like(v, x))))
     wrong, found = _certainly_wrong(functions.gradient, x, v[:, None], claimed[:, None])
     if wrong.any():  # a small component may have a scale of its own
-        v = _vectors(x, own=True)
-        again = _products(functions, x, v)
-        still, found = _certainly_wrong(functions.gradient, x, v[:, None], again[:, None])
+        v, claimed = _products(functions, x, own=True)
+        still, found = _certainly_wrong(functions.gradient, x, v[:, None], claimed[:, None])
         wrong &= still
     if wrong.any():
         i, _, k = np.argwhere(wrong)[0].tolist()
         raise ValueError(
             f"`{name}` is not the derivative of `{functions.names[1]}`: at {_shown(functions, x[i])}, along v = "
-            f"{_short(v[i])}, its component {k} is {again[i, k]:g}, but the gradient grows by "
+            f"{_short(v[i])}, its component {k} is {claimed[i, k]:g}, but the gradient grows by "
             f"{found[i, 0, k]:g}, by differences. Correct one of them; {REMEDY}"
         )
-    size = np.abs(claimed).max(-1, keepdims=True)
-    apart = ~(np.abs(batch - claimed) <= (1e-7 if _precision(x) == np.float64 else 1e-3) * size + 1e-300)
-    apart &= np.isfinite(claimed)
-    if apart.any():
-        i, k = np.argwhere(apart)[0].tolist()
-        raise ValueError(
-            f"`{name}` gives a batch other values than single states: component {k} of its result at "
-            f"{_shown(functions, x[i])} is {claimed[i, k]:g} alone, {batch[i, k]:g} in a batch of shape "
-            f"{tuple(x.shape)}. Write it for states on the last axis, q[..., 0] in place of q[0]; {REMEDY}"
-        )
 
 
-def _vectors(x: Array, own: bool = False) -> np.ndarray:
-    """One random direction (N, n) at each state."""
-    return _directions(_numbers(x), None, 1, own)[:, 0]
-
-
-def _products(functions: Tested, x: Array, v: np.ndarray) -> np.ndarray:
-    """The given products of the Hessian at single states with v, (N, n)."""
+def _products(functions: Tested, x: Array, own: bool) -> tuple[np.ndarray, np.ndarray]:
+    """One random direction at each state, and the given products of the Hessian with them, (N, n) each."""
     assert functions.hessian_vector is not None
-    vectors = as_like(v, x)
-    return np.stack([_numbers(functions.hessian_vector(x[i], vectors[i])) for i in range(len(x))])
+    v = _directions(_numbers(x), None, 1, own)[:, 0]
+    vectors = like(v, x)
+    return v, np.stack([_numbers(functions.hessian_vector(x[i], vectors[i])) for i in range(len(x))])
 
 
 def check_writes(name: str, function: Callable[..., Any], *states: np.ndarray) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, largest, library, like, of_library, per_state
+from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.formulas import TracedHamiltonian, recorded
 from sympflow.hamiltonian.friction import FRICTIONLESS, Friction
 from sympflow.hamiltonian.times import checked_time
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from sympflow.compiler.program import Program
     from sympflow.hamiltonian.layered import LayeredPotential
     from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.hamiltonian.poles import Poles
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 
@@ -34,24 +33,6 @@ class ExternalForce(Protocol):
 
     def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
         """∂F/∂(q, p): (..., d), each, to (..., d, 2d)."""
-        ...
-
-
-class Doubled(Protocol):
-    """A system in twice the variables: see `sympflow.doubled`."""
-
-    physical: Any
-
-    def lift(self, y: Array) -> Array:
-        """The state for a physical one: (..., 2d) to (..., 4d)."""
-        ...
-
-    def physical_limit(self, y: Array) -> Array:
-        """The physical part of a state: (..., 4d) to (..., 2d)."""
-        ...
-
-    def difference(self, y: Array) -> Array:
-        """The rest of a state, 0 in the physical limit: (..., 4d) to (..., 2d)."""
         ...
 
 
@@ -97,8 +78,8 @@ class Hamiltonian:
 
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self.name = name
-        self._definition = definition
-        self.symbols: SymbolicHamiltonian | None = None
+        self.definition = definition
+        self.symbols: SymbolicHamiltonian | None = definition.symbols
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
@@ -107,8 +88,7 @@ class Hamiltonian:
         self.quadratic_kinetic = quadratic_kinetic
         self.stiffness_matrix: np.ndarray | None = None
         self.functions_given: bool = definition.given
-        if definition.timed:
-            self.autonomous = False
+        self.autonomous = not definition.timed
         self._tested: dict[tuple[type, Any], np.ndarray] = {}  # how far, by the kind of states
 
     def hamiltonian(self, y: Array, t: Any = None) -> Array:
@@ -123,20 +103,20 @@ class Hamiltonian:
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
             return self.kinetic(p, t) + self.potential(q, t)
-        return self._definition.hamiltonian(y, *self._time(t, y))
+        return self.definition.hamiltonian(y, *self._time(t, y))
 
     def gradient(self, y: Array, t: Any = None) -> Array:
         """∇H(y): (..., 2d) to (..., 2d)."""
         self._check_width(y)
         if self.separable:
             return concatenate([-self.force(y[..., : self.ndof], t), self.velocity(y[..., self.ndof :], t)])
-        return self._definition.gradient(y, *self._time(t, y))
+        return self.definition.gradient(y, *self._time(t, y))
 
     def hessian(self, y: Array, t: Any = None) -> Array:
         """∇²H(y): (..., 2d) to (..., 2d, 2d)."""
         self._check_width(y)
         if not self.separable:
-            return self._definition.hessian(y, *self._time(t, y))
+            return self.definition.hessian(y, *self._time(t, y))
         d = self.ndof
         A, B = self.potential_hessian(y[..., :d], t), self.kinetic_hessian(y[..., d:], t)
         B = B + 0 * A
@@ -165,7 +145,7 @@ class Hamiltonian:
     def time_derivative(self, y: Array, t: Any = None) -> Array:
         """∂H/∂t of a driven system, 0 of another: (..., 2d) to (...)."""
         self._check_width(y)
-        return 0 * y[..., 0] if self.autonomous else self._definition.time_derivative(y, *self._time(t, y))
+        return 0 * y[..., 0] if self.autonomous else self.definition.time_derivative(y, *self._time(t, y))
 
     def energy_density(self, y: Array, t: Any = None) -> Array:
         """H at each site of a lattice (..., *shape), or each body of pairs (..., n), which add up to H.
@@ -192,7 +172,7 @@ class Hamiltonian:
         if self.separable:
             velocity, force = self.velocity(y[..., d:], t), self.force(y[..., :d], t)
         else:
-            g = self._definition.gradient(y, *self._time(t, y))
+            g = self.definition.gradient(y, *self._time(t, y))
             velocity, force = g[..., d:], -g[..., :d]
         force = self.friction.added(force, y[..., d:])
         if self.external_force is not None:
@@ -215,18 +195,11 @@ class Hamiltonian:
 
     def with_force(self, force: ExternalForce) -> Self:
         """Return the system with p' = −∂H/∂q − Γp + F(q, p), which its vector field, and no H, holds."""
-        forced = self._copied()
+        forced = bare_copy(self)
         forced.name, forced.external_force = f"{self.name}_forced", force
         return forced
 
-    def _copied(self) -> Self:
-        """A copy without what was found out of the original, which is to be another system."""
-        other = copy.copy(self)
-        for name in [name for name in vars(other) if isinstance(getattr(type(other), name, None), cached_property)]:
-            del vars(other)[name]
-        return other
-
-    def as_doubled(self) -> Doubled:
+    def as_doubled(self) -> Any:
         """Return the system itself if it is a doubled one.
 
         Raises
@@ -235,7 +208,7 @@ class Hamiltonian:
             If it is none.
         """
         raise ValueError(
-            f"`system` {self.name!r} is no doubled one, so that its states are the physical ones as they are: make one "
+            f"`system` {self.name!r} is not doubled: its states are the physical ones: make one "
             "by sympflow.doubled(system, force), or leave out what asks for its physical limit."
         )
 
@@ -255,7 +228,7 @@ class Hamiltonian:
     def identity_parts(self) -> Any:
         """Return all that H and the equations of motion are made of, by which a store knows the system again."""
         return [
-            self._definition,
+            self.definition,
             self.inverse_mass,
             self.stiffness_matrix,
             self.damping,
@@ -314,7 +287,7 @@ class Hamiltonian:
 
         An adaptive method may step over a pulse that no stage meets; one with steps no longer than this does not.
         """
-        return self._definition.shortest_piece
+        return self.definition.shortest_piece
 
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
         """The times (n,) between two others at which H jumps: of samples, and of functions of t that jump.
@@ -323,17 +296,16 @@ class Hamiltonian:
         pieces, and their like. Zeros of their arguments that are neither linear nor periodic are not told apart where
         they are nearer to each other than `step`. In a long interval with many jumps the first ones alone are given.
         """
-        return self._definition.jump_times(low, high, step)
+        return self.definition.jump_times(low, high, step)
 
     @cached_property
     def between_impulses(self) -> Self:
         """The system without its impulses, which it follows between them: itself, where H has none."""
-        form = self._definition.between_impulses
-        if form is self._definition:
+        form = self.definition.between_impulses
+        if form is self.definition:
             return self
-        between = self._copied()
+        between = bare_copy(self)
         Hamiltonian.__init__(between, self.name, form, self.inverse_mass, self.quadratic_kinetic)
-        between.symbols, between.autonomous = form, not form.timed
         return between
 
     def check_impulses(self, what: str, remedy: str) -> None:
@@ -362,7 +334,7 @@ class Hamiltonian:
         """The time that functions of a driven system take after the states x (..., k), checked; () of another."""
         if self.autonomous:
             return ()
-        if self._definition.impulses:
+        if self.definition.impulses:
             self.check_impulses(
                 "so that H and its derivatives are no functions",
                 "solve it by sympflow.solve; or use system.between_impulses, and the kicks of p between by "
@@ -374,10 +346,6 @@ class Hamiltonian:
                 "as in system.hamiltonian(y, t)."
             )
         return (checked_time(t, x, x.shape[:-1]),)
-
-    def learns(self, y: Array) -> bool:
-        """Return True if torch follows numbers of H other than y (..., 2d), a tensor: such as a network's weights."""
-        return self._definition.learns(y)
 
     def __call__(self, t: float, y: Array) -> Array:
         """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`.
@@ -399,19 +367,19 @@ class Hamiltonian:
 
     def potential(self, q: Array, t: Any = None) -> Array:
         """V(q): (..., d) to (...)."""
-        return self._separable()._definition.potential(self._positions(q), *self._time(t, q))
+        return self._separable().definition.potential(self._positions(q), *self._time(t, q))
 
     def force(self, q: Array, t: Any = None) -> Array:
         """−∇V(q): (..., d) to (..., d)."""
-        return -self._separable()._definition.potential_gradient(self._positions(q), *self._time(t, q))
+        return -self._separable().definition.potential_gradient(self._positions(q), *self._time(t, q))
 
     def potential_hessian(self, q: Array, t: Any = None) -> Array:
         """∇²V(q): (..., d) to (..., d, d)."""
-        return self._separable()._definition.potential_hessian(self._positions(q), *self._time(t, q))
+        return self._separable().definition.potential_hessian(self._positions(q), *self._time(t, q))
 
     def hessian_vector(self, q: Array, v: Array, t: Any = None) -> Array:
         """∇²V(q)·v, by the function given for it if there is one: (..., d), (..., d) to (..., d)."""
-        return self._separable()._definition.hessian_vector(self._positions(q), v, *self._time(t, q))
+        return self._separable().definition.hessian_vector(self._positions(q), v, *self._time(t, q))
 
     def curvature(self, q: Array, t: Any = None) -> Array:
         """½ v·∇²V(q) v, the curvature of V along the acceleration v = M⁻¹∇V(q): (..., d) to (...).
@@ -442,9 +410,9 @@ class Hamiltonian:
 
     def third_derivative(self, q: Array, v: Array, w: Array, t: Any = None) -> Array:
         """∇³V(q)(v, w), for a system without symbols: (..., d), each, to (..., d)."""
-        if self._definition.has_third_derivative:
-            return self._definition.third_derivative(q, v, w, *self._time(t, q))
-        if self.numba_functions is None and (self._definition.differentiates_itself or is_tensor(q)):
+        if self.definition.has_third_derivative:
+            return self.definition.third_derivative(q, v, w, *self._time(t, q))
+        if self.numba_functions is None and (self.definition.differentiates_itself or is_tensor(q)):
             import torch
 
             from sympflow.arrays import jvp
@@ -476,12 +444,12 @@ class Hamiltonian:
         if self._separable().quadratic_kinetic:
             felt = None if self.local is None else self.local.felt
             return ((p if felt is None else p * like(felt, p)) * self.velocity(p)).sum(-1) / 2
-        return self._definition.kinetic(p, *self._kinetic_time(t, p))
+        return self.definition.kinetic(p, *self._kinetic_time(t, p))
 
     def velocity(self, p: Array, t: Any = None) -> Array:
         """∇T(p): (..., d) to (..., d)."""
         if not self._separable().quadratic_kinetic:
-            return self._definition.kinetic_gradient(p, *self._kinetic_time(t, p))
+            return self.definition.kinetic_gradient(p, *self._kinetic_time(t, p))
         if self.inverse_mass is None:
             return p
         M = like(self.inverse_mass, p)
@@ -490,7 +458,7 @@ class Hamiltonian:
     def kinetic_hessian(self, p: Array, t: Any = None) -> Array:
         """∇²T(p): (..., d) to (..., d, d); M⁻¹ of shape (d, d) when T is quadratic."""
         if not self._separable().quadratic_kinetic:
-            return self._definition.kinetic_hessian(p, *self._kinetic_time(t, p))
+            return self.definition.kinetic_hessian(p, *self._kinetic_time(t, p))
         M = np.ones(self.ndof) if self.inverse_mass is None else self.inverse_mass
         return like(np.diag(M) if M.ndim == 1 else M, p)
 
@@ -514,7 +482,7 @@ class Hamiltonian:
         """
         if not self.kinetic_timed:
             return per_state(s, p) * self.velocity(p)
-        return self._definition.drifted(p, *self._time(t, p), checked_time(s, p, p.shape[:-1]))
+        return self.definition.drifted(p, *self._time(t, p), checked_time(s, p, p.shape[:-1]))
 
     def drifted(self, q: Array, p: Array, t: Any, s: Any, sign: float = 1.0) -> tuple[Array, Array]:
         """The states after the flow of T(p, t) with friction over a time s from t on; `sign` −1 undoes it.
@@ -532,12 +500,12 @@ class Hamiltonian:
         """The derivatives of `drift` in p: (..., d) to (..., d, d)."""
         if not self.kinetic_timed:
             return (s[..., None, None] if getattr(s, "ndim", 0) else s) * self.kinetic_hessian(p)
-        return self._definition.drift_jacobian(p, *self._time(t, p), checked_time(s, p, p.shape[:-1]))
+        return self.definition.drift_jacobian(p, *self._time(t, p), checked_time(s, p, p.shape[:-1]))
 
     @property
     def kinetic_timed(self) -> bool:
         """True if T depends on t: then a drift is an integral over t."""
-        return not self.autonomous and self._definition.kinetic_timed
+        return self.definition.kinetic_timed
 
     def _kinetic_time(self, t: Any, p: Array) -> tuple[Any, ...]:
         return self._time(t, p) if self.kinetic_timed else ()
@@ -546,56 +514,29 @@ class Hamiltonian:
         if not self.separable:
             raise ValueError(
                 f"`system` {self.name!r} is not separable: H does not split into T(p) + V(q), so splitting methods do "
-                f"not apply. Use {self.instead}."
+                f"not apply. Use {self.definition.instead}."
             )
         return self
 
     @property
-    def instead(self) -> str:
-        """The methods that are advised where H is not separable, in words."""
-        return self._definition.instead
-
-    @property
-    def poles(self) -> Poles | None:
-        """The places that a step may leap over at which H as it is written is infinite or no number, if it has some."""
-        return self._definition.poles
-
-    @property
-    def leaps(self) -> bool:
-        """True if bodies may meet, over which a step may leap."""
-        return self._definition.leaps
-
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int) -> np.ndarray:
-        """Return True for each run from states (n, 2d) to others that is seen to have leapt over such a place: (n,)."""
-        return self._definition.leapt(starts, ends, n_steps, self.keeps_energy)
-
-    def leap(self, y: np.ndarray, start: np.ndarray) -> str:
-        """A clause on a state (2d,) of a run from a start (2d,) that did."""
-        return self._definition.leap(y, start)
-
-    def remark(self, q: np.ndarray) -> str:
-        """A clause on the last positions (d,) of a run that could not go on, such as bodies that met; or nothing."""
-        return self._definition.remark(q)
-
-    @property
     def local(self) -> LocalHamiltonian | None:
         """The definition by one piece, of a lattice or of pairs, with what it has of its own, such as `shape`."""
-        return self._definition if self._definition.loops else None
+        return self.definition if self.definition.loops else None
 
     @property
     def form(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
         """The definition that programs are recorded of: symbols, or functions that were traced; else None."""
-        return self.symbols if self.symbols is not None else self._definition.form
+        return self.symbols if self.symbols is not None else self.definition.form
 
     @property
     def layered(self) -> LayeredPotential | None:
         """V as a chain of linear layers whose weights torch follows, of functions that are one; else None."""
-        return self._definition.layered
+        return self.definition.layered
 
     @property
     def untraced(self) -> str:
         """The reason for which Python functions could not be traced, a clause; "" if they were, or there are none."""
-        return "" if self.form is not None else self._definition.untraced
+        return "" if self.form is not None else self.definition.untraced
 
     @property
     def program(self) -> Program:
@@ -634,17 +575,12 @@ class Hamiltonian:
     @property
     def has_hessian_vector(self) -> bool:
         """False if ∇²V·v of arrays is not to be had, as for a gradient that was given without it."""
-        return self._definition.has_hessian_vector
-
-    @property
-    def takes_tensors(self) -> bool:
-        """False if the functions are a user's that take NumPy arrays alone."""
-        return self._definition.takes_tensors
+        return self.definition.has_hessian_vector
 
     @property
     def numba_functions(self) -> tuple[Any, Any, Any] | None:
         """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
-        return self._definition.numba_functions
+        return self.definition.numba_functions
 
 
 def _rows(left: Array, right: Array) -> Array:

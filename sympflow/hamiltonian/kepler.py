@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import is_tensor
+from sympflow.arrays import detached
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import apply, where
 
@@ -201,7 +201,7 @@ def kepler_changes(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any, rates: S
     t = t - left_out
     sign = where(t < 0.0, 0.0 * t - 1.0, 1.0)
     forward, along, zeta = t * sign, eta * sign, mu - beta * r
-    X = solved(*map(_still, (r, along, zeta, beta, mu, forward)))
+    X = solved(*map(detached, (r, along, zeta, beta, mu, forward)))
     G = stumpff(X, beta)
     f, g, df, dg, d, other = coefficients(X, G, r, inverse, along, zeta, mu, forward)
     g = where(2.0 * apply("abs", forward - g) < forward, g, other)
@@ -211,11 +211,6 @@ def kepler_changes(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any, rates: S
     found = sign * X, (G[0], sign * G[1], G[2], sign * G[3]), sign * d
     known = inverse, eta, beta, zeta, mu, r
     return moved(x, v, c) + varied((x, v), rates, c, known, found, 1.5 * left_out / bound)
-
-
-def _still(x: Any) -> Any:
-    """Return the number without its derivatives: Newton's last step has those of the solution."""
-    return x.detach() if is_tensor(x) else x
 
 
 # elements ----------------------------------------------------------------------------------------------------------

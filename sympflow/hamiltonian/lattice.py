@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
@@ -13,12 +12,14 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import check_kept, plain, real_number
+from sympflow.arguments import plain
 from sympflow.arrays import Array, concatenate, library, like
+from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
-from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, letters, parsed
+from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, parsed
 from sympflow.hamiltonian.poles import LatticePoles, Poles
+from sympflow.hamiltonian.symbolic import exact
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.normal_modes import SpectralPart
@@ -28,9 +29,9 @@ Expressions = Callable[[], Sequence[sp.Expr]]
 BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
 FEW = 6, 4, 3
-"""Sites along each axis of a piece, of lattices of one, two and three axes."""
+"""Sites along each axis of a subsystem, of lattices of one, two and three axes."""
 MANY = 64, 10, 5
-"""The same, of a ring of which long runs are made; as many as a piece has, if that is more."""
+"""The same, of a ring of which long runs are made; as many as a subsystem has, if that is more."""
 MOST_JUDGED = 1024
 """Degrees of freedom of the lattice on which a flow is judged, where it has more."""
 WELLS, FAR = 8, 100.0
@@ -72,15 +73,13 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
-        other = copy.copy(self)
-        for name in ("_functions", "terms"):
-            vars(other).pop(name, None)
+        other = bare_copy(self)
         other.params = checked_params({**self.params, **values}, self.shape)
         other._check_continuous()
         other._set_mass()
         return other
 
-    def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
+    def subsystem(self, sites: Any = None, boundary: Any = "periodic") -> Self:
         shape = self.few() if sites is None else checked_shape(sites, "sites")
         if len(shape) == 1:
             shape *= len(self.shape)
@@ -90,8 +89,7 @@ class LatticeHamiltonian(LocalHamiltonian):
                 f"got {sites!r}."
             )
         shape = tuple(min(n, m) for n, m in zip(shape, self.shape, strict=True)) if not self.uniform else shape
-        other = copy.copy(self)
-        vars(other).pop("terms", None)
+        other = bare_copy(self)
         other._functions = self._functions  # of sites and bonds, whatever their number
         other.shape, other.boundary = shape, _checked_boundary(boundary, len(shape))
         other.ndof = math.prod(shape) * len(self.fields)
@@ -104,7 +102,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         other._set_mass()
         return other
 
-    has_piece = True
+    has_subsystem = True
 
     def judged(self) -> tuple[Any, ...]:
         if not self.uniform or self.ndof <= MOST_JUDGED:
@@ -118,7 +116,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return (tuple(max(MANY[len(self.shape) - 1], n) for n in self.few()),)
 
     def few(self) -> tuple[int, ...]:
-        """The sites along each axis of a piece of which nothing else is said."""
+        """The default number of sites along each axis of a subsystem."""
         least = 2 * max(self.bonds, default=0) + 1
         return (max(FEW[len(self.shape) - 1], least),) * len(self.shape)
 
@@ -197,12 +195,12 @@ class LatticeHamiltonian(LocalHamiltonian):
                 kept.append(x)
         return [size * x for x in kept]
 
-    @property
+    @cached_property
     def poles(self) -> Poles | None:  # type: ignore[override]
         return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:
-        if self.poles is None:
+        if self.poles is None or not self.poles.watched:
             return ""
         nearest = LatticePoles(self).nearest(q)
         return f"{nearest} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
@@ -214,9 +212,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         values = [np.broadcast_to(v, self.shape) for v in self.params.values()]
 
         def at(x: Sequence[sp.Symbol], own: Sequence[Any], site: int) -> dict[Any, Any]:
-            numbers = {s: sp.Float(float(v.flat[site])) for s, v in zip(self.c, values, strict=True)}
-            numbers |= {s: sp.Integer(int(v)) for s, v in numbers.items() if float(v).is_integer()}
-            return {**dict(zip(x, own, strict=True)), **numbers}
+            return dict(zip((*x, *self.c), (*own, *(exact(float(v.flat[site])) for v in values)), strict=True))
 
         def fields(of: Sequence[sp.Symbol], site: int | None) -> list[Any]:
             return [sp.S.Zero if site is None else of[f * n + site] for f in range(len(self.fields))]
@@ -362,14 +358,12 @@ class LatticeHamiltonian(LocalHamiltonian):
         waves = [dispersion(couplings, transform.angles(axis)) for axis in range(len(self.shape))] if couplings else []
         K = transform.total(waves) + onsite if waves else np.broadcast_to(onsite, (*self.shape, F, F))
         linear = SpectralPart.of_matrices(transform, inverse_mass, np.ascontiguousarray(K), interval)
-        rest = copy.copy(self)
-        for name in ("_functions", "terms"):
-            vars(rest).pop(name, None)
+        rest = bare_copy(self)
         rest.U, rest.bonds = U if U.free_symbols & set(self.x) else sp.S.Zero, bonds
         return linear, [RestOfLattice(rest)] if rest.U != 0 or bonds else []
 
     def _quadratic(self, f: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[np.ndarray, sp.Expr]:
-        """K (F, F) of the terms ½ xᵀKx of a piece, with its numbers and the means of its arrays; and what remains."""
+        """K (F, F) of the terms ½ xᵀKx of a site or bond, with numbers and means of arrays; and what remains."""
         values = dict(zip(self.c, self.params.values(), strict=True))
         numbers = {s: v for s, v in values.items() if not isinstance(v, np.ndarray)}
         means = {s: float(v.mean()) for s, v in values.items() if isinstance(v, np.ndarray)}
@@ -399,22 +393,13 @@ class LatticeHamiltonian(LocalHamiltonian):
         return found
 
     def potential_gradient(self, q: Array) -> Array:
-        def slopes(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
-            return [sp.diff(f, s) for s in x]
-
-        return self._gathered("1", slopes, q)
+        return self._gathered(q)
 
     def hessian_vector(self, q: Array, v: Array, *t: Array) -> Array:
-        def slopes(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
-            return [sp.diff(_along(f, x, self.v), s) for s in x]
-
-        return self._gathered("2", slopes, q, v)
+        return self._gathered(q, v)
 
     def third_derivative(self, q: Array, v: Array, w: Array, *t: Array) -> Array:
-        def slopes(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
-            return [sp.diff(_along(_along(f, x, self.v), x, self.w), s) for s in x]
-
-        return self._gathered("3", slopes, q, v, w)
+        return self._gathered(q, v, w)
 
     def kinetic(self, p: Array) -> Array:
         return _total(self._kinetic_of_sites(p), self.shape)
@@ -424,10 +409,8 @@ class LatticeHamiltonian(LocalHamiltonian):
         return self._site_values("kinetic", lambda: [self.T], self.p, self._on_sites(p))[0]
 
     def kinetic_gradient(self, p: Array) -> Array:
-        def slopes() -> list[sp.Expr]:
-            return [sp.diff(self.T, s) for s in self.p]
-
-        return _joined(self._site_values("kinetic 1", slopes, self.p, self._on_sites(p)), len(self.shape))
+        slopes = self._site_values("kinetic 1", partial(_slopes, self.T, self.p), self.p, self._on_sites(p))
+        return _joined(slopes, len(self.shape))
 
     def kinetic_hessian(self, p: Array) -> Array:
         """∇²T, dense: (..., d) to (..., d, d)."""
@@ -468,22 +451,21 @@ class LatticeHamiltonian(LocalHamiltonian):
         """The axes and distances of bonds."""
         return [(axis, k) for axis in range(len(self.shape)) for k in self.bonds]
 
-    def _gathered(self, order: str, slopes: Any, q: Array, *directions: Array) -> Array:
-        """Derivatives of V by sites (..., d), of those of one site and one bond."""
-        parts = [self._on_sites(each) for each in (q, *directions)]
-        given = (self.v, self.w)[: len(directions)]
+    def _gathered(self, *arrays: Array) -> Array:
+        """The gradient of V by sites (..., d), along directions after q, of those of one site and one bond."""
+        parts, order = [self._on_sites(each) for each in arrays], len(arrays)
+        given = (self.v, self.w)[: order - 1]
         out: list[Any] = [0.0] * len(self.fields)
         if self.U != 0:
-            variables = sum(given, self.x)
-            out = self._site_values(f"onsite {order}", partial(slopes, self.U, self.x), variables, *parts)
+            slopes = partial(_slopes, self.U, self.x, *given)
+            out = self._site_values(f"onsite {order}", slopes, sum(given, self.x), *parts)
         for axis, k in self._kinds():
-            variables = sum(given, self.r)
+            slopes = partial(_slopes, self.bonds[k], self.r, *given)
             differences = [self._differences(x, axis, k) for x in parts]
-            values = self._bond_values(axis, k, order, partial(slopes, self.bonds[k], self.r), variables, *differences)
+            values = self._bond_values(axis, k, str(order), slopes, sum(given, self.r), *differences)
             n, at = self.shape[axis], axis - len(self.shape)
-            free = self.boundary[axis] == "free"
             for i, value in enumerate(values):
-                slope = _padded(value, at, k, "zeros") if free else value
+                slope = _padded(value, at, k, "zeros") if self.boundary[axis] == "free" else value
                 out[i] = out[i] + _cut(slope, at, 0, n) - _cut(slope, at, k, k + n)
         return _joined(out, len(self.shape))
 
@@ -573,9 +555,11 @@ class RestOfLattice:
         return self.lattice.hessian_vector(y[..., : self.ndof], v)
 
 
-def _along(f: sp.Expr, x: Sequence[sp.Symbol], v: Sequence[sp.Symbol]) -> sp.Expr:
-    """The derivative of f along v."""
-    return sp.Add(*[s * sp.diff(f, z) for z, s in zip(x, v, strict=True)])
+def _slopes(f: sp.Expr, x: Sequence[sp.Symbol], *along: Sequence[sp.Symbol]) -> list[sp.Expr]:
+    """The gradient of f in x, differentiated along some directions."""
+    for v in along:
+        f = sp.Add(*[s * sp.diff(f, z) for z, s in zip(x, v, strict=True)])
+    return [sp.diff(f, s) for s in x]
 
 
 def _total(values: Array, shape: tuple[int, ...]) -> Array:
@@ -651,38 +635,3 @@ def _checked_distance(k: Any) -> int:
     if not isinstance(k, int) or isinstance(k, bool) or k < 1:
         raise ValueError(f"`bond` by distances must have the integers 1, 2, … as keys; got {k!r}.")
     return k
-
-
-def checked_params(params: Any, shape: tuple[int, ...]) -> dict[str, float | np.ndarray]:
-    """The values of parameters, numbers or one for each site, of an argument `params`."""
-    if not isinstance(params, Mapping | None):
-        raise TypeError(
-            f"`params` must be a mapping of names to numbers or arrays; got {type(params).__name__}: pass a dict."
-        )
-    checked: dict[str, float | np.ndarray] = {}
-    for name, given in (params or {}).items():
-        if not isinstance(name, str) or not name.isidentifier():
-            raise ValueError(f"`params` must have names as keys; got {name!r}.")
-        check_kept(f"params[{name!r}]", given)
-        value = plain(given)
-        if real_number(value):
-            if not math.isfinite(value):
-                raise ValueError(f"`params` has {name} = {given!r}: give a finite real number.")
-            checked[name] = value
-            continue
-        try:
-            array = np.array(value, dtype=float)
-        except (TypeError, ValueError):
-            raise TypeError(
-                f"`params` has {name} = {reprlib.repr(given)}: give a number or an array of them."
-            ) from None
-        if array.shape != shape:
-            raise ValueError(
-                f"`params` has {name} of shape {array.shape}, and that of the lattice is {shape}: give one value for "
-                "each site, or a number for all."
-            )
-        if not np.isfinite(array).all():
-            raise ValueError(f"`params` has {name} with a value that is not finite: give finite real numbers.")
-        array.setflags(write=False)
-        checked[name] = array
-    return checked

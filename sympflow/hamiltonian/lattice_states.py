@@ -36,8 +36,8 @@ class LatticeStates:
     one temperature, positions and momenta at random, then relaxed by the lattice's own dynamics. So a few sites are as
     often as far from rest as any few neighbours in a large lattice are.
 
-    A state belongs to the set if the densest block of as many neighbours as `HamiltonianSystem.piece` has by default
-    has at most 8 times the upper density, and at least an eighth of the lower one: so a wave alone in a lattice at rest
+    A state belongs to the set if the densest block of as many neighbours as `HamiltonianSystem.subsystem` has sites has
+    at most 8 times the upper density, and at least an eighth of the lower one: so a wave alone in a lattice at rest
     is judged by itself.
 
     Parameters

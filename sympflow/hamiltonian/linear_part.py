@@ -20,8 +20,40 @@ SAME = 1e-9  # relative difference below which two frequencies are one
 EQUILIBRIUM_STEPS = 100
 
 
+class NormalModes:
+    """Modes of a quadratic Hamiltonian by their kinds and rates, and the classes of those that have both in common."""
+
+    kinds: Any
+    rates: np.ndarray
+    classes: np.ndarray
+    interval: float
+
+    @property
+    def frequencies(self) -> np.ndarray:
+        """|ω| of each mode, (d,): 0 where nothing oscillates."""
+        return np.where(np.asarray(self.kinds) == "oscillator", abs(self.rates), 0.0)
+
+    @property
+    def stiffness(self) -> float:
+        """Largest frequency × length of the default interval: the radians that the fastest mode turns in it.
+
+        A method that meets the fast oscillation by forces, as every explicit one does, needs at least half as many
+        force evaluations to be stable.
+        """
+        return float(self.frequencies.max(initial=0.0) * self.interval)
+
+    @cached_property
+    def representatives(self) -> np.ndarray:
+        """The first mode of each class: (n_classes,)."""
+        return np.unique(self.classes, return_index=True)[1]
+
+    @property
+    def n_classes(self) -> int:
+        return len(self.representatives)
+
+
 @dataclass(frozen=True)
-class LinearPart:
+class LinearPart(NormalModes):
     """½ pᵀBp + ½ (q − c)ᵀK(q − c), a quadratic Hamiltonian, in its normal modes.
 
     With q = c + C X and p = C⁻ᵀY it is Σ_j Ω_j (Y_j² + σ_j X_j²)/2, where σ_j = 1 for an *oscillator*, −1 for a
@@ -71,11 +103,6 @@ class LinearPart:
         return self._spectrum[0]
 
     @property
-    def frequencies(self) -> np.ndarray:
-        """ω of each mode, (d,): 0 where nothing oscillates."""
-        return np.sqrt(np.maximum(np.nan_to_num(self.squared_frequencies), 0.0))
-
-    @property
     def modes(self) -> np.ndarray:
         """C: (d, d)."""
         return self._spectrum[1]
@@ -118,13 +145,13 @@ class LinearPart:
         return tuple("idle" if np.isnan(s) else names[float(np.sign(s))] for s in self.squared_frequencies)
 
     @cached_property
-    def rates(self) -> np.ndarray:
+    def rates(self) -> np.ndarray:  # type: ignore[override]
         """Ω of each mode, (d,): ω, the hyperbolic rate, 1 for a free mode and 0 for an idle one."""
         squares = np.nan_to_num(self.squared_frequencies)
         return np.where(squares != 0, np.sqrt(np.abs(squares)), [float(kind == "free") for kind in self.kinds])
 
     @cached_property
-    def classes(self) -> np.ndarray:
+    def classes(self) -> np.ndarray:  # type: ignore[override]
         """To which of the distinct frequencies a mode belongs: (d,) int."""
         found: list[tuple[str, float]] = []
         labels = []
@@ -134,24 +161,6 @@ class LinearPart:
             if not same:
                 found.append((kind, float(rate)))
         return np.array(labels)
-
-    @cached_property
-    def n_classes(self) -> int:
-        return int(self.classes.max()) + 1
-
-    @cached_property
-    def representatives(self) -> np.ndarray:
-        """The first mode of each class: (n_classes,)."""
-        return np.array([int(np.argmax(self.classes == f)) for f in range(self.n_classes)])
-
-    @property
-    def stiffness(self) -> float:
-        """Largest frequency × length of the default interval: the radians that the fastest mode turns in it.
-
-        A method that meets the fast oscillation by forces, as every explicit one does, needs at least half as many
-        force evaluations to be stable.
-        """
-        return float(self.frequencies.max(initial=0.0) * self.interval)
 
 
 def check_parts_conservative(system: Any) -> None:

@@ -6,7 +6,9 @@ operations. Nothing that it holds, but what depends on sites, is as long as the 
 
 from __future__ import annotations
 
+import math
 import os
+import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
@@ -15,12 +17,13 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
+from sympflow.arguments import as_float, check_kept, plain, real_number
 from sympflow.arrays import Array, is_tensor, like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
-__all__ = ["LocalHamiltonian", "check_memory", "letters", "parsed"]
+__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "letters", "named_values", "parsed"]
 
 MOST_DENSE = 50_000_000
 """Entries of matrices ∇²V that are made at a time."""
@@ -84,24 +87,24 @@ class LocalHamiltonian(Definition, ABC):
             "V, such as 'srkn6b'."
         )
 
-    def piece(self, sites: Any = None, boundary: Any = "periodic") -> Self:
-        """Return the definition with the same terms on a few sites: see `HamiltonianSystem.piece`."""
+    def subsystem(self, sites: Any = None, boundary: Any = "periodic") -> Self:
+        """Return the definition with the same terms on a few sites: see `HamiltonianSystem.subsystem`."""
         raise TypeError(
-            f"`system` is no lattice, of which a few sites are a piece: make a smaller one by HamiltonianSystem."
-            f"{self.loops}."
+            f"`system` is not a lattice, and only lattices have subsystems of a few sites: make a smaller one "
+            f"by HamiltonianSystem.{self.loops}."
         )
 
     @property
-    def has_piece(self) -> bool:
-        """True if a few parts behave as those of a large system do: `piece` is defined."""
+    def has_subsystem(self) -> bool:
+        """True if a few parts behave as those of a large system do: `subsystem` is defined."""
         return False
 
     def judged(self) -> tuple[Any, ...]:
-        """Arguments of `piece` for a system that is large, and small enough to judge a flow on; () for itself."""
+        """Arguments of `subsystem` for a system that is large, and small enough to judge a flow on; () for itself."""
         return ()
 
     def many(self) -> tuple[Any, ...]:
-        """Arguments of `piece` for a system that is large enough to change as slowly as larger ones, of cheap runs."""
+        """Arguments of `subsystem` for one that is large enough to change as slowly as larger ones, of cheap runs."""
         return ()
 
     @property
@@ -144,7 +147,7 @@ class LocalHamiltonian(Definition, ABC):
         if entries > MOST_DENSE:
             raise ValueError(
                 f"`system` has {self.ndof:,} degrees of freedom, of which {what} is dense, with {entries:.3g} entries: "
-                "take a splitting method such as 'srkn6b', which needs no matrix, or a piece of the system."
+                "take a splitting method such as 'srkn6b', which needs no matrix, or a subsystem."
             )
 
     def energy_density(self, y: Array, *t: Array) -> Array:
@@ -171,10 +174,6 @@ class LocalHamiltonian(Definition, ABC):
     @cached_property
     def _functions(self) -> dict[tuple[str, str], Callable[..., list[Any]]]:
         return {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the generated functions, which cannot be pickled and are generated again."""
-        return {name: value for name, value in vars(self).items() if name != "_functions"}
 
 
 def letters(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
@@ -209,6 +208,44 @@ def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Sy
     if f.has(sp.zoo, sp.nan, sp.oo) or complex_part(f) is not None:
         raise ValueError(f"`{argument}` must be a real, finite expression such as {example!r}; got {f}.")
     return f.xreplace({s: symbols[s.name] for s in f.free_symbols})
+
+
+def named_values(argument: str, given: Any, of: str = "numbers") -> dict[str, Any]:
+    """The values of an argument that is a mapping of names, those of one number as such."""
+    if not isinstance(given, Mapping | None):
+        raise TypeError(f"`{argument}` must be a mapping of names to {of}; got {type(given).__name__}: pass a dict.")
+    for name, value in (given or {}).items():
+        if not isinstance(name, str) or not name.isidentifier():
+            raise ValueError(f"`{argument}` must have names as keys; got {name!r}.")
+        check_kept(f"{argument}[{name!r}]", value)
+    return {name: plain(value) for name, value in (given or {}).items()}
+
+
+def checked_params(params: Any, shape: tuple[int, ...] = (), remedy: str = "") -> dict[str, Any]:
+    """The values of parameters: finite numbers, or one for each site of a lattice of this shape."""
+    checked: dict[str, Any] = {}
+    for name, value in named_values("params", params, "numbers or arrays" if shape else "numbers").items():
+        if real_number(value) or not shape:
+            if not math.isfinite(as_float(value)):
+                shown = reprlib.repr(value)
+                raise ValueError(f"`params` has {name} = {shown}: give a finite real number{remedy}.")
+            checked[name] = value
+            continue
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError):
+            shown = reprlib.repr(value)
+            raise TypeError(f"`params` has {name} = {shown}: give a number or an array of them.") from None
+        if array.shape != shape:
+            raise ValueError(
+                f"`params` has {name} of shape {array.shape}, and that of the lattice is {shape}: give one value for "
+                "each site, or a number for all."
+            )
+        if not np.isfinite(array).all():
+            raise ValueError(f"`params` has {name} with a value that is not finite: give finite real numbers.")
+        array.setflags(write=False)
+        checked[name] = array
+    return checked
 
 
 def check_memory(ndof: float, what: str) -> None:

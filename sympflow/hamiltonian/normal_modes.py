@@ -11,9 +11,7 @@ import numpy as np
 from scipy import fft, fftpack
 
 from sympflow.arrays import Array, is_tensor, like, moveaxis
-
-ZERO = 1e-12
-"""Share of the largest squared frequency below which a mode drifts freely, as in `LinearPart`."""
+from sympflow.hamiltonian.linear_part import ZERO, NormalModes
 
 
 class Transform:
@@ -126,7 +124,7 @@ def _cosine_norms(x: Any) -> Any:
     return norms
 
 
-class SpectralPart:
+class SpectralPart(NormalModes):
     """A quadratic H of fields on a lattice, diagonal by a `Transform` and a small matrix for each wave."""
 
     dense = diagonal = False
@@ -161,16 +159,6 @@ class SpectralPart:
         matrices = L[:, None] * V / unit[..., None, :]
         return cls(transform, np.moveaxis(rates, -1, 0), np.moveaxis(kinds, -1, 0), matrices, interval)
 
-    @property
-    def frequencies(self) -> np.ndarray:
-        """|ω| of each mode, (d,): 0 where nothing oscillates."""
-        return np.where(self.kinds == "oscillator", abs(self.rates), 0.0)
-
-    @property
-    def stiffness(self) -> float:
-        """Largest frequency × length of the default interval: see `LinearPart`."""
-        return float(self.frequencies.max(initial=0.0) * self.interval)
-
     @cached_property
     def modes(self) -> np.ndarray:
         """C, dense: (d, d)."""
@@ -182,24 +170,10 @@ class SpectralPart:
         return self.coordinates(np.eye(self.ndof)).T
 
     @cached_property
-    def _distinct(self) -> tuple[np.ndarray, np.ndarray]:
-        keys = np.rec.fromarrays([self.kinds, self.rates])
-        _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-        return first, inverse.reshape(-1)
-
-    @property
-    def classes(self) -> np.ndarray:
+    def classes(self) -> np.ndarray:  # type: ignore[override]
         """To which of the distinct frequencies a mode belongs: (d,) int."""
-        return self._distinct[1]
-
-    @property
-    def representatives(self) -> np.ndarray:
-        """The first mode of each class: (n_classes,)."""
-        return self._distinct[0]
-
-    @property
-    def n_classes(self) -> int:
-        return len(self.representatives)
+        keys = np.rec.fromarrays([self.kinds, self.rates])
+        return np.unique(keys, return_inverse=True)[1].reshape(-1)
 
     # C and its inverse, on (..., d)
 

@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import sympy as sp
 
-from sympflow.arrays import differentiable, is_tensor, transformed
+from sympflow.arrays import differentiable, expanded, is_tensor, transformed
 from sympflow.hamiltonian.symbolic import exact, generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -209,9 +209,9 @@ def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...])
             f"value for each trajectory; got {shapes}."
         ) from None
     followed = {name: value for name, value in params.items() if differentiable(value)}
-    followed = {name: value.double().cpu().expand(shape).reshape(-1) for name, value in followed.items()}
+    followed = {name: expanded(value.double().cpu(), shape).reshape(-1) for name, value in followed.items()}
     numbers = not followed and not any(array.ndim for array in arrays.values())
-    values = {name: np.broadcast_to(array, shape) for name, array in arrays.items()}
+    values = {name: expanded(array, shape) for name, array in arrays.items()}
     return ParameterRows(system, values, numbers, followed)
 
 

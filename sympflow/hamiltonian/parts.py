@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, like, stack
+from sympflow.arrays import Array, concatenate, detached, is_tensor, library, like, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
-from sympflow.hamiltonian.times import probe_times, stage_time
+from sympflow.hamiltonian.times import stage_time
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -72,7 +72,7 @@ class RestOfPotential:
 
     def __init__(self, system: HamiltonianSystem, linear: LinearPart) -> None:
         self.system, self.K, self.center, self.ndof = system, linear.stiffness_matrix, linear.center, system.ndof
-        self.timed = not system.autonomous
+        self.timed = system.definition.timed
 
     def hamiltonian(self, y: Array, *t: Any) -> Array:
         q = y[..., : self.ndof]
@@ -330,7 +330,7 @@ def _reduced(theta: Array, low: Any, module: Any) -> tuple[Array, Array]:
     r = module.arctan2(s, c) + low
     # what rounding of Ω s leaves of whole quarter turns is none: its shears would round one way in every step
     none = abs(r) <= 4 * float(module.finfo(theta.dtype).eps) * abs(theta)
-    return k, module.where(none, r - r.detach() if is_tensor(r) else 0.0, r)
+    return k, module.where(none, r - detached(r), r)
 
 
 def _low(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> np.ndarray:
@@ -431,10 +431,10 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
     difference = sp.expand(sp.Add(*parts) - symbols.H)
     probes = np.random.default_rng(0).uniform(0.3, 0.9, (8, 2 * system.ndof))
     whole, missing = (PartFunctions(f, symbols.q, symbols.p, symbols) for f in (symbols.H, difference))
-    for t in [()] if system.autonomous else [(s,) for s in probe_times(*system.t_span)]:
+    for t in system.probe_times():
         with np.errstate(all="ignore"):
-            excess = missing.hamiltonian(probes, *t) if difference.free_symbols else 0.0
-            size = np.abs(whole.hamiltonian(probes, *t)).max()
+            excess = missing.hamiltonian(probes, t) if difference.free_symbols else 0.0
+            size = np.abs(whole.hamiltonian(probes, t)).max()
         if not np.allclose(np.ptp(excess), 0, atol=1e-12 * size):
             raise ValueError(f"`parts` do not add up to the Hamiltonian: they leave out {-difference}.")
     linear: LinearPart | None = None

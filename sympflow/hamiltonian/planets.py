@@ -18,11 +18,11 @@ from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, concatenate, like, masked, stack, to_numpy
 from sympflow.compiler.functions import apply
 from sympflow.compiler.program import Program, gradient, tangent, traced
-from sympflow.hamiltonian.bodies import Pairs, PairsHamiltonian, checked_params
+from sympflow.hamiltonian.bodies import Pairs, PairsHamiltonian, checked_column
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
-from sympflow.hamiltonian.local import letters, parsed
+from sympflow.hamiltonian.local import checked_params, letters, parsed
 from sympflow.hamiltonian.recorded import NotRecorded
 
 COORDINATES = ("jacobi", "democratic")
@@ -505,22 +505,19 @@ class PlanetsHamiltonian(PairsHamiltonian):
 
 def checked_planets(masses: Any, elements: Any, y0: Any, G: Any, units: Any) -> tuple[np.ndarray, float, np.ndarray]:
     """Masses, G and the state y0 that `HamiltonianSystem.planets` is given, tested."""
-    G, given = plain(G), masses
+    G = plain(G)
     if G is not None and units is not None:
         raise ValueError("`units` tell what `G` is: leave out one of them.")
     if G is not None and not (real_number(G) and 0 < G < math.inf):
         raise ValueError(f"`G` must be positive and finite; got {G!r}.")
     G = 1.0 if G is None and units is None else float(G) if units is None else gravity(units)
-    try:
-        masses = np.array(to_numpy(masses), dtype=float)
-    except (TypeError, ValueError):
-        raise TypeError(f"`masses` must be an array (n,) of numbers, the star's first; got {given!r}.") from None
-    if masses.ndim != 1 or len(masses) < 2:
+    masses = checked_column("masses", masses)
+    if len(masses) < 2:
         raise ValueError(
             f"`masses` must be those of a star and one planet or more, an array (n,); got shape {masses.shape}."
         )
-    if not (np.isfinite(masses) & (masses >= 0)).all():
-        i = int(np.argmin(np.isfinite(masses) & (masses >= 0)))
+    if not (masses >= 0).all():
+        i = int(np.argmin(masses >= 0))
         raise ValueError(
             f"`masses` must be positive, or 0 of bodies that are not felt; that of body {i} is {masses[i]:g}: "
             "change it."

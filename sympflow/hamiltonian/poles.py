@@ -11,13 +11,14 @@ import mpmath
 import numpy as np
 import sympy as sp
 
-__all__ = ["LatticePoles", "Place", "Poles", "SymbolicPoles", "places"]
+__all__ = ["LatticePoles", "PairsPoles", "Place", "Poles", "SymbolicPoles", "places"]
 
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
 MOST_SHOWN = 100  # characters of terms
 DIGITS, HALVINGS = 50, 100  # of the arithmetic in which H is judged beside such a place, and of the way to it
 BESIDE = 1e-3, 1e-6, 1e-9
 """Distances from a place, in parts of a step, at which H is compared: of a finite one the differences decrease."""
+MOST_MET = 16  # pairs that changed their cells in a step, which are looked at
 DECREASES = 0.7  # by less, of the second difference to the first, where H is infinite: by 1 of a logarithm
 
 
@@ -29,12 +30,16 @@ class Place(NamedTuple):
 
 
 class Cancelling(NamedTuple):
-    """Terms f of H in one letter s, of that column, that are infinite at a value of s where their sum is not."""
+    """Terms f of H in one letter s that are infinite at a value of s where their sum is not; and where that letter is.
+
+    `letter` is its number among those of H, or of U of a lattice, or of a bond of length `bond`, or of V of a pair.
+    """
 
     f: sp.Expr
     s: sp.Symbol
     at: float
-    column: int
+    letter: int
+    bond: int | None = None
 
     @property
     def name(self) -> str:
@@ -56,13 +61,15 @@ class Cancelling(NamedTuple):
 class Poles(Protocol):
     """The places at which H of a system may be infinite, in columns."""
 
-    @property
-    def cancelling(self) -> Sequence[Cancelling]:
-        """Terms of H that cancel where each is infinite."""
+    cancelling: Sequence[Cancelling]
+    """Terms of H that cancel where each is infinite."""
+    watched: bool
+    """False if H has cancelling terms alone."""
 
     @property
-    def watched(self) -> bool:
-        """False if H has cancelling terms alone."""
+    def exact(self) -> Poles | None:
+        """The places by which runs are judged, where these may have passed one; None if they are not known."""
+        return self
 
     def look(
         self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()
@@ -78,8 +85,11 @@ class Poles(Protocol):
     def name(self, column: int) -> str:
         """The place, in words that go before "passed"."""
 
+    def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
+        """The values (..., m) of the letter of terms that cancel, at states (..., 2d)."""
 
-class SymbolicPoles:
+
+class SymbolicPoles(Poles):
     """The places of H, as it is written."""
 
     def __init__(self, symbols: Any) -> None:
@@ -87,7 +97,7 @@ class SymbolicPoles:
         letters = (*symbols.q, *symbols.p, *((symbols.time,) if symbols.timed else ()))
         parts = [symbols.V, symbols.T] if symbols.separable else [symbols.H]
         self._letters, self._places = letters, [(place, f) for f in parts for place in places(f, letters)]
-        self._m = len(self._places)
+        self._m, self.watched = len(self._places), bool(self._places)
         self.cancelling = [c for f in parts for c in cancelling(f, letters)]
         if not self._places:
             return
@@ -97,11 +107,7 @@ class SymbolicPoles:
         self._sizes = symbols.evaluated("sizes", [place.g for place, _ in self._places])
 
     def __bool__(self) -> bool:
-        return bool(self._places or self.cancelling)
-
-    @property
-    def watched(self) -> bool:
-        return bool(self._places)
+        return self.watched or bool(self.cancelling)
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values = self._look(y, *self._time(y, t), numbers=numbers)
@@ -117,6 +123,9 @@ class SymbolicPoles:
 
     def name(self, column: int) -> str:
         return f"{_written(self._places[column][0].g)} = 0"
+
+    def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
+        return y[..., [terms.letter]]
 
     def _time(self, y: np.ndarray, t: Any) -> tuple[Any, ...]:
         return (np.broadcast_to(t, y.shape[:-1]),) if self._symbols.timed else ()
@@ -141,19 +150,26 @@ class _Lattice(Protocol):
     def of_terms(self, key: str, expressions: Any, q: Any) -> list[tuple[int | None, int, list[Any]]]: ...
 
 
-class LatticePoles:
+class LatticePoles(Poles):
     """The places of the terms of a lattice, at each site and bond."""
 
     def __init__(self, lattice: _Lattice) -> None:
         self._lattice = lattice
+        terms = [(None, lattice.U, lattice.x), *((k, V, lattice.r) for k, V in lattice.bonds.items())]
+        self.watched = any(places(f, x) for _, f, x in terms)
+        self.cancelling = []
+        for k, f, x in terms:
+            names = [sp.Symbol(name, real=True) for name in lattice.names["x" if k is None else "r"]]
+            named = _with_numbers(f, lattice.c, lattice.params).xreplace(dict(zip(x, names, strict=True)))
+            self.cancelling += [each._replace(bond=k) for each in cancelling(named, tuple(names))]
 
     def __bool__(self) -> bool:
-        lattice = self._lattice
-        terms = [(lattice.U, lattice.x), *((V, lattice.r) for V in lattice.bonds.values())]
-        return any(places(f, x) for f, x in terms)
+        return self.watched or bool(self.cancelling)
 
-    cancelling: Sequence[Cancelling] = ()
-    watched = True
+    def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
+        rows = self._lattice.of_terms("own", lambda f, x: [*x], self._positions(y))
+        found = [values[terms.letter] for axis, k, values in rows if terms.bond == (None if axis is None else k)]
+        return np.concatenate([value.reshape(*y.shape[:-1], -1) for value in found], axis=-1)
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         cells = self._columns("cells", _cells, y)
@@ -220,6 +236,61 @@ class LatticePoles:
             last[axis] %= n
         ends = [_name(end) if 0 <= end[axis] < n else "the wall" for end in (first, last)]
         return f"the bond of {ends[0]} and {ends[1]}"
+
+
+class PairsPoles(Poles):
+    """The places of V of two bodies, at a distance r or, of free bodies on a line, a difference."""
+
+    def __init__(self, pairs: Any) -> None:
+        self._pairs, self._x = pairs, sp.Symbol("r", real=True)
+        own = [s for s in pairs.of_distance.free_symbols if s.name == "r"]
+        self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if pairs.on_a_line else self._x for s in own})
+        found = places(self._f, (self._x,))
+        self._places = [place for place in found if pairs.on_a_line or place.cell != sp.sign(self._x)]
+        self.watched = bool(self._places)
+        self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
+
+    def __bool__(self) -> bool:
+        return self.watched or bool(self.cancelling)
+
+    def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
+        q, end = y[..., : self._pairs.ndof], self._pairs.cutoff
+        sums = np.zeros((*y.shape[:-1], len(self._places)))
+        for i, j, x, letters in self._pairs.met(q):
+            cells = self._cells(x, letters)
+            beyond = self._cells(np.full_like(x, end), letters) if end else [0.0] * len(cells)
+            number = 1 + i * self._pairs.n_bodies + j
+            sums += np.stack([((a - b) * number).sum(-1) for a, b in zip(cells, beyond, strict=True)], axis=-1)
+        return sums, np.where(np.isnan(self._pairs.potential(q)), np.nan, 0.0), None
+
+    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
+        raise NotImplementedError("PairsPoles has no sizes: its H is not looked at.")
+
+    def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
+        names = (self._x, *self._pairs.first, *self._pairs.second, *self._pairs.c)
+        for _, _, x, letters in self._pairs.met(y[..., : self._pairs.ndof]):
+            cells = self._cells(x, letters)[column]
+            for k in np.flatnonzero(cells[0] != cells[1])[:MOST_MET]:
+                own = [float(np.broadcast_to(v, x.shape)[0, k]) for v in letters]
+                if infinite_between(self._f, self._places[column].cell, names, *([float(v), *own] for v in x[:, k])):
+                    return True
+        return False
+
+    def name(self, column: int) -> str:
+        names = dict(zip(self._pairs.c, map(sp.Symbol, self._pairs.params), strict=False))
+        return f"{_written(self._places[column].g.xreplace(names))} = 0 of two bodies"
+
+    def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([x for _, _, x, _ in self._pairs.met(y[..., : self._pairs.ndof])], axis=-1)
+
+    def _cells(self, x: np.ndarray, letters: Sequence[Any]) -> list[np.ndarray]:
+        return self._pairs.values_of("cells", [place.cell for place in self._places], self._x, x, letters)
+
+
+def _with_numbers(f: sp.Expr, letters: Sequence[sp.Symbol], params: Any) -> sp.Expr:
+    """An expression with the values of its parameters, of those that are numbers."""
+    values = zip(letters, params.values(), strict=False)
+    return f.xreplace({s: sp.Float(float(v)) for s, v in values if np.ndim(v) == 0})
 
 
 def _cells(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:

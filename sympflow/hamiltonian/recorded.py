@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import sympy as sp
+from sympy.core.relational import Relational
 
 from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
 from sympflow.compiler.program import Program, Traced
@@ -157,8 +158,17 @@ def in_symbols(program: Program) -> sp.Expr:
         rule = _SYMBOLS.get(x.name)
         if rule is None:
             raise NotRecorded(f"{x.name} has no form in symbols.")
-        known[x.order] = rule(*map(given, x.args))
+        args = [*map(given, x.args)]
+        if x.name not in ("and", "or", "not"):
+            args = [a if x.name == "where" and i == 0 else _as_number(a) for i, a in enumerate(args)]
+        known[x.order] = rule(*args)
     return given(program.outputs[0])
+
+
+def _as_number(f: Any) -> Any:
+    """1 and 0 for a condition that is calculated with."""
+    conditions = Relational | sp.logic.boolalg.BooleanFunction | sp.logic.boolalg.BooleanAtom
+    return sp.Piecewise((1, f), (0, True)) if isinstance(f, conditions) else f
 
 
 def _sum(terms: Sequence[Any]) -> Any:

@@ -8,8 +8,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.hamiltonian.times import probe_times
-
 STATES = 64
 """States of a domain at which Hessians are taken, where there is no y0."""
 MOST_DENSE = 200
@@ -62,7 +60,7 @@ def smallest_size(scene: Any, y0: np.ndarray) -> float:
     scale = weights(system)
     size = np.abs(scale * y0).max(initial=0.0)
     if size == 0:
-        slopes = [np.asarray(system.vector_field(y0, float(t))) for t in probe_times(*system.t_span)]
+        slopes = [np.asarray(system.vector_field(y0, t)) for t in system.probe_times()]
         size = np.abs(scale * slopes).max(initial=0.0) * system.dt
     found = float(size / scale.max())
     return found if 0 < found < np.inf else 1.0
@@ -100,9 +98,7 @@ def fastest_rate(system: Any) -> float | None:
     """The largest |λ| of J∇²H at y0, or the median over the domain; `SLOW`/dt where that is 0, None without states."""
     if system.y0 is None and system.domain is None:
         return None
-    t0, t1 = system.t_span
-    times = [t0] if system.autonomous else probe_times(t0, t1 if system.period is None else t0 + system.period)
-    return max(_median_rate(system, float(t)) for t in times) or SLOW / system.dt
+    return max(_median_rate(system, t) for t in system.probe_times(system.period)) or SLOW / system.dt
 
 
 def default_step(scene: Any, y: np.ndarray | None = None) -> float:
@@ -111,8 +107,7 @@ def default_step(scene: Any, y: np.ndarray | None = None) -> float:
     rate = 0.0
     if system.ndof <= MOST_DENSE:
         with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
-            times = probe_times(*system.t_span) if not system.autonomous else [system.t_span[0]]
-            rate = max(float(_rates(system, float(t), y).max(initial=0.0)) for t in times)
+            rate = max(float(_rates(system, t, y).max(initial=0.0)) for t in system.probe_times())
     return float(f"{STEP / rate:.2g}") if 0 < STEP / max(rate, 1e-300) < 1e100 and np.isfinite(rate) else STEP
 
 

@@ -74,7 +74,7 @@ class Scene:
             )
         for name in options:
             if name not in known:
-                raise TypeError(f"`{name}` is no argument of this system, nor of its scene, {', '.join(known)}.")
+                raise TypeError(f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}.")
         return cls(**{**defaults, **options})
 
     def state(self, ndof: int) -> np.ndarray | None:

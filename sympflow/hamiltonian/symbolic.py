@@ -20,7 +20,7 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arguments import check_kept, plain
-from sympflow.arrays import Array, assemble, concatenate, library_name
+from sympflow.arrays import Array, assemble, beside, concatenate, library_name
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.driving import (
     DURATION,
@@ -71,6 +71,15 @@ class Kick:
         for strength, W in self.potentials:
             p = p - (sign * strength) * W.gradient(y, self.t)[..., :d]
         return concatenate([q, p])
+
+
+def _evaluation(name: str, order: int) -> Callable[..., Array]:
+    """Return a method: an expression, its gradient or its Hessian at arrays (..., n), and at times."""
+
+    def evaluate(self: SymbolicHamiltonian, x: Array, *t: Array) -> Array:
+        return self._derivative(name, order)(x, *t)
+
+    return evaluate
 
 
 class SymbolicHamiltonian(Definition):
@@ -226,6 +235,10 @@ class SymbolicHamiltonian(Definition):
         return [*letters.found, *letters.numbers], letters.replaced
 
     @property
+    def symbols(self) -> SymbolicHamiltonian:
+        return self
+
+    @property
     def timed(self) -> bool:  # type: ignore[override]
         return self.time is not None
 
@@ -337,49 +350,27 @@ class SymbolicHamiltonian(Definition):
 
     # array functions, state y = [q, p] on the last axis -------------------------------------------
 
-    def hamiltonian(self, y: Array, *t: Array) -> Array:
-        return self._scalar("H")(y, *t)
+    hamiltonian = _evaluation("H", 0)
+    hessian = _evaluation("H", 2)
+    time_derivative = _evaluation("Ht", 0)
+    potential = _evaluation("V", 0)
+    potential_gradient = _evaluation("V", 1)
+    potential_hessian = _evaluation("V", 2)
+    curvature = _evaluation("W", 0)
+    curvature_gradient = _evaluation("W", 1)
+    kinetic = _evaluation("T", 0)
+    kinetic_gradient = _evaluation("T", 1)
+    kinetic_hessian = _evaluation("T", 2)
 
     def gradient(self, y: Array, *t: Array) -> Array:
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
             return concatenate([self.potential_gradient(q, *t), self.kinetic_gradient(p, *t)])
-        return self._vector("H")(y, *t)
-
-    def hessian(self, y: Array, *t: Array) -> Array:
-        return self._matrix("H")(y, *t)
-
-    def time_derivative(self, y: Array, t: Array) -> Array:
-        """∂H/∂t: (..., 2d) to (...)."""
-        return self._scalar("Ht")(y, t)
+        return self._derivative("H", 1)(y, *t)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
         """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""
         return self._function(name, lambda: expressions, assemble)
-
-    def potential(self, q: Array, *t: Array) -> Array:
-        return self._scalar("V")(q, *t)
-
-    def potential_gradient(self, q: Array, *t: Array) -> Array:
-        return self._vector("V")(q, *t)
-
-    def potential_hessian(self, q: Array, *t: Array) -> Array:
-        return self._matrix("V")(q, *t)
-
-    def curvature(self, q: Array, *t: Array) -> Array:
-        return self._scalar("W")(q, *t)
-
-    def curvature_gradient(self, q: Array, *t: Array) -> Array:
-        return self._vector("W")(q, *t)
-
-    def kinetic(self, p: Array, *t: Array) -> Array:
-        return self._scalar("T")(p, *t)
-
-    def kinetic_gradient(self, p: Array, *t: Array) -> Array:
-        return self._vector("T")(p, *t)
-
-    def kinetic_hessian(self, p: Array, *t: Array) -> Array:
-        return self._matrix("T")(p, *t)
 
     def drifted(self, p: Array, t: Array, s: Array) -> Array:
         """`drift` for times t and durations s, numbers or (...): (..., d) to (..., d)."""
@@ -414,14 +405,14 @@ class SymbolicHamiltonian(Definition):
     def _variables(self, name: str) -> tuple[sp.Symbol, ...]:
         return {"V": self.q, "T": self.p, "W": self.q, "drift": self.p}.get(name, self.q + self.p)
 
-    def _scalar(self, name: str) -> Callable[..., Array]:
-        return self._function(name, lambda: [getattr(self, name)], lambda values, like: assemble(values, like)[..., 0])
+    def _derivative(self, name: str, order: int) -> Callable[..., Array]:
+        """A function of arrays: an expression, its gradient or its Hessian, by the order."""
 
-    def _vector(self, name: str) -> Callable[..., Array]:
-        return self._function(name + "'", lambda: gradient(getattr(self, name), self._variables(name)), assemble)
+        def expressions() -> list[sp.Expr]:
+            f, x = getattr(self, name), self._variables(name)
+            return [f] if order == 0 else gradient(f, x) if order == 1 else list(hessian(f, x))
 
-    def _matrix(self, name: str) -> Callable[..., Array]:
-        return self._function(name + "''", lambda: list(hessian(getattr(self, name), self._variables(name))), _square)
+        return self._function(name + "'" * order, expressions, (_single, assemble, _square)[order])
 
     def _function(
         self,
@@ -449,8 +440,7 @@ class SymbolicHamiltonian(Definition):
                 )
             columns = [x[..., i] for i in range(n)]
             times = times[: len(moving)]
-            if library == "torch" and moving:
-                times = _doubles(times, x)
+            times = tuple(beside(t, x) for t in times)
             sampled_values = [self.samples[a.name_of_samples](at(*times), a.order) for a, at in values_of_samples]
             try:
                 values = generated[library](*columns, *times, *numbers, *sampled_values)
@@ -469,27 +459,21 @@ class SymbolicHamiltonian(Definition):
         timed = self.kinetic_timed if name in ("T", "drift") else self.timed
         return (self.time,) * timed + (DURATION,) * (name == "drift")
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Everything but the generated functions, which cannot be pickled and are generated again."""
-        left_out = ("_functions", "_switches", "poles")
-        return {name: value for name, value in vars(self).items() if name not in left_out}
+    _generated = ("_functions", "_switches", "poles")
 
     @cached_property
     def _functions(self) -> dict[str, Callable[[Array], Array]]:
         return {}
 
 
+def _single(values: Sequence[Array], like: Array) -> Array:
+    return assemble(values, like)[..., 0]
+
+
 def _square(values: Sequence[Array], like: Array) -> Array:
     """Entries of a square matrix, row by row, as arrays: (..., n, n)."""
     flat, n = assemble(values, like), math.isqrt(len(values))
     return flat.reshape(*flat.shape[:-1], n, n)
-
-
-def _doubles(times: Sequence[Any], x: Any) -> tuple[Any, ...]:
-    """Times as tensors of doubles, on the device of x."""
-    import torch
-
-    return tuple(torch.as_tensor(t, dtype=torch.float64, device=x.device) for t in times)
 
 
 COORDINATE_LIKE = re.compile(r"[pqv]?[xyzr]\d?|[PQX]\d*|v|[pq]_?\w|[vpq]?_?(theta|phi)\d?")

@@ -258,7 +258,6 @@ class HamiltonianSystem(Hamiltonian, Shown):
         M = symbols.inverse_mass
         inverse_mass = None if M is None else matrices.simplest(matrices.from_entries(M.shape, M.todok()))
         Hamiltonian.__init__(self, settled.name, symbols, inverse_mass, M is not None)
-        self.symbols = symbols
         self._set_friction(damping)
         self._set_scene(params, settled)
         self._set_period(period)
@@ -322,7 +321,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         from sympflow.hamiltonian.lattice import LatticeHamiltonian
 
         local = LatticeHamiltonian(onsite, bond, shape, boundary, kinetic, fields, params)
-        return cls._of_pieces(local, damping, Scene.given(scene, name="lattice"))
+        return cls._of_local(local, damping, Scene.given(scene, name="lattice"))
 
     @classmethod
     def pairs(
@@ -384,7 +383,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         from sympflow.hamiltonian.bodies import PairsHamiltonian
 
         local = PairsHamiltonian(potential, masses, dim, box, cutoff, softening, params, bodies)
-        return cls._of_pieces(local, damping, Scene.given(scene, name="pairs", t_span=(0.0, 1.0)))
+        return cls._of_local(local, damping, Scene.given(scene, name="pairs", t_span=(0.0, 1.0)))
 
     @classmethod
     def planets(
@@ -454,9 +453,9 @@ class HamiltonianSystem(Hamiltonian, Shown):
         local = PlanetsHamiltonian(masses, G, y0, coordinates, encounter, extra, params)
         span, dt = (0.0, 1000 * float(local.frame.periods.max())), local.frame.longest_step
         given = {name: value for name, value in scene.items() if value is not None} | {"y0": y0}
-        return cls._of_pieces(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))
+        return cls._of_local(local, None, Scene.given(given, name="planets", t_span=span, dt=dt))
 
-    def piece(
+    def subsystem(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
     ) -> HamiltonianSystem:
         """A few sites of a lattice with the same terms: what a flow for a large one is fitted on.
@@ -480,30 +479,30 @@ class HamiltonianSystem(Hamiltonian, Shown):
         Raises
         ------
         TypeError, ValueError
-            If the system has no piece, or has a rate of friction for each site, or the shape does not fit its bonds.
+            If the system is no lattice, or has a rate of friction for each site, or the shape does not fit its bonds.
 
         Examples
         --------
-        >>> HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=1024).piece(8).ndof
+        >>> HamiltonianSystem.lattice(bond="r**2/2 + r**4/4", shape=1024).subsystem(8).ndof
         8
         """
         if self.local is None:
             raise TypeError(
-                f"`system` {self.name!r} is no lattice, of which a few sites are a piece: define it by "
-                "HamiltonianSystem.lattice."
+                f"`system` {self.name!r} is not a lattice, and only lattices have subsystems of a few sites: define it "
+                "by HamiltonianSystem.lattice."
             )
-        local = self.local.piece(sites, boundary)
+        local = self.local.subsystem(sites, boundary)
         if self.damping is not None and self.damping.ndim:
             raise ValueError(
-                f"`damping` of {self.name!r} differs from place to place, and a piece is of a system whose parts are "
-                "alike: give one rate."
+                f"`damping` of {self.name!r} differs from site to site, and a subsystem needs sites that are alike: "
+                "give one rate."
             )
         domain = None
         with suppress(ValueError):  # of states at rest none follow
             domain = self.local_states()
-        return HamiltonianSystem._of_pieces(local, self.damping, self._piece_scene(domain))
+        return HamiltonianSystem._of_local(local, self.damping, self._subsystem_scene(domain))
 
-    def _piece_scene(self, domain: Domain | None) -> Scene:
+    def _subsystem_scene(self, domain: Domain | None) -> Scene:
         """The scene of a few of the sites or bodies."""
         return Scene(self.name, domain, None, self.t_span, self.dt)
 
@@ -523,12 +522,12 @@ class HamiltonianSystem(Hamiltonian, Shown):
     @cached_property
     def _few_sites(self) -> HamiltonianSystem:
         assert self.local is not None
-        return HamiltonianSystem._of_pieces(self.local.piece(), self.damping, self._piece_scene(None))
+        return HamiltonianSystem._of_local(self.local.subsystem(), self.damping, self._subsystem_scene(None))
 
     @property
     def few_sites(self) -> HamiltonianSystem:
         local = self.local
-        alike = local is not None and local.uniform and local.has_piece
+        alike = local is not None and local.uniform and local.has_subsystem
         return self._few_sites if alike and (self.damping is None or not self.damping.ndim) else self
 
     @classmethod
@@ -584,10 +583,10 @@ class HamiltonianSystem(Hamiltonian, Shown):
         from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian
 
         local = WaveFunctionHamiltonian(onsite, dispersion, shape, length, params)
-        return cls._of_pieces(local, None, Scene.given(scene, name="schroedinger"))
+        return cls._of_local(local, None, Scene.given(scene, name="schroedinger"))
 
     @classmethod
-    def _of_pieces(cls, local: LocalHamiltonian, damping: float | ArrayLike | None, scene: Scene) -> HamiltonianSystem:
+    def _of_local(cls, local: LocalHamiltonian, damping: float | ArrayLike | None, scene: Scene) -> HamiltonianSystem:
         """A system by a definition of one piece."""
         self = cls.__new__(cls)
         Hamiltonian.__init__(self, scene.name, local, local.inverse_mass, local.quadratic_kinetic)
@@ -605,7 +604,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         if self.autonomous:
             raise TypeError("`period` only goes with `time`, for H that depends on t: leave it out.")
         check_positive("period", period, most=1e100)
-        known = self._definition.has_period(float(period))
+        known = self.definition.has_period(float(period))
         if known is False:
             raise ValueError(
                 f"`period` {period!r} is none of H, which differs a period later: give the period of the drive, such "
@@ -631,7 +630,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         self.domain = None if scene.domain is None else domain_of(scene.domain, self)
         if self.domain is not None and self.domain.sample(1).shape != (1, 2 * self.ndof):
             raise ValueError(f"`domain` must be a set of states [q, p] of length {2 * self.ndof}.")
-        self._definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
+        self.definition.place(self.y0, self.domain, self.inverse_mass, self.t_span)
 
     @property
     def scene(self) -> Scene:
@@ -723,7 +722,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         {'k': 2.5}
         """
         if self.local is not None:
-            return HamiltonianSystem._of_pieces(self.local.with_params(values), self.damping, self.scene)
+            return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
         self.check_parameters(values)
         assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.named_time
@@ -756,14 +755,14 @@ class HamiltonianSystem(Hamiltonian, Shown):
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
         if kind in self._tested:
-            self._definition.check_unchanged()
+            self.definition.check_unchanged()
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 
         given = one_lane(like) if math.prod(like.shape) else self.y0
         probes = probe_states(given, self.domain, 2 * self.ndof)
         n_given = min(FEW, math.prod(like.shape) // (2 * self.ndof))
-        self._definition.check(probes, like, n_given, *self._probed_times())
+        self.definition.check(probes, like, n_given, self.probe_times())
         self._tested = self._tested | {kind: reach(probes[:, : self._arguments], self._arguments // self.ndof)}
 
     def check_functions_along(self, y: Array) -> bool:
@@ -785,7 +784,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         if not len(far):
             return False
         try:
-            self._definition.check(far, y, 0, *self._probed_times())
+            self.definition.check(far, y, 0, self.probe_times())
         except (ValueError, TypeError) as error:
             warn(f"On this run, far from its start: {error}", RuntimeWarning)
             return True
@@ -793,9 +792,10 @@ class HamiltonianSystem(Hamiltonian, Shown):
         self._tested = self._tested | {kind: reach(seen, self._arguments // self.ndof)}
         return False
 
-    def _probed_times(self) -> tuple[np.ndarray, ...]:
-        """The times at which functions of a driven system are tested."""
-        return () if self.autonomous else (probe_times(*self.t_span),)
+    def probe_times(self, length: float | None = None) -> list[float]:
+        """The times at which functions of the system are tried: the first one, of a driven system others after it."""
+        t0, t1 = self.t_span
+        return [t0] if self.autonomous else probe_times(t0, t1 if length is None else t0 + length).tolist()
 
     @property
     def _arguments(self) -> int:
@@ -813,7 +813,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         >>> [(kick.t, kick(np.array([0.0, 0.5]))) for kick in system.kicks(0, 2)]
         [(1.0, array([0. , 1.5]))]
         """
-        return self._definition.kicks(t0, t1, self.dt / 4)
+        return self.definition.kicks(t0, t1, self.dt / 4)
 
     # structure --------------------------------------------------------------------------------------
 
@@ -844,7 +844,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
             kind += f", damping {np.array2string(self.damping, threshold=9, precision=6).replace(chr(10), '')}"
         if not self.autonomous:
             kind += ", driven" if self.period is None else f", driven with period {self.period:g}"
-        if self._definition.given_functions:
+        if self.definition.given_functions:
             kind += f", arrays: it could not be traced, for {self.untraced}" if self.form is None else ", traced"
         degrees = f"{self.ndof:,} degree{'s' * (self.ndof > 1)} of freedom"
         named = self.title if self.name == UNNAMED and self.symbols is not None else f"{self.name}({params})"

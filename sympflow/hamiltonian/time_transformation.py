@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -10,9 +11,9 @@ import numpy as np
 
 from sympflow.arguments import real_number
 from sympflow.arrays import Array, concatenate, library
+from sympflow.arrays import like as as_like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.function_checks import as_like
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.scene import Scene
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
@@ -75,7 +76,7 @@ def time_transformed(
         "and no Hamiltonian in another time", "solve it in the physical time, by 'verlet' or 'dop853' for instance"
     )
     system.check_autonomous(
-        "so that there is no energy E that a time transformation could hold",
+        "and a time transformation needs an energy E that is constant",
         "solve it in the physical time, by 'kahan_li8' or 'dop853' for instance",
     )
     if not system.separable:
@@ -155,11 +156,12 @@ def projected(x: Array) -> Array:
 def _expression(system: HamiltonianSystem, c: float) -> Any:
     import sympy as sp
 
+    from sympflow.hamiltonian.symbolic import exact
+
     symbols = system.written
     assert symbols is not None
     B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
-    numbered = sp.nsimplify(c) if c.is_integer() else sp.Float(c)
-    return sp.log(symbols.T + B) - sp.log(numbered - symbols.V)
+    return sp.log(symbols.T + B) - sp.log(exact(c) - symbols.V)
 
 
 class _Logarithmic(Definition):
@@ -171,7 +173,7 @@ class _Logarithmic(Definition):
         self.ndof, self._system, self._c = system.ndof + 1, system, c
         self.given = system.functions_given
 
-    def check(self, states: np.ndarray, like: Array, n_given: int) -> None:
+    def check(self, states: np.ndarray, like: Array, n_given: int, times: Sequence[float] = ()) -> None:
         self._system.check_functions(projected(as_like(states[:n_given], like)) if n_given else None)
 
     def kinetic(self, P: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping
 from functools import cached_property
@@ -13,9 +12,10 @@ import sympy as sp
 
 from sympflow.arguments import real_number
 from sympflow.arrays import Array, concatenate, library, like
+from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
-from sympflow.hamiltonian.lattice import checked_params, checked_shape
-from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, letters, parsed
+from sympflow.hamiltonian.lattice import checked_shape
+from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, checked_params, letters, parsed
 from sympflow.hamiltonian.normal_modes import SpectralPart, Transform
 
 
@@ -86,8 +86,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
 
     def with_params(self, values: Mapping[str, Any]) -> Self:
         self.check_names(values)
-        other = copy.copy(self)
-        vars(other).pop("_functions", None)
+        other = bare_copy(self)
         other.params = checked_params({**self.params, **values}, self.grid)
         other._set_rates()
         return other

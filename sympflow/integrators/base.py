@@ -23,6 +23,7 @@ from sympflow.integrators.contract import (
     ENDED,
     Failure,
     Integrator,
+    Interrupted,
     Outcome,
     Problem,
     Steps,
@@ -250,7 +251,11 @@ class Recorder:
 
 def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch) -> Outcome:
     """Run an integrator that does not look for events itself: they are sought on its dense output afterwards."""
-    full = integrator.run(replace(problem, t_eval=None, save_every=1, dense_output=True, events=None))
+    stopped = False
+    try:
+        full = integrator.run(replace(problem, t_eval=None, save_every=1, dense_output=True, events=None))
+    except Interrupted as stop:
+        full, stopped = stop.outcome, True
     if full.sol is None:
         raise ValueError(
             f"`events` are located on the dense output, which method {integrator.name!r} does not give: use another "
@@ -275,4 +280,7 @@ def run_and_search(integrator: Integrator, problem: Problem, search: EventSearch
             t, y = np.append(t, t_end), stack([*y, search.end[1]], axis=0)
     if search.end:
         full.status, full.message = 1, ENDED
-    return replace(full, t=t, y=y, sol=full.sol if problem.dense_output else None)
+    outcome = replace(full, t=t, y=y, sol=full.sol if problem.dense_output else None)
+    if stopped and not search.end:
+        raise Interrupted(outcome)
+    return outcome

@@ -93,7 +93,7 @@ def _flow_holds(system: HamiltonianSystem, y0: Array, tol: float | None) -> bool
 
 def _falls_to_the_origin(system: HamiltonianSystem, y0: np.ndarray) -> bool:
     """True if V < 0 along the rays of all positions, and −∞ at their end at q = 0."""
-    if not (system.poles and system.separable and system.keeps_energy):
+    if not (system.definition.poles and system.separable and system.keeps_energy):
         return False
     q = y0.reshape(-1, y0.shape[-1])[:MOST_STATES, : system.ndof]
     with np.errstate(all="ignore"):

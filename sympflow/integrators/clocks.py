@@ -9,8 +9,9 @@ that solves t(σ) = t, to rounding.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import lru_cache
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,15 +19,15 @@ import numpy as np
 from sympflow.arrays import Array, is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
 from sympflow.integrators.grid import Grid
+from sympflow.integrators.grid_runs import Run, broken_off
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
 FIRST_CHUNK = 2**16  # steps, at most, before it is known how fast time goes
-LONGEST_STRIDE = 64  # steps from one state that is kept to the next, where few outputs are wanted
+LONGEST_STRIDE = 64  # steps from one state that a compiled pass keeps to the next, where few outputs are wanted
 MOST_KEPT = 100_000_000  # numbers that a run may store where every step is an output
 FEW_EVALUATIONS = 20_000  # of forces on arrays, half a second, before a run whose time hardly advances is ended;
 EVALUATIONS_EACH = 50  # and these for each step of the physical length dt within the interval,
@@ -61,42 +62,14 @@ ARRAYS_ONLY = (
 )
 
 
-class OnClock(Protocol):
-    """A method that is run on the logarithmic clock."""
-
-    name: ClassVar[str]
-
-    def check_library(self, y0: Array) -> None:
-        """Refuse tensors: see `Integrator`."""
-        ...
-
-    def reach_times(
-        self,
-        clock: LogarithmicClock,
-        h: float,
-        start: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        backend: str,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run in one compiled pass: see `kernels.elapsed_times.reach_times`. None where there is none."""
-        ...
-
-    @property
-    def inner(self) -> FixedStep:
-        """The method that is applied to the transformed system."""
-        ...
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count evaluations on the transformed system, as `FixedStep.evaluations`."""
-        ...
-
-
 class LogarithmicClock(NamedTuple):
-    """A method with equal steps in s, on one system."""
+    """A method with equal steps in s, on one system.
 
-    method: OnClock
+    The method has an `inner` one, which is applied to the transformed system, with `evaluations` on that; and
+    `reach_times`, a run in one compiled pass as `kernels.elapsed_times.reach_times`, None where there is none.
+    """
+
+    method: Any
     system: HamiltonianSystem
     transformed: HamiltonianSystem
     dt: float
@@ -238,14 +211,13 @@ def reach(
     return best, best_sigma
 
 
-class PhysicalRun:
-    """One run: chunks of steps, equal in s, until the physical end is passed."""
+class PhysicalRun(Run):
+    """A run in chunks of steps that are equal in s, until the physical end is passed."""
 
     def __init__(self, clock: LogarithmicClock, problem: Problem) -> None:
-        self.clock, self.problem = clock, problem
-        self.system = problem.system
-        self.transformed = clock.transformed
-        self.d, c = self.system.ndof, self.transformed.params["shift"]
+        super().__init__(clock.method, problem, clock.dt)
+        self.clock, self.system, self.transformed = clock, problem.system, clock.transformed
+        self.d, c = self.system.ndof, clock.shift
         rows = problem.y0.reshape(-1, problem.y0.shape[-1])
         with np.errstate(all="ignore"):
             gap = np.asarray(c - self.system.potential(rows[:, : self.d]))
@@ -267,25 +239,32 @@ class PhysicalRun:
         self.h = self.sign * clock.new_step
         compiled = problem.backend != "array" and problem.y0.dtype == np.float64 and self.system.written is not None
         self.most_steps = self._most_steps(COMPILED_FOR_ONE if compiled else 1)
-        self.n_steps = np.zeros(len(rows), dtype=int)
-        self.n_extra, self.backend = 0, ""
+        self.n_steps, self.n_extra = np.zeros(len(rows), dtype=int), 0
         self.stepper = self._stepper()
+        self.elapsed, self.done = np.zeros(len(rows)), 0.0
         self.failed_at = np.full(len(rows), np.nan)
         self.stalled = np.zeros(len(rows), dtype=bool)
-        self.stride = 1
+        times = problem.t_eval
+        if times is None and problem.y0.ndim > 1:  # the trajectories take different steps: report on a common grid
+            times = Grid(problem.t0, problem.t1, clock.dt).outputs(None, problem.save_every)
+        self.times: np.ndarray | None = times
+        """The times of outputs; None for those of the steps of a single trajectory."""
+        self.wanted = np.empty(0) if times is None else (times - problem.t0).astype(self.start.dtype)
+        self.out = np.full((len(self.wanted), len(rows), 2 * self.d), np.nan, dtype=self.start.dtype)
+        self.out[self.wanted == 0] = projected(self.start)
+        self.delivered = np.full(len(rows), int((self.wanted == 0).sum()))
+        self.kept: list[tuple[np.ndarray, np.ndarray]] = []
 
     def _stepper(self) -> Stepper:
         clock, start = self.clock, self.start[0] if len(self.start) == 1 else self.start
         return clock.method.inner.stepper(Problem(clock.transformed, 0.0, self.h, start, backend=self.problem.backend))
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but the stepper, whose compiled loops belong to a process."""
-        return {name: value for name, value in self.__dict__.items() if name != "stepper"}
+        """All but the stepper, whose compiled loops belong to a process, and a function that is told of progress."""
+        problem = replace(self.problem, progress=None)
+        return {name: x for name, x in vars(self).items() if name != "stepper"} | {"problem": problem}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        if "integrator" in state:  # of a former version
-            integrator, _ = state.pop("integrator"), state.pop("inner")
-            state["clock"] = integrator.on_clock(state["system"])
         for name, value in state.items():
             setattr(self, name, value)
         self.stepper = self._stepper()
@@ -294,58 +273,55 @@ class PhysicalRun:
         """Steps after which time hardly advances: before a collision they would never end, so it is evaluations."""
         made = self.clock.method.evaluations(1000, 0, 0, "numpy")
         stages = max(1, round(sum(made.values()) / 1000))
-        nominal = self.length / self.clock.dt
+        nominal = self.length / self.dt
         return int(allowance * (FEW_EVALUATIONS / stages + max(EVALUATIONS_EACH / stages, STEPS_EACH) * nominal))
 
     def chunks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Chunks of states (N, n + 1, 2d + 2), `stride` steps apart, and the last (N,) of a run, at or past its end."""
-        x, total = self.start, 0
-        n = self._chunk(1.1 * self.length / self.clock.dt + 2, FIRST_CHUNK)
+        """Chunks of states (N, n + 1, 2d + 2), and the last one (N,) of each trajectory, at or past its end."""
+        x, rows, total = self.start, np.arange(len(self.start)), 0
+        n = self._chunk(1.1 * self.length / self.dt + 2, FIRST_CHUNK)
         running = np.full(len(x), self.length > 0)
         while running.any():
-            if self.most_steps - total < self.stride:
-                self.stride = 1
-            n = min(n, max(1, (self.most_steps - total) // self.stride))
-            states, good = x[:, None].repeat(n + 1, axis=1), np.zeros(len(x), dtype=int)
-            states[running], finite = self._steps(x[running], n * self.stride, self.stride)
-            good[running] = np.minimum(finite // self.stride, n)
+            n = min(n, max(1, self.most_steps - total))
+            if running.all():
+                states, good = self._steps(x, n)
+            else:
+                states, good = x[:, None].repeat(n + 1, axis=1), np.zeros(len(x), dtype=int)
+                states[running], good[running] = self._steps(x[running], n)
             t = self.sign * states[..., self.d]
-            forward = np.isfinite(t) & (np.maximum.accumulate(np.where(np.isfinite(t), t, np.inf), axis=1) <= t)
-            good = np.minimum(good, np.where(forward.all(1), n, np.argmin(forward, axis=1) - 1))  # time must not turn
+            forward = t[:, 1:] >= t[:, :-1]
+            good = np.minimum(good, np.where(forward.all(1), n, np.argmin(forward, axis=1)))  # time must not turn
             passed = (t >= self.length) & (np.arange(n + 1) <= good[:, None])
             last = np.where(passed.any(1), passed.argmax(1), good)
             last[~running] = 0
             lost = running & ~passed.any(1) & (good < n)
-            if self.stride > 1 and lost.any():  # step by step, to see where
-                steps, self.stride = n * self.stride, 1
-                n = self._chunk(steps, FIRST_CHUNK)
-                continue
-            if total + n * self.stride >= self.most_steps:
+            total += n
+            if total >= self.most_steps:
                 self.stalled = running & ~passed.any(1) & ~lost
                 lost |= self.stalled
-            self.n_steps += self.stride * last
-            total += n * self.stride
-            rows = np.arange(len(x))
-            elapsed = np.where(np.isnan(t[rows, last]), 0, t[rows, last])  # of a start that is not finite
-            self.failed_at[lost] = self.problem.t0 + self.sign * elapsed[lost]
+            self.n_steps += last
+            self.elapsed = np.nan_to_num(t[rows, last], posinf=np.inf)  # 0 of a start that is not finite
+            self._end(lost)
             yield states, last
             paces = np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last, 1), np.nan)
-            pace = np.fmin.reduce(paces) / self.stride  # of those that are numbers, if any is
+            pace = np.fmin.reduce(paces)  # of those that are numbers, if any is
             running = running & ~passed.any(1) & ~lost
             x = states[rows, last]
-            left = (self.length - t[rows, last][running]).max(initial=0.0)
-            n = self._chunk(1.02 * left / pace + 2 if pace > 0 else np.inf, 4 * n * self.stride)
+            left = (self.length - self.elapsed[running]).max(initial=0.0)
+            n = self._chunk(1.02 * left / pace + 2 if pace > 0 else np.inf, 4 * n)
+
+    def _end(self, rows: np.ndarray) -> None:
+        """Note that trajectories end where they are."""
+        self.failed_at[rows] = self.problem.t0 + self.sign * self.elapsed[rows]
 
     def _chunk(self, steps: float, most: int) -> int:
-        """The number of states of a chunk of so many steps, or the most that there may be."""
-        kept = max(16, LARGEST_CHUNK // self.start.size)
-        return int(min(max(16, steps if steps < most else most) / self.stride + 1, kept))
+        """The number of steps of a chunk that is to have so many, or the most that there may be."""
+        return int(min(max(16, steps if steps < most else most) + 1, max(16, LARGEST_CHUNK // self.start.size)))
 
-    def _steps(self, x: np.ndarray, n: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
-        """Each `stride`-th of n steps from the states x (N, 2d + 2): (N, 1 + n/stride, 2d + 2), and the last finite."""
+    def _steps(self, x: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """The states (N, 1 + n, 2d + 2) of n steps from x (N, 2d + 2), and the last finite ones."""
         alone = len(x) == 1
-        found, finite = self.stepper.rollout(x[0] if alone else x, self.h, n, np.arange(0, n + 1, stride))
-        self.backend = self.stepper.backend
+        found, finite = self.stepper.rollout(x[0] if alone else x, self.h, n, np.arange(n + 1))
         return (found[None] if alone else np.moveaxis(found, 0, 1)), np.atleast_1d(finite)
 
     def reach(self, before: np.ndarray, after: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -364,82 +340,70 @@ class PhysicalRun:
         x[at_end] = after[at_end]
         return x
 
-    def outcome(self) -> Outcome:
-        problem = self.problem
-        single = problem.y0.ndim == 1
-        times = problem.t_eval
-        if times is None and not single:  # the trajectories take different steps: report on a common grid
-            times = Grid(problem.t0, problem.t1, self.clock.dt).outputs(None, problem.save_every)
-        N = len(self.start)
-        wanted = np.empty(0) if times is None else (times - problem.t0).astype(self.start.dtype)
-        out = np.full((len(wanted), N, 2 * self.d), np.nan, dtype=self.start.dtype)
-        at_start = wanted == 0
-        out[at_start] = projected(self.start)
-        delivered = np.full(N, int(at_start.sum()))
-        kept: list[tuple[np.ndarray, np.ndarray]] = []
-        if times is not None and not problem.dense_output:  # what few outputs do not need is not kept
-            steps = self.length / self.clock.dt / (len(wanted) + 1)
-            self.stride = int(min(max(1.0, steps**0.5), LONGEST_STRIDE))
-        more = problem.dense_output or times is None or bool((delivered < len(wanted)).any())
-        for states, last in self.chunks() if more else ():
-            if problem.dense_output or times is None:
-                kept.append((states, last))
-                self._check_memory(kept)
-            if times is not None:
-                self._deliver(states, last, wanted, delivered, out)
-                if not problem.dense_output and (delivered == len(wanted)).all():
-                    break
-        path = _Path(self, kept) if kept or problem.dense_output else None
-        if times is None:
+    def windows(self) -> Iterator[float]:
+        keeps = self.problem.dense_output or self.times is None
+        if not keeps and (self.delivered == len(self.wanted)).all():
+            return
+        for states, last in self.chunks():
+            if keeps:
+                self.kept.append((states, last))
+                if sum(states.size for states, _ in self.kept) > MOST_KEPT:
+                    raise ValueError(
+                        f"`t_eval` is not given, and the steps are so short that more than {MOST_KEPT:.0e} values "
+                        "would be stored: choose the times with `t_eval`, leave dense_output out, or raise `dt`."
+                    )
+            if self.times is not None:
+                self._deliver(states, last)
+                if not keeps and (self.delivered == len(self.wanted)).all():
+                    return
+            yield self._slowest
+
+    @property
+    def _slowest(self) -> float:
+        """The time that has elapsed for all trajectories that have not failed."""
+        return float(np.minimum(self.elapsed, self.length)[np.isnan(self.failed_at)].min(initial=self.length))
+
+    @property
+    def reached(self) -> float:
+        return self.problem.t0 + self.sign * self.done
+
+    def stop(self) -> None:
+        super().stop()
+        self.done = self._slowest
+        self._end(np.isnan(self.failed_at) & (self.elapsed < self.length))
+
+    def taken(self) -> Outcome:
+        problem, single = self.problem, self.problem.y0.ndim == 1
+        path = _Path(self, self.kept) if self.kept or problem.dense_output else None
+        if self.times is None:
             times, out = self._every_step(path)
-        elif single:
-            keep = int(delivered[0])
-            times, out = times[:keep], out[:keep]
+        else:
+            n = int(self.delivered.max()) if single or self.stopped else len(self.times)
+            times, out = self.times[:n], self.out[:n]
         y = out.reshape(len(times), *problem.y0.shape)
         failed = np.isfinite(self.failed_at)
         n_steps = int(self.n_steps.max(initial=0))
-        stats: dict[str, Any] = {
-            "dt": self.clock.dt,
-            "n_steps": n_steps,
-            **self.stepper.evaluations(n_steps, n_steps, self.n_extra),
-            "backend": self.backend or "numpy",
-        }
-        status: Any = 0 if single else np.where(failed, -1, 0).reshape(y.shape[1:-1])
-        outcome = Outcome(times, y, status, finished(problem), stats)
-        if failed.any():
-            if single:
-                outcome.status = -1
+        status: Any = -int(failed[0]) if single else np.where(failed, -1, 0).reshape(y.shape[1:-1])
+        stats = self.stats(n_steps, n_steps, n_steps, self.n_extra)
+        outcome = Outcome(times, y, status, finished(problem), stats, path if problem.dense_output else None)
+        if failed.any() and not self.stopped:
             stats["failed_at"] = float(self.failed_at[0]) if single else self.failed_at.reshape(y.shape[1:-1])
-            outcome.message = self._failure(int(np.argmax(failed)), int(failed.sum()))
-        if problem.dense_output:
-            outcome.sol = path
+            i = int(np.argmax(failed))
+            outcome.message = broken_off(
+                Failure.STALLED if self.stalled[i] else Failure.CLOCK,
+                float(self.failed_at[i]),
+                failed=None if single else np.argwhere(outcome.status),
+                of=len(failed),
+                n_steps=self.n_steps[i],
+            )
         return outcome
 
-    @staticmethod
-    def _check_memory(kept: list[tuple[np.ndarray, np.ndarray]]) -> None:
-        if sum(states.size for states, _ in kept) > MOST_KEPT:
-            raise ValueError(
-                f"`t_eval` is not given, and the steps are so short that more than {MOST_KEPT:.0e} values would be "
-                "stored: choose the times with `t_eval`, leave dense_output out, or raise `dt`."
-            )
-
-    def _failure(self, i: int, count: int) -> str:
-        what, remedy = (Failure.STALLED if self.stalled[i] else Failure.CLOCK).value
-        what = what.format(n_steps=self.n_steps[i])
-        which = (
-            "" if len(self.start) == 1 else f"{count} of {len(self.start)} trajectories failed, the first (index {i}): "
-        )
-        return f"{which}{what}, after t = {self.failed_at[i]:.15g}. {remedy}."
-
-    def _deliver(
-        self, states: np.ndarray, last: np.ndarray, wanted: np.ndarray, delivered: np.ndarray, out: np.ndarray
-    ) -> None:
+    def _deliver(self, states: np.ndarray, last: np.ndarray) -> None:
         """The outputs that fall into a chunk."""
-        t = self.sign * states[..., self.d]
+        wanted, delivered, t = self.wanted, self.delivered, self.sign * states[..., self.d]
         ahead = t[np.arange(len(t)), last]
         end = np.where(last > 0, np.searchsorted(self.sign * wanted, ahead, side="right"), delivered)
         count = np.maximum(end - delivered, 0)
-        ended = np.flatnonzero((last > 0) & (ahead >= self.length))
         row = np.repeat(np.arange(len(t)), count)
         output = np.arange(len(row)) - np.repeat(np.cumsum(count) - count - delivered, count)
         due = self.sign * wanted[output]
@@ -448,26 +412,9 @@ class PhysicalRun:
         else:
             k = np.concatenate([t[i, : last[i] + 1].searchsorted(due[row == i]) for i in np.flatnonzero(count)])
         k = k.clip(1) - 1
-        delivered += count
-        target = wanted[output]
-        if self.stride > 1 and (len(row) or len(ended)):
-            rows, ks = np.append(row, ended).astype(int), np.append(k, last[ended] - 1).astype(int)
-            targets = np.append(target, np.full(len(ended), self.sign * self.length, target.dtype))
-            before, after, step = self._between(states[rows, ks], targets)
-            self.n_steps[ended] += step[len(row) :] + 1 - self.stride
-            before, after = before[: len(row)], after[: len(row)]
-        else:
-            before, after = states[row, k], states[row, k + 1]
         if len(row):
-            out[output, row] = projected(self.reach(before, after, target))
-
-    def _between(self, x: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The states before and after the step that passes a time, of `stride` steps from x (n, 2d + 2), and which."""
-        states, _ = self._steps(x, self.stride, 1)
-        beyond = self.sign * (states[..., self.d] - target[:, None]) >= 0
-        k = np.where(beyond.any(1), beyond.argmax(1), self.stride).clip(1) - 1
-        rows = np.arange(len(x))
-        return states[rows, k], states[rows, k + 1], k
+            self.out[output, row] = projected(self.reach(states[row, k], states[row, k + 1], wanted[output]))
+        self.delivered = delivered + count
 
     def _every_step(self, path: _Path | None) -> tuple[np.ndarray, np.ndarray]:
         """Times and states (n, 1, 2d) of every `save_every`-th step of a single trajectory, and of the end."""

@@ -38,21 +38,10 @@ _PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary
 
 
 class Composition(ABC, ArraySteps):
-    """A scheme composed of the exact flows of the parts of one system.
+    """A scheme composed of the exact flows of the parts of one system; `method` is its name in messages.
 
-    A subclass may take options of its own: `parts`, `omega` or `corrector` of `Splitting`.
-
-    Parameters
-    ----------
-    method : str
-        The name of the method, for messages.
-    scheme : Scheme
-    system : HamiltonianSystem
-
-    Raises
-    ------
-    ValueError
-        If the splitting, or the scheme with it, does not apply to the system.
+    A subclass may take options of its own: `parts`, `omega` or `corrector` of `Splitting`. A ValueError says where the
+    splitting, or the scheme with it, does not apply to the system.
     """
 
     compensates: ClassVar[bool] = False
@@ -150,7 +139,7 @@ class KineticPotential(Composition):
         if not system.separable:
             raise ValueError(
                 f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
-                f"{system.instead}."
+                f"{system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
@@ -262,7 +251,7 @@ class KineticPotential(Composition):
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
         system = self.system
         if system.symbols is None:
-            raise ValueError(f"`system` {system.name!r} is no symbolic one.")
+            raise ValueError(f"`system` {system.name!r} is not symbolic.")
         if system.kinetic_timed:
             raise ValueError(f"`system` {system.name!r} has a kinetic energy that depends on t.")
         kernel = _splitting_loops()(system, names).kernel(self.scheme, compensated)

@@ -103,7 +103,7 @@ class Failure(Enum):
     )
     STALLED = (
         "After {n_steps} steps time hardly advances any more, as before a collision",
-        "End `t_span` earlier, or raise `dt`",
+        "Raise `dt`",
     )
 
 

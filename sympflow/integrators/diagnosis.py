@@ -54,7 +54,7 @@ _TOLD: WeakSet[Any] = WeakSet()
 def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, rows: ParameterRows | None) -> None:
     """Note poles that a run passed, digits that it lost, and when the solution of one that failed becomes infinite."""
     system, failed = problem.system, _failed(outcome)
-    looked = system.poles is not None or problem.parameter_values is not None
+    looked = system.definition.poles is not None or problem.parameter_values is not None
     if not problem.diagnosed or not (failed or looked) or not readable(outcome.y):
         return
     passed, plain = False, problem.parameter_values is None
@@ -85,7 +85,7 @@ def diagnose(
         diagnose_piece(outcome, integrator, problem, rows)
     values, between = readable(outcome.y), system.between_impulses
     held = values and problem.store is None and not _failed(outcome)
-    told = held and system.leaps and problem.parameter_values is None and warn_of_leap(outcome, system, y0)
+    told = held and system.definition.leaps and problem.parameter_values is None and warn_of_leap(outcome, system, y0)
     if values and system.functions_given:
         told = system.check_functions_along(outcome.y) or told
     if integrator.trained:
@@ -115,7 +115,7 @@ class Passage(NamedTuple):
 
 def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, values: ParameterRows | None) -> bool:
     """End a run where it passed a place at which H is infinite or no number; warn where it may have."""
-    poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
+    poles, width, n = problem.system.definition.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
     if problem.parameter_values is not None:
         assert problem.system.symbols is not None
@@ -130,6 +130,8 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
     with np.errstate(all="ignore"):
         try:
             looked = _look(problem.system, poles.look(y, t[:, None], numbers))
+            if looked is not None and (exact := poles.exact) is not poles:
+                looked = _look(problem.system, exact.look(y, t[:, None])) if exact and exact.watched else None
         except TypeError:  # a function that takes no arrays
             return False
         if looked is None:
@@ -147,10 +149,11 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
                 if values is None or problem.parameter_values is None
                 else replace(problem, system=values.system_of(row), parameter_values=None)
             )
-            if own.system.poles is None or not own.system.poles.watched:
+            known = own.system.definition.poles and own.system.definition.poles.exact
+            if known is None or not known.watched:
                 continue
             ends = t[-1], t[int(np.argmax(odd[:, row]))]
-            passage = _passage(own.system.poles, *_steps_of(outcome, integrator, own, row, ends), scale[row])
+            passage = _passage(known, *_steps_of(outcome, integrator, own, row, ends), scale[row])
             if passage is not None:
                 found[row] = passage
     certain = [row for row, passage in found.items() if passage.certain]
@@ -170,22 +173,21 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
 
 def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
     """Warn, once for a system, of a run about a value of q or p near which terms of H cancel until digits are lost."""
-    poles, width, n = problem.system.poles, 2 * problem.system.ndof, len(outcome.t)
+    poles, width, n = problem.system.definition.poles, 2 * problem.system.ndof, len(outcome.t)
     if poles is None or not poles.cancelling or poles in _TOLD:
         return
     starts = to_numpy(problem.y0).reshape(-1, width)
     every = slice(None, None, max(1, n // LOOKED_AT))
     y = np.concatenate([starts[None], to_numpy(outcome.y).reshape(n, len(starts), width)[every]])
+    steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
     for each in poles.cancelling:
-        x = y[..., each.column] - each.at
-        about = np.fmin.reduce(x) <= 0
-        about &= np.fmax.reduce(x) >= 0
-        if not about.any():
-            continue
-        reach = float(np.fmax.reduce(np.abs(x[:, about]), axis=None))
-        steps = max(FEWEST_NEAR, int(outcome.stats.get("n_steps", 0)) // (1 if problem.y0.ndim == 1 else len(starts)))
-        visited = y[:, about, each.column].ravel()
-        if reach > 0 and starts[:, each.column].all() and not each.loss(reach / steps, visited) > LOST_DIGITS:
+        x = poles.visited(each, y).reshape(len(y), -1) - each.at
+        about = (np.fmin.reduce(x) <= 0) & (np.fmax.reduce(x) >= 0)
+        if about.any():
+            x = x[:, about]
+        sizes = np.abs(x)
+        near = float(np.fmax.reduce(sizes, axis=None) / steps if about.any() else np.fmin.reduce(sizes, axis=None))
+        if near > 0 and x[0].all() and not each.loss(near, x.ravel() + each.at) > LOST_DIGITS:
             continue
         _TOLD.add(poles)
         warn(
@@ -360,7 +362,7 @@ def note_singularities(outcome: Outcome, integrator: Integrator, problem: Proble
     last = outcome.t[-1] if len(outcome.t) else problem.t0
     failed_at = np.broadcast_to(np.asarray(outcome.stats.get("failed_at", last), dtype=float), y0.shape[:-1])
     rows = np.flatnonzero(failed & np.isfinite(failed_at).reshape(-1))
-    if problem.system.poles is not None and len(rows):  # of a start without H there is no solution
+    if problem.system.definition.poles is not None and len(rows):  # of a start without H there is no solution
         with np.errstate(all="ignore"):
             rows = rows[np.isfinite(problem.system.hamiltonian(y0.reshape(-1, y0.shape[-1])[rows]))]
     times, passed = np.full(len(failed), np.nan), np.zeros(len(failed), dtype=bool)
@@ -397,7 +399,7 @@ def _note_last_state(outcome: Outcome, problem: Problem) -> None:
     t, y = problem.t0, to_numpy(problem.y0).reshape(-1, 2 * d)[row]
     if finite.size:
         t, y = float(outcome.t[finite[-1]]), outputs[finite[-1]]
-    remark = problem.system.remark(y[:d])
+    remark = problem.system.definition.remark(y[:d])
     if remark:
         outcome.message += f" At t = {t:.10g} {remark}"
 

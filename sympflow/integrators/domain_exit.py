@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -74,19 +74,20 @@ def warn_of_leap(outcome: Outcome, system: HamiltonianSystem, y0: Array) -> bool
         return False
     starts, outputs = to_numpy(y0).reshape(-1, width), to_numpy(outcome.y).reshape(n, -1, width)
     n_steps = int(np.max(outcome.stats.get("n_steps", 0)))
-    leapt = system.leapt(starts, outputs[-1], n_steps)
+    leapt_of = partial(system.definition.leapt, n_steps=n_steps, conserves=system.keeps_energy)
+    leapt = leapt_of(starts, outputs[-1])
     if not leapt.any():
         return False
     row = int(np.argmax(leapt))
     start, along = starts[row], outputs[:, row]
-    first = int(np.argmax(system.leapt(np.broadcast_to(start, along.shape), along, n_steps)))
+    first = int(np.argmax(leapt_of(np.broadcast_to(start, along.shape), along)))
     with np.errstate(all="ignore"):
         H0, H = system.hamiltonian(np.stack([start, along[-1]]))
     after = f"between t = {outcome.t[first - 1]:.10g} and {outcome.t[first]:.10g}" if first else "by the first output"
     which = "" if len(leapt) == 1 else f" of trajectory {row}, the first of {leapt.sum()},"
     warn(
         f"The energy{which} went from {H0:.6g} to {H:.6g} over a singularity of V, and the run means nothing after "
-        f"that. It was lost {after}, where {system.leap(along[first], start)}.",
+        f"that. It was lost {after}, where {system.definition.leap(along[first], start)}.",
         RuntimeWarning,
     )
     return True

@@ -181,7 +181,11 @@ class FlowIntegrator(FixedStep):
 
     def kernel(self, flow: KnownFlow, problem: Problem) -> Any:
         """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
-        return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend)
+        system = None
+        if is_tensor(problem.y0) and str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
+            weights: Any = flow
+            system = None if any(x.requires_grad for x in weights.parameters()) else problem.system
+        return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend, system=system)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         flow = self.known_flow(problem.system)
@@ -521,7 +525,7 @@ class LogSympFlow(FixedStep):
         expected: float,
         backend: str,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run in one compiled pass: see `clocks.OnClock`. Only a trained clock tells what times its steps reach."""
+        """Run in one compiled pass: see `LogarithmicClock`. Only a trained clock tells what times its steps reach."""
         if not clock.numbers:
             return None
         bound = self.flow.bound(clock.transformed)
@@ -534,7 +538,7 @@ class LogSympFlow(FixedStep):
         return SympFlowIntegrator(flow=self.flow)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count evaluations on the transformed system: see `clocks.OnClock`."""
+        """Count evaluations on the transformed system: see `LogarithmicClock`."""
         return self.flow.evaluations(n_steps, n_saved, n_extra, backend)
 
     def identity_for(self, system: HamiltonianSystem) -> Identity | None:

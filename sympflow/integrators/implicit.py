@@ -108,6 +108,7 @@ class Gauss(FixedStep):
             problem.backend,
             self.compensated,
             told=told,
+            system=problem.system,
         )
         return Stepper(self, problem, GaussSteps(problem.system, self.tableau), kernel, told)
 

@@ -122,10 +122,7 @@ class Constant(DenseOutput):
 class Batch(DenseOutput):
     """The dense output of a batch by those of its parts, NaN after the end of a part.
 
-    Parameters
-    ----------
-    places : sequence of (callable, int)
-        For each trajectory the dense output of the run that it was part of, and its place there.
+    `places` are for each trajectory the dense output of the run that it was part of, and its place there.
     """
 
     def __init__(self, places: Sequence[tuple[Any, int]], batch: tuple[int, ...], t_span: tuple[float, float]):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import MAX_ASKED_VALUES, MAX_SAVED_VALUES, as_float
-from sympflow.arrays import Array, finite_states, is_tensor, readable
+from sympflow.arrays import Array, expanded, finite_states, is_tensor, readable
 from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Problem
@@ -100,8 +100,8 @@ def check_params(
 
     rows = checked_rows(system, params, tuple(y0.shape[:-1]))
     check_own_parameters(system, rows.values, integrator)
-    shape = (*rows.shape, y0.shape[-1])
-    return rows, (y0.expand(shape) if is_tensor(y0) else np.broadcast_to(y0, shape).copy())
+    y = expanded(y0, (*rows.shape, y0.shape[-1]))
+    return rows, y if y is y0 or is_tensor(y) else y.copy()
 
 
 def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLike], integrator: Integrator) -> None:

@@ -14,17 +14,10 @@ from sympflow.integrators.registry import build, check_applies
 
 @dataclass(frozen=True)
 class Projected(FixedStep):
-    """Another method on a doubled system, with q₋ = p₋ = 0 put back after every step.
+    """Another method `of` a doubled system, with q₋ = p₋ = 0 put back after every step.
 
     A trained flow leaves the physical limit by its error, and the doubled flow then carries q₋, p₋ away as fast as
     friction takes energy out: e^{γt}. With this projection the physical states (q₊, p₊) are mapped by themselves.
-
-    Parameters
-    ----------
-    dt : float, optional
-        Step length; the default is that of the inner method.
-    of : str, Integrator or trained flow
-        The inner method, which makes steps by itself.
     """
 
     of: Any = field(default=None, repr=False)

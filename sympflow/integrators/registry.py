@@ -184,15 +184,7 @@ def register(name: str, integrator: type[Integrator] | Scheme) -> None:
 
 
 def build(method: Any, options: dict[str, Any]) -> Integrator:
-    """The integrator that `solve(method=..., **options)` means: a name, a class, an instance or a trained flow.
-
-    Raises
-    ------
-    TypeError
-        If an option is not one of the method's.
-    RuntimeError
-        If the class of a plug-in fails, with the name of its distribution.
-    """
+    """The integrator that `solve(method=..., **options)` means: a name, a class, an instance or a trained flow."""
     if isinstance(method, Integrator):
         if options:
             raise TypeError(
@@ -253,7 +245,7 @@ def _load(point: EntryPoint) -> type[Integrator]:
         integrator = load_announced(point, "method")
     if not (isinstance(integrator, type) and issubclass(integrator, Integrator)):
         raise ImportError(
-            f"`method` {point.name!r} of the plug-in {distribution(point)} is no Integrator class: report it there."
+            f"`method` {point.name!r} of the plug-in {distribution(point)} is not an Integrator class: report it there."
         )
     if not named(integrator):
         raise ImportError(

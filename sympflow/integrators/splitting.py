@@ -44,10 +44,7 @@ END = 1e-9
 class Clock:
     """A time in which steps are equal, with the traits of the contract that depend on it.
 
-    Attributes
-    ----------
-    on : callable, optional
-        Makes of a method and a system the method on the clock; None for the physical time, which needs none.
+    `on` makes of a method and a system the method on the clock; None for the physical time, which needs none.
     """
 
     on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None
@@ -262,7 +259,7 @@ class Splitting(FixedStep):
         expected: float,
         backend: str,
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run on the logarithmic clock in one compiled pass: see `clocks.OnClock`."""
+        """Run on the logarithmic clock in one compiled pass: see `LogarithmicClock`."""
         transformed = clock.transformed
         if self.compensated or transformed.symbols is None:
             return None
@@ -357,7 +354,7 @@ class Splitting(FixedStep):
 
     def _force_times(self, system: HamiltonianSystem) -> list[float]:
         """The times of the forces in a step of length 1, of a driven system."""
-        return [] if self.clock != "physical" or system.autonomous else self.composed(system).force_times()
+        return [] if self.clock != "physical" else self.composed(system).force_times()
 
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         clock = self.on_clock(system)

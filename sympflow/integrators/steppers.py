@@ -61,18 +61,9 @@ class ArraySteps:
 class Stepper:
     """One run of a fixed-step integrator: all that a run changes or counts is here, its kernel and its arrays.
 
-    Attributes
-    ----------
-    kernel : Kernel or None
-        The compiled loops of the run; None where it is made of array operations.
-    arrays : ArraySteps
-        The same steps by array operations, and their evaluations.
-    saves_finite : bool
-        True if the states that `rollout` saves up to the last finite one are known to be finite.
-    remark : str
-        Why a run of a formula is not compiled, for its message.
-    why : str
-        Why functions of Python run as such, to be read after the backend.
+    `kernel` are its compiled loops, None where it is made of array operations; `arrays` the same steps by these.
+    `saves_finite` is True if the states that `rollout` saves up to the last finite one are known to be finite. `remark`
+    says why a run of a formula is not compiled, for its message; `why` why functions of Python run as such.
     """
 
     def __init__(
@@ -221,7 +212,7 @@ def _no_loops_for(y0: Array, system: Any) -> str | None:
         return f"`y0` is on {y0.device}: move it to the CPU, or use backend='array'."
     if transformed(y0):
         return "`y0` is followed by torch.func, forward mode or torch.compile: use backend='array'."
-    if system.layered is None and system.learns(y0):
+    if system.layered is None and system.definition.learns(y0):
         return "`system` has numbers that torch follows: use backend='array'."
     return None
 

@@ -56,12 +56,13 @@ class _Rolled:
         """The cotangents of y0 and of k numbers of each trajectory."""
         shape = cotangents.shape[1:]
         given = to_numpy(cotangents).reshape(len(self.save), -1, shape[-1]).swapaxes(0, 1)
-        of_states, of_table, of_weights = self.recorded.pulled(given, k > 0)
+        of_states, of_values = self.recorded.pulled(given, k > 0)
+        numbers: Sequence[Tensor] = ()
         if weights := self.stepper.kernel.tensors:
-            pieces = torch.from_numpy(of_weights).split([x.numel() for x in weights])
+            pieces = torch.from_numpy(of_values[:, 0]).split([x.numel() for x in weights])
             numbers = [x.reshape(w.shape).to(w.dtype) for x, w in zip(pieces, weights, strict=True)]
-        else:
-            numbers = list(torch.from_numpy(of_table[len(of_table) - k :].sum(1))) if k else []
+        elif k:
+            numbers = torch.from_numpy(of_values).unbind()
         return [torch.from_numpy(of_states.reshape(shape)), *numbers]
 
     def by_arrays(self, y0: Tensor, *followed: Tensor) -> Tensor:

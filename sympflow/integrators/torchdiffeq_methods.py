@@ -19,7 +19,6 @@ from sympflow.arguments import check_dt
 from sympflow.arrays import (
     Array,
     differentiable,
-    finite_states,
     full_of_nan,
     is_tensor,
     readable,
@@ -34,7 +33,7 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
-from sympflow.integrators.steppers import Stepper, compiled_loops, rollout
+from sympflow.integrators.steppers import Stepper, compiled_loops
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
 Visit = Callable[[Interpolant], bool]
@@ -59,7 +58,7 @@ class Trace:
 
     def __call__(self, s: Any, y: Any) -> Any:
         self.evaluations += 1
-        f = self.system.vector_field(y, None if self.system.autonomous else self.time(s))
+        f = self.system.vector_field(y, self.time(s))
         self.evaluated(y, f)
         return f if self.direction > 0 else -f
 
@@ -368,7 +367,7 @@ class Adaptive(Watched, RungeKutta):
         if trace.system.shortest_piece < math.inf:
             options["max_step"] = trace.system.shortest_piece
         symbols = trace.system.symbols
-        if not trace.system.autonomous and symbols is not None and symbols.jumps:
+        if symbols is not None and symbols.jumps:
             options["step_t"] = s[1:]  # the last step would be longer, and meet a jump beyond
         atol = self.tolerance_of(trace.system, y)
         try:
@@ -557,7 +556,7 @@ def __getattr__(name: str) -> type[Integrator]:
 
 @dataclass(frozen=True)
 class FixedGrid(ExplicitStep, FixedStep):
-    """A fixed-step Runge–Kutta method of torchdiffeq; compiled for arrays where H is symbolic.
+    """A fixed-step Runge–Kutta method with torchdiffeq's name and table; compiled for arrays where H is symbolic.
 
     Parameters
     ----------
@@ -575,43 +574,9 @@ class FixedGrid(ExplicitStep, FixedStep):
             problem.y0,
             problem.backend,
             told=told,
+            system=problem.system,
         )
         return Stepper(self, problem, OwnSteps(self, problem), kernel, told)
-
-    def rollout(self, problem: Problem, h: float, n_steps: int, save: np.ndarray) -> tuple[Array, np.ndarray, str]:
-        """Calls of `odeint` for 64 steps each, in the time s = (t − t0)/h, where h is exact."""
-        if not readable(problem.y0):
-            states, finite = rollout(
-                lambda k, y: self.step(problem.system, problem.t0 + k * h, y, h), problem.y0, n_steps, save
-            )
-            return states, finite, "torch"
-        import torch
-        from torchdiffeq import odeint
-
-        tensor = is_tensor(problem.y0)
-        y = problem.y0 if tensor else torch.from_numpy(np.ascontiguousarray(problem.y0))
-        states, k, last = [y] * int((save == 0).sum()), 0, int(save[-1]) if len(save) else 0
-        finite = np.full(y.shape[:-1], n_steps)
-
-        def scaled(s: Any, y: Any) -> Any:
-            time = None if problem.system.autonomous else problem.t0 + (k + s.double()) * h
-            return h * problem.system.vector_field(y, time)
-
-        with torch.set_grad_enabled(tensor and torch.is_grad_enabled()):
-            while k < last:
-                n = min(last - k, 64)
-                wanted = save[(save > k) & (save <= k + n)] - k
-                if (finite == n_steps).any():
-                    block = odeint(scaled, y, torch.arange(n + 1, dtype=y.dtype, device=y.device), method=self.name)
-                    ok = finite_states(block)
-                    finite = np.where((finite == n_steps) & ~ok[-1], k + np.argmin(ok, axis=0) - 1, finite)
-                    y = block[-1]
-                    states += [block[i] for i in wanted.tolist()]
-                else:
-                    states += [y] * len(wanted)
-                k += n
-        out = torch.stack(states) if states else y[None][:0]
-        return (out if tensor else out.numpy()), finite, "torchdiffeq"
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return {"force_evaluations": len(self.B) * (n_steps + n_extra), "hessian_evaluations": 0}

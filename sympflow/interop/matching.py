@@ -335,7 +335,7 @@ def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
     integrator = build(method, options)
     if not isinstance(integrator, FixedStep):
         raise TypeError(
-            f"`method` {integrator.name!r} is no fixed-step map, which is what can be handed to {peer}: use a "
+            f"`method` {integrator.name!r} is not a fixed-step map, and {peer} takes nothing else: use a "
             f"splitting method or a trained flow, or {peer}'s own method."
         )
     if integrator.in_another_time and integrator.given_flow is not None:

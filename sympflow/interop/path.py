@@ -165,7 +165,7 @@ class Path:
         """True if torch follows numbers of the map: the weights of the flow, or those of H."""
         if differentiable(*self.weights()):
             return True
-        return self.system is not None and self.system.learns(self.y0)
+        return self.system is not None and self.system.definition.learns(self.y0)
 
     def weights(self) -> list[Tensor]:
         """The weights of the flow, if there is one."""
@@ -446,7 +446,7 @@ class _PulledBack(torch.autograd.Function):
 def leaves(system: HamiltonianSystem, y: Tensor, t: float) -> list[Tensor]:
     """The leaves of the graph on which the vector field at y and t depends, other than y: a network's weights."""
     y = y.detach()
-    if not system.learns(y):
+    if not system.definition.learns(y):
         return []
     found: list[Tensor] = []
     waiting, seen = [system.vector_field(y, t).grad_fn], set()

@@ -277,7 +277,9 @@ def odeint_adjoint(
         own = [] if adjoint_params is not None or system is None else leaves(system, y, start)
         parameters = (*(given or ()), *own)
         flow = integrator.flow_for(system)  # type: ignore[arg-type]
-        field = [system.vector_field(unfollowed(y), start)] if system is not None and system.learns(y) else []
+        field = (
+            [system.vector_field(unfollowed(y), start)] if system is not None and system.definition.learns(y) else []
+        )
         if transformed(y, t, *field, *parameters, *(() if flow is None else flow.parameters())):
             raise TypeError(
                 "`odeint_adjoint` is for reverse mode, backward() and torch.autograd.grad: in forward mode, and inside "
@@ -360,7 +362,7 @@ def _build(func: Any, method: Any, options: dict[str, Any] | None) -> tuple[Fixe
     options.pop("norm", None)  # torchdiffeq adds its own
     system = options.pop("system", func if isinstance(func, HamiltonianSystem) else None)
     if not (system is None or isinstance(system, HamiltonianSystem)):
-        raise TypeError(f"`options` has a 'system' that is no HamiltonianSystem: {type(system).__name__}. Pass one.")
+        raise TypeError(f"`options` has a 'system' that is not a HamiltonianSystem: {type(system).__name__}. Pass one.")
     if "step_size" in options and "dt" in options:
         raise TypeError("`options` has both 'step_size' and 'dt', two names of the step length: give one of them.")
     if "step_size" in options:

@@ -126,9 +126,8 @@ class SymplecticStep(SingleStepMethod):
             raise ValueError(
                 f"`y0` must have shape (batch, {2 * self.system.ndof}), [q, p]; got {problem.n_features} features."
             )
-        if not self.system.autonomous:
-            times = to_numpy(torch.stack([problem.t_start, problem.t_end]).detach())
-            self.system.check_times(times.min(), times.max())
+        times = to_numpy(torch.stack([problem.t_start, problem.t_end]).detach())
+        self.system.check_times(times.min(), times.max())
         return Run(term, problem, self, stats, args)
 
     def step(
@@ -159,9 +158,8 @@ class SymplecticStep(SingleStepMethod):
         return StepResult(self._advance(t0, y0, dt), None), Beginning(t0, y0), state, None
 
     def _advance(self, t: Tensor, y: Tensor, h: Tensor) -> Tensor:
-        at: Any = 0.0 if self.system.autonomous else t
         with naming_plugin(self.integrator):
-            return self.integrator.step(self.system, at, y, h.to(y.dtype))
+            return self.integrator.step(self.system, t, y, h.to(y.dtype))  # type: ignore[arg-type]
 
     def merge_states(self, accept: Tensor, current: Run, previous: Run) -> Run:
         return current

@@ -10,15 +10,17 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.compiler.control import DOUBLE, POINTER, Module, Rows, Value
+from sympflow.compiler.control import DOUBLE, POINTER, Code, Module, Rows, Value
 from sympflow.compiler.machine import compiled, host
-from sympflow.compiler.program import Program, gradient
+from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Letter, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
-from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.runs import Numbers, Room, reverse_function
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
+
+MOST_REVERSED = 500  # operations of a step whose reverse is compiled
 
 
 class Tableau(Protocol):
@@ -160,14 +162,48 @@ class _InRegisters(_Explicit):
     lanes = 8
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-        column, parameters = self.column(values[0].code, numbers, step), self.parameters
-        rates = column[self.size - len(self.field.rates) :]
-        K: list[list[Value]] = []
-        for row in self.A:
-            letters = self.letters_at(column, sum(row))
-            f = self.field.program(*_moved(values, column[0], row, K), *column[1 : 1 + parameters], *letters, *rates)
-            K.append([values[0].code.operand(x, values[0].type) for x in f])
-        return _moved(values, column[0], self.B, K)
+        return self._advanced(*values, *self._given(numbers, values[0].code, step))
+
+    def _given(self, numbers: Numbers, code: Code, step: Value) -> list[Value]:
+        """The numbers of a step: h, the parameters, the letters at each stage, the rates."""
+        column = self.column(code, numbers, step)
+        letters = [x for row in self.A for x in self.letters_at(column, sum(row))]
+        return [*column[: 1 + self.parameters], *letters, *column[self.size - len(self.field.rates) :]]
+
+    def _advanced(self, *numbers: Any) -> list[Any]:
+        """The state after a step, from the state and the numbers of a step."""
+        n, at = self.n_out, self.n_out + 1 + self.parameters
+        y, h, parameters = numbers[:n], numbers[n], numbers[n + 1 : at]
+        count = len(self.lettered.letters)
+        rates = numbers[at + count * len(self.A) :]
+        K: list[list[Any]] = []
+        for i, row in enumerate(self.A):
+            letters = numbers[at + i * count :][:count]
+            K.append(self.field.program(*_moved(y, h, row, K), *parameters, *letters, *rates))
+        return _moved(y, h, self.B, K)
+
+    @cached_property
+    def _reverse(self) -> Program:
+        """The cotangents of a state, from it, the numbers of a step, and the cotangents of the state after it."""
+        count = self.n_out + 1 + self.parameters + len(self.lettered.letters) * len(self.A) + len(self.field.rates)
+        found = adjoint(traced(self._advanced, *(f"x_{i}" for i in range(count))))
+        return Program(found.inputs, found.outputs[: self.n_out])
+
+    @property
+    def reversible(self) -> bool:  # type: ignore[override]
+        return len(self.field.program) * len(self.A) <= MOST_REVERSED
+
+    def adjoint(
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+    ) -> tuple[list[Value], list[Value]]:
+        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
+        found = self._reverse(*values, *self._given(numbers, step.code, step), *cotangents)
+        return [step.code.operand(x, values[0].type) for x in found], []
+
+    def made(self, name: str, width: int) -> Callable[..., None]:
+        if name != "reverse":
+            return super().made(name, width)
+        return reverse_function(self.n_values, self.n_out, self.size, self.adjoint, width, closing=False)
 
 
 class _InMemory(_Explicit):
@@ -200,7 +236,7 @@ class _InMemory(_Explicit):
             code.store(x, to, m)
 
 
-def _moved(y: Sequence[Value], h: Value, weights: Sequence[float], K: Sequence[Sequence[Value]]) -> list[Value]:
+def _moved(y: Sequence[Any], h: Any, weights: Sequence[float], K: Sequence[Sequence[Any]]) -> list[Any]:
     """y + h Σ weights_i K_i."""
     moved = []
     for m, x in enumerate(y):

@@ -65,7 +65,7 @@ class LayeredCode(SplittingRollouts):
         assert memory is not None
         begin = (int(kinds[0]) - address(memory)) // 8
         n = self._potential.n_weights
-        return np.asarray(memory[begin + n : begin + n * (1 + SIDE)].reshape(n, SIDE).sum(1))
+        return np.asarray(memory[begin + n : begin + n * (1 + SIDE)].reshape(n, SIDE).sum(1, keepdims=True))
 
     def check_reverse(self) -> None:
         """All stages have a reverse."""

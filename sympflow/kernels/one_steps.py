@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 from sympflow.compiler.control import Code, Value
 from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
-from sympflow.kernels.rollouts import Rollouts
+from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.threads import given
 
 if TYPE_CHECKING:
+    from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.terms import Terms
 
 __all__ = ["Lettered", "OneStep", "OneStepKernel", "check_size", "is_large", "lettered", "terms_of"]
@@ -72,6 +73,7 @@ class OneStep(Rollouts):
     """
 
     closing = False
+    reversible = False  # there is `adjoint`, see `sympflow.kernels.runs.Adjoint`
     work: float
 
     def __init__(self, lettered: Lettered, n_values: int, more: int = 0) -> None:
@@ -132,10 +134,23 @@ class OneStepKernel(Kernel):
             numbers.append(self._more(h))
         return np.concatenate(numbers, axis=1)
 
+    def _columns(self, task: Task) -> Columns:
+        numbers = self._numbers(np.array([task.h]), np.array([task.t0]))
+        return np.repeat(numbers, 3, axis=0), np.zeros(3, dtype=np.int64)
+
+    def check_reverse(self) -> None:
+        if not self._code.reversible:
+            super().check_reverse()
+
+    def recorded(self, task: Task) -> Recorded:
+        """`runs`, as a run of which cotangents can be pulled back: after `check_reverse`."""
+        from sympflow.kernels.reverse import Recorded
+
+        return Recorded(self._code, self._columns(task), task.y0, task.n_steps, task.save, self._code.work)
+
     def runs(self, task: Task) -> Run:
-        code, numbers = self._code, self._numbers(np.array([task.h]), np.array([task.t0]))
-        columns = np.repeat(numbers, 3, axis=0), np.zeros(3, dtype=np.int64)
-        rollout = partial(code.run, columns, closed=False)
+        code = self._code
+        rollout = partial(code.run, self._columns(task), closed=False)
         return run_states(rollout, task, code.n_values - code.counted, code.work, counts=code.counted)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:

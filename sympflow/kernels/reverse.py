@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from sympflow.kernels.protocol import Batch
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.threads import BLOCK, NEVER, given, run_rows
-
-if TYPE_CHECKING:
-    from sympflow.kernels.splittings import SplittingCode
 
 __all__ = ["Recorded"]
 
@@ -29,12 +26,15 @@ class Recorded:
     the last step of each row that ends in a finite state.
     """
 
-    def __init__(
-        self, code: SplittingCode, table: np.ndarray, y0: np.ndarray, n_steps: int, save: np.ndarray, work: float
-    ) -> None:
+    def __init__(self, code: Any, table: Any, y0: np.ndarray, n_steps: int, save: np.ndarray, work: float) -> None:
         self._code, self._table, self._y0, self._work = code, table, given(y0), work
-        self._n_steps, self._save, self._link = n_steps, given(save, np.int64), table.shape[1] - 2
-        self._own = y0.shape[1] > code.n_out
+        self._n_steps, self._save = n_steps, given(save, np.int64)
+        self._link = (len(table[1]) if isinstance(table, tuple) else table.shape[1]) - 2
+        self._given, self._n_own = self._y0, (own := y0.shape[1] - code.n_out)
+        if own and len(y0) == 1:  # a table of all trajectories, which is prepared once
+            self._table, self._y0 = table.copy(), self._y0[:, : code.n_out]
+            self._table[len(table) - own :] = y0[0, code.n_out :, None]
+        self._own = self._y0.shape[1] > code.n_out
         self.states = np.empty((len(y0), len(save), code.n_out))
         self.n_finite = np.full(len(y0), n_steps)
         size = self._link * code.n_values
@@ -83,17 +83,16 @@ class Recorded:
         if self._n_steps == 0:
             self.states[i] = self._y0[i, None, : code.n_out]
 
-    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def pulled(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray]:
         """The cotangents of the states (N, 2d), for those of the outputs (N, len(save), 2d).
 
-        With `slopes` those of the numbers of the table too, (n, m), with tables of their own (n, m, N), and the sums
-        of `SplittingRollouts.summed`.
+        With `slopes` those of the own values of each row too, (n, N), or the sums of `SplittingRollouts.summed`.
         """
         if (self.n_finite < self._n_steps).any():
             return self._pulled_apart(cotangents, slopes)
-        code, table, N = self._code, self._table, len(self._y0)
+        code, N = self._code, len(self._y0)
         of_states = np.zeros((N, code.n_values))
-        found = np.zeros((table.shape[1], code.size, N if slopes else 0))
+        found = np.zeros((self._link + 2, code.size, N if slopes else 0))
         sums: dict[int, np.ndarray] = {}
 
         def piece(i: slice, stop: np.ndarray) -> None:
@@ -105,33 +104,33 @@ class Recorded:
         of_states = of_states[:, : code.n_out]
         if n := int(self._save.searchsorted(0, "right")):
             of_states += cotangents[:, :n].sum(1)
-        of_weights = np.sum([sums[k] for k in sorted(sums)], axis=0) if sums else code.summed(code.prepared(table)[1])
-        of_table = np.zeros((len(table), table.shape[1], *[N] * self._own))
-        if slopes and not of_weights.size:
-            of_table += code.pulled(self._full_table(), found if self._own else found.sum(-1))
-        return of_states, of_table, of_weights
+        if slopes and self._n_own:
+            return of_states, code.pulled(self._full_table(), found)
+        return of_states, np.sum([sums[k] for k in sorted(sums)], axis=0) if sums else self._nothing()
 
-    def _pulled_apart(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _nothing(self) -> np.ndarray:
+        code = self._code
+        return np.zeros((self._n_own, len(self._y0))) if self._n_own else code.summed(code.prepared(self._table)[1])
+
+    def _pulled_apart(self, cotangents: np.ndarray, slopes: bool) -> tuple[np.ndarray, np.ndarray]:
         """`pulled` of the rows that stay finite together, and of others alone up to the last output that is finite."""
-        code, table, save, finite = self._code, self._table, self._save, self.n_finite
-        of_states, of_table = np.zeros((len(finite), code.n_out)), np.zeros((*table.shape, *[len(finite)] * self._own))
-        of_weights = code.summed(code.prepared(table)[1])
+        save, finite, given = self._save, self.n_finite, self._given
+        of_states, of_values = np.zeros((len(finite), self._code.n_out)), self._nothing()
         good = np.flatnonzero(finite >= self._n_steps)
         parts = [(good, self._n_steps, len(save))] if good.size else []
         for k in np.flatnonzero(finite < self._n_steps).tolist():
             m = int(save.searchsorted(finite[k], "right"))
             parts.append((np.array([k]), int(save[m - 1]) if m else 0, m))
         for rows, n_steps, m in parts:
-            part = Recorded(code, table, self._y0[rows], n_steps, save[:m], self._work)
-            of_states[rows], more, of_part = part.pulled(cotangents[rows, :m], slopes)
-            of_table[..., rows if self._own else slice(None)] += more
-            of_weights = of_weights + of_part
-        return of_states, of_table, of_weights
+            part = Recorded(self._code, self._table, given[rows], n_steps, save[:m], self._work)
+            of_states[rows], more = part.pulled(cotangents[rows, :m], slopes)
+            of_values[..., rows if self._n_own else slice(None)] += more
+        return of_states, of_values
 
     def _full_table(self) -> np.ndarray:
         """The table, with the own values of all rows (n, m, N)."""
         if not self._own:
-            return self._table
+            return self._table[..., None]
         values = self._y0[:, self._code.n_out :].T
         table = np.repeat(self._table[..., None], len(self._y0), axis=2)
         table[len(table) - len(values) :] = values[:, None]

@@ -127,13 +127,18 @@ class Rollouts(ABC):
         """The columns of trajectories with their own values (N, n): a table for every `width` of them."""
         entries, kinds = self.own_entries(table, values)
         groups = -(-len(entries) // width)
-        full = np.concatenate([entries, entries[-1:].repeat(groups * width - len(entries), axis=0)])
-        return np.ascontiguousarray(full.reshape(groups, width, *entries.shape[1:]).transpose(0, 2, 3, 1)), kinds
+        if len(entries) < groups * width:
+            entries = np.concatenate([entries, entries[-1:].repeat(groups * width - len(entries), axis=0)])
+        return np.ascontiguousarray(entries.reshape(groups, width, *entries.shape[1:]).transpose(0, 2, 3, 1)), kinds
 
     def own_entries(self, table: Any, values: np.ndarray) -> Columns:
         """The numbers (N, m, size) of the columns of each, and their kinds (m,); `values` are places in the table."""
         entries, kinds = table
         return entries[values[:, 0].astype(int)], kinds
+
+    def summed(self, kinds: np.ndarray) -> np.ndarray:
+        """The sums over trajectories that a reverse of columns of these kinds left, such as derivatives by weights."""
+        return np.zeros(0)
 
     @property
     def place(self) -> Callable[..., Memory] | None:
@@ -261,10 +266,6 @@ class SplittingRollouts(Rollouts):
         self, table: Any, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray
     ) -> None:
         """One step of length ``h[i]`` at ``t[i]`` from every row of `y`, by polynomials of ``x[i]``, into `out`."""
-
-    def summed(self, kinds: np.ndarray) -> np.ndarray:
-        """The sums over trajectories that a reverse of columns of these kinds left, such as derivatives by weights."""
-        return np.zeros(0)
 
     def own_steps(self, table: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from every row of `y` (N, 2d) by its own numbers: a table (n, m N), a column of all rows each."""

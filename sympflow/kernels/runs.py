@@ -184,7 +184,14 @@ def run_function(
 
 
 def reverse_function(
-    n_values: int, n_out: int, size: int, adjoint: Adjoint, width: int = 1, own: bool = False, slopes: bool = False
+    n_values: int,
+    n_out: int,
+    size: int,
+    adjoint: Adjoint,
+    width: int = 1,
+    own: bool = False,
+    slopes: bool = False,
+    closing: bool = True,
 ) -> Callable[..., None]:
     """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
 
@@ -224,7 +231,9 @@ def reverse_function(
                 saved.value = saved.value - 1
                 given = outputs.loaded(out, begin, n_rows, n_saved * n_out, saved.value * n_out)
                 given += [code.constant(0.0, given[0].type)] * (n_values - n_out)
-                for x, more in zip(cotangents, pulled(link + 1, n.value, history.state(s.value), given), strict=True):
+                if closing:
+                    given = pulled(link + 1, n.value, history.state(s.value), given)
+                for x, more in zip(cotangents, given, strict=True):
                     x.value = x.value + more
             to = code.apply("max", (last(), first))
             r, step = code.variable(link), code.variable(n.value)

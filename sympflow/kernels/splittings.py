@@ -469,23 +469,24 @@ class SplittingCode(SplittingRollouts):
         return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
     def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-        """From cotangents (m, size, …) of the numbers of columns to those of the numbers of a table (n, m, …)."""
+        """From cotangents (m, size, N) of the numbers of columns to those of the values (n, N) that end a table."""
         if self.timed:
-            return slopes.swapaxes(0, 1)
-        found = np.zeros((len(table), *np.delete(slopes.shape, 1)))
-        kinds = self._kinds_of(table if table.ndim == 2 else table[..., 0])
-        for k, program in enumerate(self._of_tables):
-            columns = kinds == k
+            return np.asarray(slopes[:, self.size - self._own :].sum(0))
+        found = np.zeros((self._own, slopes.shape[2]))
+        for k, columns in self._columns_of_kinds(self._kinds_of(table[..., 0])):
+            program = self._of_tables[k]
             n = len(program.inputs) - len(table)
             with np.errstate(all="ignore"):
-                rows = program(*(row[columns] for row in table), *(slopes[columns, i] for i in range(n)))
+                rows = program(*table[:, columns], *slopes[columns, :n].swapaxes(0, 1))
             for i, row in enumerate(rows):
-                found[i, columns] = row
+                found[i] += np.sum(row, axis=0)
         return found
 
     @cached_property
     def _of_tables(self) -> list[Program]:
-        return [adjoint(kind.table) for kind in self._kinds]
+        """From the numbers of a table, and cotangents of those of a column, to cotangents of the values."""
+        programs = [adjoint(kind.table) for kind in self._kinds]
+        return [Program(each.inputs, each.outputs[len(each.outputs) - self._own :]) for each in programs]
 
     def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
         """A step of length h at t from tensors (..., 2d), by tensor operations.
@@ -571,20 +572,27 @@ class SplittingCode(SplittingRollouts):
         if self.timed:
             return np.stack([np.broadcast_to(row, (len(kinds), *shape)) for row in table], axis=1)
         entries = np.zeros((len(kinds), self.size, *shape))
-        for k, kind in enumerate(self._kinds):
+        for k, columns in self._columns_of_kinds(kinds):
             with np.errstate(all="ignore"):
-                rows = kind.table(*table)
+                rows = self._kinds[k].table(*(row[columns] for row in table))
             for i, row in enumerate(rows):
-                entries[kinds == k, i] = np.broadcast_to(row, (len(kinds), *shape))[kinds == k]
+                entries[columns, i] = row
         return entries
+
+    def _columns_of_kinds(self, kinds: np.ndarray) -> list[tuple[int, Any]]:
+        """The kinds with their columns."""
+        if len(self._kinds) == 1:
+            return [(0, slice(None))]
+        return [(k, kinds == k) for k in range(len(self._kinds))]
 
     def own_entries(self, table: Any, values: np.ndarray) -> Columns:
         """The numbers of the columns of trajectories with their own values of the parameters."""
         if isinstance(table, tuple):
             return super().own_entries(table, values)
         kinds, n = self._kinds_of(table), len(table) - self._own
-        rows = [*(row[:, None] for row in table[:n]), *(np.broadcast_to(v, (len(kinds), len(v))) for v in values.T)]
-        return np.moveaxis(self._entries(rows, kinds, (len(values),)), -1, 0), kinds
+        values = np.broadcast_to(values.T[:, None], (values.shape[1], len(kinds), len(values)))
+        rows = [*table[:n, :, None], *values]
+        return np.moveaxis(self._entries(rows, kinds, values.shape[2:]), -1, 0), kinds
 
     def step_rows(
         self, table: np.ndarray, x: np.ndarray, h: np.ndarray, t: np.ndarray, y: np.ndarray, out: np.ndarray

@@ -96,8 +96,8 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
         if not any(sp.diff(lettered, s).free_symbols & letters for s in letters):
             return lettered, found
     raise ValueError(
-        f"`system` has the kinetic energy {symbols.T}, which is no sum of products of functions of {symbols.time} and "
-        "of p: use an implicit method such as 'gauss_legendre6'."
+        f"`system` has the kinetic energy {symbols.T}, which is not a sum of products of functions of {symbols.time} "
+        "and of p: use an implicit method such as 'gauss_legendre6'."
     )
 
 

@@ -6,9 +6,10 @@ Each is a regression of the smoothed slopes with more freedom, or with rows in a
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from sympflow.learning.library import Library, library_for, polynomials
-from sympflow.learning.models import drags, turns
+from sympflow.learning.models import Drive, Polynomial, drags, turns
 from sympflow.learning.smoothing import Smooth
 from sympflow.learning.trajectories import Trajectories
 
@@ -20,16 +21,16 @@ ALIKE = 1.2
 """Factor by which a reading may leave more than the best, and is named if it stands before it."""
 TURNED = (
     "The second half looks like velocities in a uniform magnetic field, by which p_i' = B p_j, p_j' = -B p_i with "
-    "B = {} for i < j: these are no momenta; with a mass m these are p_i - m B q_j/2 and p_j + m B q_i/2."
+    "B = {} for i < j. These are not momenta, which with a mass m are p_i - m B q_j/2 and p_j + m B q_i/2: pass "
+    'observed="qv" to `learn`, which finds both.'
 )
-DRAG = (
-    "Quadratic drag p' = -c|p|p with c = {} would leave much less: it is no friction -γp, which alone can be learned; "
-    "give data in which it is small."
-)
+DRAG = 'Quadratic drag p\' = -c|p|p with c = {} would leave much less: pass damping="quadratic" to `learn`.'
 DRIVEN = (
-    "A force of angular frequency {} that depends on the time alone would leave much less: the data look driven, and "
-    "an H(t) is not learned; give data without the drive."
+    "Forces or stiffnesses of the angular frequency {} would leave much less: the data look driven, by an H(q, p, t). "
+    "Pass drive={} to `learn`."
 )
+PER_NUMBER = 4
+"""Values of half of the trajectories that there are at least for a number of a fit with a drive."""
 FREQUENCIES = 1000
 """Halves of the angular frequency π over the longest time, up to which that of a drive is looked for."""
 
@@ -68,8 +69,6 @@ def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str, d
         found.append((rest, TURNED.format(_said(theta[-turned.shape[2] :]))))
     rest, theta = _left(np.concatenate([X, np.moveaxis(drags(x.T)[0], -1, 0)], 2), v, scales)
     found.append((rest, DRAG.format(_said(theta[-d:]))))
-    rest, frequency = _driven(X, smooth, scales)
-    found.append((rest * left, DRIVEN.format(f"{frequency:.4g}")))
     if d > 1:
         pairs = [*range(0, 2 * d, 2), *range(1, 2 * d, 2)]
         with np.errstate(all="ignore"):
@@ -89,6 +88,8 @@ def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str, d
                 f"The second half looks like velocities, of masses {said}: pass velocity_mass=[…], by which p = M v.",
             )
         )
+    rest, frequency = _driven(X, smooth, scales, polynomial_drive(scales))
+    found.append((rest * left, DRIVEN.format(*2 * [f"{frequency:.5g}"])))
     least = min(found)[0]
     best = next(one for one in found if one[0] <= ALIKE * least)
     if best[0] < BETTER * left:
@@ -112,29 +113,59 @@ def _said(numbers: np.ndarray) -> str:
     return ", ".join(f"{number:.3g}" for number in numbers)
 
 
-def _driven(X: np.ndarray, smooth: Smooth, scales: np.ndarray) -> tuple[float, float]:
-    """The share of squares that a force a cos ωt + b sin ωt leaves, and ω; of other trajectories than those of a and b.
+def polynomial_drive(scales: np.ndarray) -> Drive:
+    """Forces and stiffnesses that a clock moves, of the first frequency that comes."""
+    d = len(scales) // 2
+    return Drive(Polynomial.up_to(2, "q", scales[:d]), 1.0)
 
-    One trajectory cannot tell a drive from its own motion: infinite.
+
+def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> float:
+    """The angular frequency at which a drive explains most of what the fields X (n, 2d, K) leave of slopes.
+
+    The peaks of the periodograms with each of its terms are compared by a fit of all, and the best is refined.
     """
-    first = smooth.owner % 2 == 0
-    if first.all() or 2 * first.sum() < X.shape[2]:
-        return np.inf, 0.0
-    v, t, d = smooth.slopes, smooth.times, X.shape[1] // 2
-    theta = _left(X, v, scales)[1]
-    u = ((v - X @ theta) / scales)[:, d:]
+    t, d, residuals = smooth.times, X.shape[1] // 2, smooth.slopes - X @ _left(X, smooth.slopes, scales)[1]
     longest = max(np.ptp(t[smooth.owner == i]) for i in np.unique(smooth.owner))
     steps = np.diff(t)
     most = min(int(2 * longest / np.median(steps[steps > 0])), FREQUENCIES)
     frequencies = np.pi / longest * np.arange(0.5, max(most, 2) / 2, 0.25)
-    best = max(frequencies, key=lambda w: float(np.abs(np.exp(-1j * w * t) @ u).sum()))
-    forces = np.zeros((*v.shape, 2 * d))
-    for i in range(d):
-        forces[:, d + i, 2 * i], forces[:, d + i, 2 * i + 1] = np.cos(best * t), np.sin(best * t)
-    whole = np.concatenate([X, forces], 2)
-    fits = [(A, _left(A[first], v[first], scales)[1]) for A in (whole, X)]
+    pushes = drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
+    assert pushes is not None
+    pushes = pushes / scales[d:, None, None]
+    terms = np.einsum("ikn,ni->nk", pushes, residuals[:, d:] / scales[d:])
+    power = np.abs(np.stack([np.exp(-1j * w * t) @ terms for w in frequencies])) ** 2 / (pushes**2).sum(axis=(0, 2))
+
+    def rest(frequency: float) -> float:
+        return _left(_with_drive(X, smooth, drive, frequency), smooth.slopes, scales)[0]
+
+    best = min(frequencies[np.unique(power.argmax(axis=0))], key=rest)
+    near = 0.5 * np.pi / longest
+    found = minimize_scalar(rest, bounds=(max(best - near, near / 2), best + near), method="bounded")
+    return float(found.x if found.fun < rest(best) else best)
+
+
+def _with_drive(X: np.ndarray, smooth: Smooth, drive: Drive, frequency: float) -> np.ndarray:
+    """Fields (n, 2d, K) with those of the terms of a drive."""
+    d = X.shape[1] // 2
+    here = Drive(drive.base, frequency, smooth.times)
+    by = here.gradient(np.zeros(here.n), smooth.points.T[:d], False, True).by_parameters
+    assert by is not None
+    forces = np.moveaxis(-by[:, :-1], -1, 0)
+    return np.concatenate([X, np.concatenate([np.zeros_like(forces), forces], axis=1)], axis=2)
+
+
+def _driven(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> tuple[float, float]:
+    """The share of squares that a drive leaves, and its ω; of other trajectories than those that it was fitted to.
+
+    One trajectory cannot tell a drive from its own motion: infinite.
+    """
+    first = smooth.owner % 2 == 0
+    if first.all() or first.sum() * X.shape[1] < PER_NUMBER * (X.shape[2] + drive.n):
+        return np.inf, 0.0
+    frequency, v = drive_frequency(X, smooth, scales, drive), smooth.slopes
+    fits = [(A, _left(A[first], v[first], scales)[1]) for A in (_with_drive(X, smooth, drive, frequency), X)]
     theirs, mine = (float(((((v - A @ c) / scales)[~first]) ** 2).sum()) for A, c in fits)
-    return theirs / mine if mine > 0 else np.inf, float(best)
+    return theirs / mine if mine > 0 else np.inf, frequency
 
 
 def _left(X: np.ndarray, v: np.ndarray, scales: np.ndarray) -> tuple[float, np.ndarray]:

@@ -13,7 +13,19 @@ import numpy as np
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.inertia import Inertia
 from sympflow.learning.maps import NetworkFlow
-from sympflow.learning.models import Distances, FixedKinetic, Formula, Kinetic, Model, Network, Part, Polynomial, Waves
+from sympflow.learning.models import (
+    Distances,
+    Drive,
+    FixedKinetic,
+    Force,
+    Formula,
+    Kinetic,
+    Model,
+    Network,
+    Part,
+    Polynomial,
+    Waves,
+)
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
 HARMONICS = (1, 2, 3, 4, 6, 8)
@@ -41,8 +53,8 @@ class Said:
     separable : bool or None
         None for not known.
     inverse_mass : ndarray of shape (d, d) or None
-    rates : int
-        How many rates of friction are to be learned.
+    force : callable or None
+        Friction or drag whose factors are to be learned, as `models.friction`.
     periods : ndarray of shape (2d,)
         Of the coordinates that are angles, infinite for the others.
     known : tuple of Formula
@@ -55,18 +67,21 @@ class Said:
         True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or M₁₁ in the middle of the data.
     middle : ndarray of shape (d,) or None
         The mean of q.
+    frequency : float or None
+        ω of a drive, about.
     """
 
     scales: np.ndarray
     separable: bool | None
     inverse_mass: np.ndarray | None
-    rates: int
+    force: Force | None
     periods: np.ndarray
     known: tuple[Formula, ...] = ()
     momenta: np.ndarray | None = None
     flow_scaling: Scaling | None = None
     velocities: bool = False
     middle: np.ndarray | None = None
+    frequency: float | None = None
 
     @property
     def ndof(self) -> int:
@@ -106,7 +121,17 @@ class Said:
 
     def whole(self, *parts: Part) -> Model:
         """H(q, p)."""
-        return Model(self.ndof, (*parts, *self.known), self.rates, self.velocities)
+        drive = () if self.frequency is None else (self.driven(self.frequency),)
+        return Model(self.ndof, (*parts, *drive, *self.known), self.force, self.velocities)
+
+    def driven(self, frequency: float) -> Drive:
+        """Forces and stiffnesses of this frequency: of degree 2 in q, of an angle its first harmonic."""
+        scales, periods = self.scales[: self.ndof], self.periods[: self.ndof]
+        base = Waves.up_to(1, 2, "q", scales, periods)
+        pushes = np.eye(self.ndof)[np.isfinite(periods)]
+        exponents = np.concatenate([base.powers.exponents, pushes])
+        waves, phases = np.concatenate([base.waves, 0 * pushes]), np.concatenate([base.phases, 0 * pushes[:, 0]])
+        return Drive(Waves("q", exponents, waves, phases, scales), frequency)
 
 
 @dataclass(frozen=True)
@@ -225,7 +250,7 @@ def _whole_networks(said: Said) -> Iterator[Candidate]:
 
 def _flows(said: Said) -> Iterator[Candidate]:
     scaling = said.flow_scaling
-    told = said.rates or said.known or said.inverse_mass is not None or said.angles
+    told = said.force or said.frequency or said.known or said.inverse_mass is not None or said.angles
     if scaling is None or told:
         return
     for pairs, width, palindromic in FLOW_SIZES:
@@ -301,6 +326,8 @@ def families(said: Said, name: str | None) -> list[str]:
         raise ValueError(
             f"`family` {name!r} is of functions H(q, p), not separable: leave out `separable` or `family`."
         )
+    if said.frequency is not None and (said.separable is False or (name and not FAMILIES[name].separable)):
+        raise ValueError("`drive` is of a separable H: leave out `separable`, or the `family`.")
     if said.inverse_mass is not None and (said.separable is False or (name and not FAMILIES[name].separable)):
         raise ValueError("`mass` is of T = ½ pᵀM⁻¹p in a separable H: leave out one of them.")
     if name is not None and not (FAMILIES[name].tells(said) and any(True for _ in FAMILIES[name].models(said))):
@@ -312,7 +339,7 @@ def families(said: Said, name: str | None) -> list[str]:
         )
     if name is not None:
         return [name]
-    only = said.separable if said.inverse_mass is None else True
+    only = said.separable if said.inverse_mass is None and said.frequency is None else True
     kinds = {name: family for name, family in FAMILIES.items() if family.tells(said)}
     return [name for name, family in kinds.items() if only is None or family.separable == only]
 
@@ -321,7 +348,7 @@ def with_unit_mass(candidate: Candidate, said: Said) -> Candidate | None:
     """The same model with T = ½ p²; None if its T is not learned."""
     parts = candidate.model.parts
     if not any(part.of == "p" and part.n for part in parts) or (
-        not candidate.model.nystrom and not candidate.model.rates
+        not candidate.model.nystrom and not candidate.model.forces
     ):
         return None
     rest = tuple(part for part in parts if part.of != "p")

@@ -1,6 +1,6 @@
 """Starts by Lagrange's equations of motion, which are linear in the masses where the field of H is not.
 
-Of smoothed curves q(t) with velocities v, p = ∂L/∂v, and p(t) − ∫ ∂L/∂q dt + Γ ∫ p dt is constant. Where momenta are
+Of smoothed curves q(t) with velocities v, p = ∂L/∂v, and p(t) − ∫ (∂L/∂q + F(p)) dt is constant. Where momenta are
 observed they are the p of both equations. Where velocities are, L is known but for a factor: the constant of M₁₁ is 1.
 """
 
@@ -71,8 +71,8 @@ class Equations:
         self.model, self.d, self.observed = model, model.ndof, not curves.velocities
         self.pieces = curves.pieces(POINTS).runs
         self.q, self.second, self.v = np.split(np.concatenate([run.y for run in self.pieces], axis=1), 3)
-        self.n = model.n - model.rates
-        self.value, self.by = model.momenta(self.q, self.v)
+        self.n = model.n - model.forces
+        self.value, self.by = model.at(np.concatenate([run.t for run in self.pieces])).momenta(self.q, self.v)
         self.scales = curves.scales[self.d : 2 * self.d, None]
 
     def momenta(self, theta: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -93,7 +93,7 @@ class Equations:
         if self.observed:
             rest, rows = self._rows(self.second)
             rows, rest = self._stacked(rows / self.scales[..., None]), (rest / self.scales).ravel()
-            wide = np.concatenate([likely, np.zeros((len(likely), self.model.rates))], axis=1)
+            wide = np.concatenate([likely, np.zeros((len(likely), self.model.forces))], axis=1)
             return _least(np.concatenate([wide, rows]), np.concatenate([right, -rest]))
         theta[: self.n] = _least(likely, right)  # p = v
         left, J = self._left(theta)
@@ -160,13 +160,12 @@ class Equations:
         return self._along(top, pushes)
 
     def _rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """p(t) − ∫ ∂L/∂q dt + Γ ∫ p dt for θ = 0, (d, N), and its derivatives (d, n, N), with these momenta p."""
-        d, rates = self.d, self.model.rates
-        friction = np.zeros((d, rates, p.shape[1]))
-        for i in range(d if rates else 0):
-            friction[i, i if rates > 1 else 0] = p[i]
-        whole = self._conservative
-        return whole[:, 0], np.concatenate([whole[:, 1:], self._along(np.zeros_like(friction), -friction)], axis=1)
+        """p(t) − ∫ (∂L/∂q + F) dt for θ = 0, (d, N), and its derivatives (d, n, N), with these momenta p."""
+        whole, force = self._conservative, self.model.force
+        if force is None:
+            return whole[:, 0], whole[:, 1:].copy()
+        pushes = force(np.concatenate([self.q, p]))[0][self.d :]
+        return whole[:, 0], np.concatenate([whole[:, 1:], self._along(np.zeros_like(pushes), pushes)], axis=1)
 
 
 def _least(rows: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -20,8 +20,9 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
+from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning.diagnosis import hint
+from sympflow.learning.diagnosis import drive_frequency, hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
 from sympflow.learning.fitting import (
     LAG,
@@ -38,9 +39,20 @@ from sympflow.learning.fitting import (
     restored,
 )
 from sympflow.learning.library import library_for
-from sympflow.learning.models import Distances, Formula, FreeField, Model, Part, Polynomial
+from sympflow.learning.models import (
+    Distances,
+    Drive,
+    Formula,
+    FreeField,
+    Model,
+    Part,
+    Polynomial,
+    drags,
+    friction,
+    frictions,
+)
 from sympflow.learning.shooting import Field, Method
-from sympflow.learning.smoothing import smoothed
+from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
 from sympflow.learning.trajectories import FEW, Run, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
@@ -70,8 +82,11 @@ LEAST_SECONDS = 1.0  # for the flow, however late it is
 MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
 FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
 CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
+SYMPLECTIC = 1e-9  # defect of a field, up to which it is of an H
 ROUGH = 60  # points from which the roughness of the data tells their noise to a fifth
 GROWS = 4.0  # standard errors below 0, from which a negative friction is no chance
+DAMPINGS: dict[Any, Any] = {False: None, True: friction, "each": frictions, "quadratic": drags}
+DRAG_STEPS = 20  # of a Gauss method in Δt, with a force that has a kink
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
@@ -85,6 +100,7 @@ def learn(
     separable: bool | None = None,
     mass: float | ArrayLike | None = None,
     damping: bool | str = False,
+    drive: bool | float = False,
     period: float | ArrayLike | None = None,
     known: HamiltonianSystem | None = None,
     family: str | None = None,
@@ -123,8 +139,12 @@ def learn(
         True if H = T(p) + V(q) is known, False if it is known not to be; by default the data decide.
     mass : float or array_like of shape (d,) or (d, d), optional
         M of T = ½ pᵀM⁻¹p; learned if not given.
-    damping : {False, True, "each"}
-        True to learn one rate γ of friction, p' = −∂H/∂q − γp; "each" for one rate for each p.
+    damping : {False, True, "each", "quadratic"}
+        True to learn one rate γ of friction, p' = −∂H/∂q − γp; "each" for one rate for each p; "quadratic" for drag,
+        p_i' = −∂H/∂q_i − c_i|p_i|p_i, by which `flow.system` is `sympflow.doubled`.
+    drive : bool or float
+        True to learn forces and stiffnesses a cos ωt + b sin ωt, and ω, in the time of the data; or ω, about. Then
+        `flow.system` is an H(q, p, t) of period 2π/ω.
     period : float or array_like of shape (d,), optional
         Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none. Angles that
         were wrapped are continued.
@@ -180,6 +200,7 @@ def learn(
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     said = _said(data, separable, mass, damping, period, known)
+    check_drive(drive)
     huber = limit_of(loss)
     dt = plain(dt)
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
@@ -189,6 +210,8 @@ def learn(
     rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
     seen = smooth.sigma if data.n_points >= ROUGH else None
     setting = Setting(_noise(noise, data), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
+    if drive is not False:
+        said = replace(said, frequency=_frequency(said, smooth) if drive is True else float(drive))
     said = replace(said, flow_scaling=data.scaling._replace(t=_step(data, rate) if dt is None else float(dt)))
     chosen = families(said, family)
     folds = [(_cut(one, rate), _cut(others, rate)) for one, others in _divided(data, seed)]
@@ -196,7 +219,8 @@ def learn(
         folds = [(_few(folds[0][0], seed), _few(folds[0][1], seed))]
     if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0 or replicas == 1:
         raise ValueError(f"`replicas` must be an integer, 0, or 2 or more; got {replicas!r}: 20 give useful bands.")
-    options = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
+    options: dict[str, Any] = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
+    options["drive"] = said.frequency
     identity = _identity(data, said, setting, options)
     search = Search(_cut(data, rate), folds, said, setting, seed, identity=identity, whole=data)
     if resume is not None:
@@ -240,12 +264,21 @@ def _few(data: Trajectories, seed: int) -> Trajectories:
     return data.subset(sorted(drawn[: max(1, int(np.searchsorted(numbers, MOST_VALUES, side="right")))]))
 
 
+def check_drive(drive: Any) -> None:
+    """Refuse a drive that is neither True or False nor a positive angular frequency."""
+    if not isinstance(drive, bool) and not (isinstance(drive, int | float) and 0 < drive < math.inf):
+        raise ValueError(
+            f"`drive` must be True, for a frequency that is found, a positive one, or False; got {drive!r}."
+        )
+
+
 def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Said:
     if separable is not None:
         check_flag("separable", separable)
-    if damping not in (False, True, "each"):
+    if damping not in DAMPINGS:
         raise ValueError(
-            f'`damping` must be True for one rate that is learned, "each" for one of each p, or False; got {damping!r}.'
+            f'`damping` must be True for one rate that is learned, "each" for one of each p, "quadratic" for drag, or '
+            f"False; got {damping!r}."
         )
     d = data.ndof
     inverse = None
@@ -255,11 +288,21 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: A
     parts = () if known is None else _formulas(known, d)
     if inverse is not None and any(part.of != "q" for part in parts):
         raise ValueError("`known` has a kinetic energy, and so has `mass`: leave out one of them.")
-    rates = 0 if damping is False else 1 if damping is True else d
     momenta = None if data.velocities else _covariance(data)
     middle = np.nanmean(np.concatenate([run.y[:d] for run in data.runs], axis=1), axis=1)
     of_data: dict[str, Any] = {"momenta": momenta, "velocities": data.velocities, "middle": middle}
-    return Said(data.scales, separable, inverse, rates, _periods(period, d), parts, **of_data)
+    return Said(data.scales, separable, inverse, DAMPINGS[damping], _periods(period, d), parts, **of_data)
+
+
+def _frequency(said: Said, smooth: Smooth) -> float:
+    """The angular frequency of a drive, by slopes beside those of a library of terms and friction."""
+    d, x = said.ndof, smooth.points
+    if not len(x):
+        raise ValueError("`drive` cannot be found without successive points that have all values: give its frequency.")
+    fields = library_for(None, d, 4, x)[0].fields(x)
+    resistance = np.moveaxis((said.force or frictions)(x.T)[0], -1, 0)
+    base = said.driven(1.0)
+    return drive_frequency(np.concatenate([fields, resistance], axis=2), smooth, said.scales, base)
 
 
 def _covariance(data: Trajectories) -> np.ndarray:
@@ -343,7 +386,9 @@ class Replicas:
             raise ValueError(f"`y0` must be one finite state ({2 * self.model.ndof},); got {y0!r}.")
         orbits = []
         for theta in self.thetas:
-            orbit = self.method.stepper.orbit(self.method, self.model, theta, start[:, None].copy(), None, gaps)
+            orbit = self.method.stepper.orbit(
+                self.method, self.model, theta, start[:, None].copy(), None, gaps, times[:1]
+            )
             orbits.append(np.stack([state[:, 0].copy() for state, _ in orbit], axis=1))
         return np.stack(orbits)
 
@@ -375,7 +420,7 @@ def without_growth(found: Fitted) -> Fitted:
     Of data without friction chance makes half of the rates negative. One that is more than chance is told.
     """
     model, theta = found.model, found.theta
-    first = model.n - (model.rates if isinstance(model, Model) else 0)
+    first = model.n - model.forces
     growing = np.arange(model.n) >= np.where(theta < 0, first, model.n)
     if not growing.any():
         return found
@@ -391,11 +436,6 @@ def without_growth(found: Fitted) -> Fitted:
         )
     moved = covariance[:, growing] @ np.linalg.pinv(covariance[np.ix_(growing, growing)]) @ theta[growing]
     return replace(found, theta=np.where(growing, 0.0, theta - moved))
-
-
-def _by_lagrange(model: Any) -> bool:
-    """True of a model whose numbers velocities tell by linear equations."""
-    return bool(model.velocities and model.lagrangian)
 
 
 Chosen = tuple[Candidate, Fitted, Held]
@@ -426,11 +466,11 @@ class Freedom:
     rate: float
 
 
-def _certain(forces: int, fit: Fitted, held: Held) -> bool:
+def _certain(numbers: slice, fit: Fitted, held: Held) -> bool:
     """True if the factor of one of the forces is more than chance, which noise that is correlated makes larger."""
     repeated = min(max(held.correlation, 0.0), 0.99) if math.isfinite(held.correlation) else 0.99
-    errors = np.sqrt(np.diag(fit.fit.covariance())[-forces:] * (1 + repeated) / (1 - repeated))
-    return bool((np.abs(fit.theta[-forces:]) > CERTAIN * max(held.loudness, 1.0) * errors).any())
+    errors = np.sqrt(np.diag(fit.fit.covariance())[numbers] * (1 + repeated) / (1 - repeated))
+    return bool((np.abs(fit.theta[numbers]) > CERTAIN * max(held.loudness, 1.0) * errors).any())
 
 
 @dataclass
@@ -545,8 +585,12 @@ class Search:
         that leave much more of increments than the best of all are the last.
         """
         queue = [(FAMILIES[name].linear, [*FAMILIES[name].models(self.said)]) for name in names]
-        linear = [c for _, candidates in queue for c in candidates if c.model.linear or _by_lagrange(c.model)]
-        found = best_by_increments(*self.folds[0], [candidate.model for candidate in linear])
+        linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
+        drive = None
+        if self.said.frequency is None and not self.data.velocities and not self.late():
+            drive = self._drive()
+        models = [candidate.model for candidate in linear]
+        found = best_by_increments(*self.folds[0], models, drive, setting.stop)
         if found is None:
             return queue
         place, self.reading, squares = found
@@ -560,15 +604,23 @@ class Search:
             self.tested.clear()
         hopeless = [id(linear[k]) for k in squares if squares[k] > HOPELESS * squares[place]]
         kept = [(kind, [c for c in some if id(c) not in hopeless]) for kind, some in queue]
-        # H = T(p) + V(q) is tried first, unless functions H(q, p) alone explain increments
+        # H = T(p) + V(q) is tried first, unless functions H(q, p) alone explain increments; networks last
         separable = [name for name in names if FAMILIES[name].separable]
         promising = any(
             of for (_, of), name in zip(kept, names, strict=True) if name in separable and FAMILIES[name].linear
         )
         apart = bool(squares) and not promising
-        order = sorted(range(len(names)), key=lambda i: apart and names[i] in separable)
+        judged = [any(id(c) in map(id, linear) for c in of) for _, of in queue]
+        order = sorted(range(len(names)), key=lambda i: (not judged[i], apart and names[i] in separable))
         late = [(True, [c for c in some if id(c) in hopeless]) for _, some in queue]
         return [group for group in [*(kept[i] for i in order), *late] if group[1]]
+
+    def _drive(self) -> Drive | None:
+        """A drive of the likeliest frequency; None where the data cannot tell one."""
+        smooth = smoothed(self.data)
+        if len(np.unique(smooth.owner)) < 2 or len(smooth.points) < 4 * self.said.driven(1.0).n:
+            return None
+        return self.said.driven(_frequency(self.said, smooth))
 
     def _first_fold(self, model: Model, setting: Setting) -> tuple[Fitted, Held]:
         """A model that is fitted to the first division of the trajectories, and what it leaves of the others there."""
@@ -696,11 +748,16 @@ class Search:
         deadline = session.deadline
         free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
         if free is not None:
-            said += (
-                f" No symplectic map explains these data: {free.said} leaves {free.share:.1e} of the squares. Its "
-                f"Jacobian L fails the test of symplecticity: LᵀJ + JL, which is 0 for a Hamiltonian, is "
-                f"{free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
-            )
+            if free.defect < SYMPLECTIC:
+                said += (
+                    f" No H without the time explains these data: {free.said} leaves {free.share:.1e} of the squares."
+                )
+            else:
+                said += (
+                    f" No symplectic map explains these data: {free.said} leaves {free.share:.1e} of the squares. Its "
+                    f"Jacobian L fails the test of symplecticity: LᵀJ + JL, which is 0 for a Hamiltonian, is "
+                    f"{free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
+                )
             if free.remedy:
                 warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=4)
                 return
@@ -708,7 +765,7 @@ class Search:
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         if self.cut:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
-        library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.said.rates > 0
+        library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.said.force is not None
         said += " " + hint(library, smooth, self.data, otherwise, damped)
         warnings.warn(said, UserWarning, stacklevel=4)
 
@@ -727,7 +784,7 @@ class Search:
         if self.reading is not None:
             return self._beside(self.reading, setting)
         best, scales = self.winner[0].model, self.data.scales
-        damped = [] if best.rates or not isinstance(best, Model) else forced(best)[:1]
+        damped = [] if best.forces or not isinstance(best, Model) else forced(best)[:1]
         free = next((r for r in map(partial(free_reading, scales), (3, 2)) if self._affords_field(r.field)), None)
         found = (self._beside(r, setting) for r in (*damped, free) if r is not None and self._affords_field(r.field))
         return next((one for one in found if one is not None), None)
@@ -741,12 +798,12 @@ class Search:
         fit = fitted(reading.field, reading.of(data), setting.turned(reading.rows))
         theirs = judged(fit, reading.of(others), self.setting.turned(reading.rows))
         left, share = theirs.squares(scales[[*reading.rows]]), 0.0
-        if reading.forces and not _certain(reading.forces, fit, theirs):
+        if reading.numbers and not (_certain(reading.numbers, fit, theirs) and reading.possible(fit.theta)):
             return None
         for model in rivals:
             _, held = self._first_fold(model, setting)
             share = max(share, left / held.squares(scales))
-            if not gains(held, theirs) or not share < (DAMPED if reading.forces else FREER):
+            if not gains(held, theirs) or not share < (DAMPED if reading.numbers else FREER):
                 return None
         return Freedom(reading.said, reading.remedy(fit.theta), share, *reading.test(fit.theta, fit.states.T, scales))
 
@@ -831,19 +888,28 @@ class Search:
         domain: Domain
         domain, states = self._domain()
         energies = model.hamiltonian(found.theta, states.T)
-        if isinstance(domain, Box) and np.isfinite(energies).all():
+        start, options = 0.0, {}
+        if model.drive is not None:
+            (place,) = (place for part, place in zip(model.parts, model.places, strict=True) if part is model.drive)
+            period = 2 * math.pi / (model.drive.frequency + found.theta[place][-1])
+            start, options = float(self.all.runs[0].t[0]), {"time": "t", "period": period}
+        elif isinstance(domain, Box) and np.isfinite(energies).all():
             top = float(energies.max())
             domain = EnergySublevel(top + MARGIN * (top - float(energies.min())), domain)
-        rates = found.theta[model.n - model.rates :]
-        return HamiltonianSystem.from_sympy(
+        rates, drag = found.theta[model.n - model.forces :], model.force is drags
+        system = HamiltonianSystem.from_sympy(
             model.expression(found.theta),
-            damping=None if not model.rates else float(rates[0]) if model.rates == 1 else rates,
+            damping=None if drag or not model.forces else float(rates[0]) if len(rates) == 1 else rates,
             name=name,
             domain=domain,
             y0=states[0],
-            t_span=(0.0, max(run.span for run in self.data.runs)),
+            t_span=(start, start + max(run.span for run in self.data.runs)),
             dt=self.data.time_scale,
+            **options,
         )
+        p = [f"p{i + 1}" if len(rates) > 1 else "p" for i in range(len(rates))]
+        pushes = [f"-{float(c)!r}*abs({x})*{x}" for c, x in zip(rates, p, strict=True)]
+        return doubled(system, pushes, name=name) if drag else system
 
     def flow(self, dt: float | None, name: str, session: Session) -> Any:
         """A flow of the H that was learned, or the flow that was fitted itself."""
@@ -851,11 +917,27 @@ class Search:
         if own is not None:
             return self._own(own, name)
         system = self.system(name)
-        flow = self._primed(system, dt, session) if system.separable else self._collocated(system, dt)
-        flow.figures = {**flow.figures, **self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
-        self._check_flow(flow)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            flow = self._primed(system, dt, session) if system.separable else self._collocated(system, dt)
+        if system.separable and system.autonomous and self._is_worse(flow):
+            flow, told = self._collocated(system, dt), []
+        for warning in told:
+            warnings.warn(str(warning.message), warning.category, stacklevel=3)
+        flow.figures = {**flow.figures, **self.figures(flow.dt)}
+        whole = system.autonomous and not isinstance(system, DoubledSystem)
+        flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole else None
+        if self._is_worse(flow):
+            error, noise = flow.figures["one_step_error"], flow.figures["noise"]
+            warnings.warn(
+                f"The flow is worse than the H that was learned: its one-step error is {error:.1e}, the noise "
+                f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme.",
+                UserWarning,
+                stacklevel=4,
+            )
         flow.history = self.history
-        damping = None if system.damping is None else system.damping.tolist()
+        model, theta = self.winner[0].model, self.final.theta
+        damping = theta[model.n - model.forces :].tolist() if model.forces else None
         flow.recipe = {**flow.recipe, "learned": {**self._learned, "damping": damping}}
         flow.take_learned(system)
         return flow
@@ -894,6 +976,9 @@ class Search:
         """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
         states = self._states()
         states = states[np.random.default_rng(self.seed).permutation(len(states))[:STEPPED]]
+        if isinstance(system, DoubledSystem):
+            step = suited_step(system, system.lift(states)) if dt is None else dt
+            return SympFlow.collocated(system, dt=step, steps=DRAG_STEPS)
         if dt is not None:
             try:
                 return SympFlow.collocated(system, dt=dt, states=states)
@@ -901,26 +986,26 @@ class Search:
                 warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
         return SympFlow.collocated(system, dt=suited_step(system, states), states=states)
 
-    def _check_flow(self, flow: FlowMap) -> None:
-        """Warn of a flow that is worse than the H of which it is."""
-        error, noise = flow.figures.get("one_step_error"), flow.figures["noise"]
-        if error is not None and error > max(noise, POOR * float(self.data.scales.min())):
-            warnings.warn(
-                f"The flow is worse than the H that was learned: its one-step error is {error:.1e}, the noise "
-                f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme.",
-                UserWarning,
-                stacklevel=5,
-            )
+    def _is_worse(self, flow: FlowMap) -> bool:
+        """True of a flow that is worse than the H of which it is."""
+        error, noise = flow.figures.get("one_step_error"), self.noise
+        return error is not None and error > max(noise, POOR * float(self.data.scales.min()))
+
+    @property
+    def noise(self) -> float:
+        """The noise of a value that was observed, in the root mean square of all coordinates."""
+        found = self.winner[1]
+        return float(np.sqrt(np.mean(found.sigma[found.fit.counts > 0] ** 2)))
 
     def figures(self, dt: float) -> dict[str, float]:
         """The figures of the chosen model on the held-out trajectories, before its last fit to all of them."""
         _, found, held = self.winner
-        noise = {name: float(s) for name, s, n in zip(self.data.names, found.sigma, found.fit.counts, strict=True) if n}
+        noise = {name: float(found.sigma[i]) for i, name in enumerate(self.data.names) if found.fit.counts[i]}
         made = {
             "held_out_loss": held.loss,
             "held_out_trajectories": len(self.held.runs),
             "residual_correlation": held.correlation,
-            "noise": math.sqrt(np.mean(np.square([*noise.values()]))),
+            "noise": self.noise,
         }
         if self.tested and self.tested[0] is not None:
             made["unconstrained_share"] = self.tested[0].share

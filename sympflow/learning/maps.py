@@ -33,25 +33,34 @@ class OwnSteps(Stepper):
     longest: float
     cost = 1.0
 
-    def step(self, model: Any, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+    def step(
+        self, model: Any, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
+    ) -> Any:
         return model.psi(theta, h, x, X)
 
     def orbit(
-        self, method: Method, model: Any, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray
+        self,
+        method: Method,
+        model: Any,
+        theta: np.ndarray,
+        x: np.ndarray,
+        X: np.ndarray | None,
+        gaps: np.ndarray,
+        t: np.ndarray,
     ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
         passed = np.zeros(x.shape[1])  # since the last whole step
         for gap in gaps:
             passed = passed + gap
             while (late := passed > self.longest * (1 + ON_TIME)).any():
                 some = None if X is None else X[..., late]
-                end, slopes = self.step(model, theta, x[:, late], some, np.full(int(late.sum()), self.longest))
+                end, slopes = self.step(model, theta, x[:, late], some, np.full(int(late.sum()), self.longest), t[late])
                 x = x.copy()
                 x[:, late] = end
                 if X is not None:
                     X = X.copy()
                     X[..., late] = slopes
                 passed[late] -= self.longest
-            yield self.step(model, theta, x, X, passed) if passed.any() else (x, X)
+            yield self.step(model, theta, x, X, passed, t) if passed.any() else (x, X)
 
 
 class NetworkFlow(VectorField):
@@ -69,7 +78,7 @@ class NetworkFlow(VectorField):
     """
 
     separable = nystrom = lagrangian = linear = False
-    rates = 0
+    forces, drive = 0, None
     parts = places = ()
 
     def __init__(self, scaling: Scaling, pairs: int, width: int, palindromic: bool) -> None:

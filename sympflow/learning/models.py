@@ -6,7 +6,7 @@ States are columns here: y (2d, N), as a batch of N states with its coordinates 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, pairwise, product
@@ -45,6 +45,10 @@ class VectorField:
 
     velocities: bool = False
     """True if [q, q'] are observed."""
+
+    def at(self, t: np.ndarray) -> Any:
+        """The field at times t (N,), one for each of the states that it is asked for."""
+        return self
 
     def observed(self, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None) -> tuple[np.ndarray, Any]:
         """Observations (2d, N) of states x, and their derivatives (2d, c, N) by what X are derivatives by."""
@@ -103,9 +107,13 @@ class Part(ABC):
         return True
 
     @property
-    def terms(self) -> bool:
-        """True if `subset` leaves terms out."""
+    def terms(self) -> bool | np.ndarray:
+        """True if `subset` leaves terms out; or the numbers (n,) that it may leave out."""
         return False
+
+    def at(self, t: np.ndarray) -> Part:
+        """The function at times t (N,), one for each column."""
+        return self
 
     @property
     def inertial(self) -> bool:
@@ -647,23 +655,120 @@ def _float(value: float) -> sympy.Float:
     return sympy.Float(float(value), 17)
 
 
+class Drive(Part):
+    """Σ_k (a_k cos ωt + b_k sin ωt) f_k(q), a force or a stiffness that a clock moves; θ = [a, b, change of ω].
+
+    Parameters
+    ----------
+    base : Part
+        Σ_k θ_k f_k(q).
+    frequency : float
+        ω, about.
+    """
+
+    of = "q"
+
+    def __init__(self, base: Part, frequency: float, times: np.ndarray | float = 0.0) -> None:
+        self.base, self.frequency, self.times = base, frequency, times
+        self.n = 2 * base.n + 1 if base.n else 0
+
+    @property
+    def terms(self) -> np.ndarray:
+        return np.arange(self.n) < self.n - 1
+
+    def subset(self, kept: np.ndarray) -> Part:
+        """The terms of which the cosine or the sine is kept."""
+        return Drive(self.base.subset(kept[: self.base.n] | kept[self.base.n : -1]), self.frequency)
+
+    def at(self, t: np.ndarray) -> Part:
+        return Drive(self.base, self.frequency, t)
+
+    def _waves(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        angle = (self.frequency + theta[-1]) * self.times
+        return np.cos(angle), np.sin(angle)
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        cos, sin = self._waves(theta)
+        a, b = (self.base.gradient(part, x, slope, by_parameters) for part in np.split(theta[:-1], 2))
+        slopes = by = None
+        if a.slope is not None and b.slope is not None:
+            slopes = a.slope * cos + b.slope * sin
+        if a.by_parameters is not None:
+            turned = self.times * (b.value * cos - a.value * sin)
+            by = np.concatenate([a.by_parameters * cos, a.by_parameters * sin, turned[:, None]], axis=1)
+        return Linear(a.value * cos + b.value * sin, slopes, by)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        a, b = np.split(theta[:-1], 2)
+        cos, sin = self._waves(theta)
+        return self.base.value(a, x) * cos + self.base.value(b, x) * sin
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        angle = _float(self.frequency + theta[-1]) * sympy.Symbol("t", real=True)
+        a, b = (self.base.expression(part, x) for part in np.split(theta[:-1], 2))
+        return a * sympy.cos(angle) + b * sympy.sin(angle)
+
+
+Force = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Fields (2d, k, N) of states (2d, N) that no H(q, p) gives, and their slopes (2d, k, 2d, N)."""
+
+
+def frictions(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """−p_i of each p."""
+    return _of_each(y, -y, -np.ones_like(y))
+
+
+def friction(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """−p of all."""
+    fields, slopes = frictions(y)
+    return fields.sum(axis=1, keepdims=True), slopes.sum(axis=1, keepdims=True)
+
+
+def drags(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quadratic drag −|p_i|p_i of each p."""
+    return _of_each(y, -np.abs(y) * y, -2 * np.abs(y))
+
+
+def _of_each(y: np.ndarray, forces: np.ndarray, bent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A force on each p_i that depends on it alone."""
+    m, N = y.shape
+    d = m // 2
+    fields, slopes = np.zeros((m, d, N)), np.zeros((m, d, m, N))
+    for i in range(d, m):
+        fields[i, i - d], slopes[i, i - d, i] = forces[i], bent[i]
+    return fields, slopes
+
+
+def turns(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform magnetic fields that turn p_i to p_j, i < j."""
+    m, N = y.shape
+    pairs = [*combinations(range(m // 2, m), 2)]
+    fields, slopes = np.zeros((m, len(pairs), N)), np.zeros((m, len(pairs), m, N))
+    for k, (i, j) in enumerate(pairs):
+        fields[i, k], fields[j, k] = y[j], -y[i]
+        slopes[i, k, j], slopes[j, k, i] = 1.0, -1.0
+    return fields, slopes
+
+
 @dataclass(frozen=True)
 class Model(VectorField):
-    """H_θ(q, p), the sum of its parts, each with its own place in θ; y' = J∇H, with friction p' = −∂H/∂q − Γp.
+    """H_θ(q, p), the sum of its parts, each with its own place in θ; y' = J∇H + Σ_k c_k F_k, c the last numbers of θ.
 
     Parameters
     ----------
     ndof : int
     parts : tuple of Part
-    rates : int
-        How many rates of friction there are at the end of θ: none, one, or one for each p.
+    force : callable, optional
+        F, such as `friction`, `drags` or `turns`.
     velocities : bool
         True if q' = ∂H/∂p is observed in place of p.
     """
 
     ndof: int
     parts: tuple[Part, ...]
-    rates: int = 0
+    force: Force | None = None
     velocities: bool = False
     stepper: ClassVar[Any] = None
     """The steps of a map of its own; None where schemes follow a field."""
@@ -671,12 +776,25 @@ class Model(VectorField):
     @property
     def n(self) -> int:
         """The length of θ."""
-        return sum(part.n for part in self.parts) + self.rates
+        return sum(part.n for part in self.parts) + self.forces
+
+    @cached_property
+    def forces(self) -> int:
+        """The number of forces that no H gives."""
+        return 0 if self.force is None else self.force(np.zeros((2 * self.ndof, 1)))[0].shape[1]
+
+    @cached_property
+    def drive(self) -> Drive | None:
+        """The part that depends on time."""
+        return next((part for part in self.parts if isinstance(part, Drive)), None)
+
+    def at(self, t: np.ndarray) -> Model:
+        return self if self.drive is None else replace(self, parts=tuple(part.at(t) for part in self.parts))
 
     @property
     def separable(self) -> bool:
-        """True if H = T(p) + V(q), without friction."""
-        return not self.rates and all(part.of != "y" for part in self.parts)
+        """True if H = T(p) + V(q), without forces."""
+        return not self.forces and all(part.of != "y" for part in self.parts)
 
     @property
     def nystrom(self) -> bool:
@@ -686,7 +804,7 @@ class Model(VectorField):
     @property
     def prior(self) -> np.ndarray:
         """One over the size (n,) that each number is expected to have, 0 for any."""
-        return np.concatenate([part.prior for part in self.parts] + [np.zeros(self.rates)])
+        return np.concatenate([part.prior for part in self.parts] + [np.zeros(self.forces)])
 
     def _columns(self, of: str) -> slice:
         return {"q": slice(0, self.ndof), "p": slice(self.ndof, None), "y": slice(None)}[of]
@@ -728,15 +846,12 @@ class Model(VectorField):
             for a in self.gradient(theta, y, "y", slope, by_parameters)
         )
         assert value is not None
-        if self.rates:
-            rates = theta[-self.rates :]
-            value[d:] -= np.broadcast_to(rates, d)[:, None] * y[d:]
-            for i in range(d):
-                place = i if self.rates > 1 else 0
-                if slopes is not None:
-                    slopes[d + i, d + i] -= rates[place]
-                if columns is not None:
-                    columns[d + i, self.n - self.rates + place] -= y[d + i]
+        if self.force is not None:
+            (fields, bent), factors = self.force(y), theta[-self.forces :]
+            value = value + np.einsum("mkn,k->mn", fields, factors)
+            slopes = None if slopes is None else slopes + np.einsum("mkjn,k->mjn", bent, factors)
+            if columns is not None:
+                columns[:, -self.forces :] = fields
         return Linear(value, slopes, columns)
 
     def observed(self, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None) -> tuple[np.ndarray, Any]:
@@ -777,7 +892,7 @@ class Model(VectorField):
         )
 
     def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """p and p' by Lagrange's equations for θ = 0, and their derivatives by θ, without those of friction."""
+        """p and p' by Lagrange's equations for θ = 0, and their derivatives by θ, without those of forces."""
         values, columns = zip(*(part.momenta(q, v) for part in self.parts), strict=True)
         return np.sum(values, axis=0), np.concatenate(columns, axis=1)
 
@@ -805,64 +920,8 @@ class Model(VectorField):
         return None
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
-        """θ before anything is known; friction 0."""
-        return np.concatenate([part.start(rng) for part in self.parts] + [np.zeros(self.rates)])
-
-
-def drags(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quadratic drag −|p_i|p_i of each p at states (2d, N): the fields (2d, d, N) and their slopes (2d, d, 2d, N)."""
-    m, N = y.shape
-    d = m // 2
-    fields, slopes = np.zeros((m, d, N)), np.zeros((m, d, m, N))
-    for i in range(d, m):
-        fields[i, i - d], slopes[i, i - d, i] = -np.abs(y[i]) * y[i], -2 * np.abs(y[i])
-    return fields, slopes
-
-
-def turns(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform magnetic fields that turn p_i to p_j, i < j: the fields (2d, d(d − 1)/2, N) and their slopes."""
-    m, N = y.shape
-    pairs = [*combinations(range(m // 2, m), 2)]
-    fields, slopes = np.zeros((m, len(pairs), N)), np.zeros((m, len(pairs), m, N))
-    for k, (i, j) in enumerate(pairs):
-        fields[i, k], fields[j, k] = y[j], -y[i]
-        slopes[i, k, j], slopes[j, k, i] = 1.0, -1.0
-    return fields, slopes
-
-
-class Forced(VectorField):
-    """The field of a model with forces that no H(q, p) gives, whose factors are its last numbers.
-
-    Parameters
-    ----------
-    model : Model
-    forces : callable
-        Such as `drags`.
-    """
-
-    separable = nystrom = lagrangian = False
-    stepper = None
-    parts = places = ()
-
-    def __init__(self, model: Model, forces: Any) -> None:
-        self.model, self.forces, self.ndof, self.linear = model, forces, model.ndof, model.linear
-        self.n = model.n + forces(np.zeros((2 * model.ndof, 1)))[0].shape[1]
-
-    @property
-    def prior(self) -> np.ndarray:
-        return np.concatenate([self.model.prior, np.zeros(self.n - self.model.n)])
-
-    def start(self, rng: np.random.Generator) -> np.ndarray:
-        return np.concatenate([self.model.start(rng), np.zeros(self.n - self.model.n)])
-
-    def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
-        """The vector field."""
-        k = self.model.n
-        found, (fields, slopes) = self.model.field(theta[:k], y, slope, by_parameters), self.forces(y)
-        value = found.value + np.einsum("mkn,k->mn", fields, theta[k:])
-        moved = None if found.slope is None else found.slope + np.einsum("mkjn,k->mjn", slopes, theta[k:])
-        columns = None if found.by_parameters is None else np.concatenate([found.by_parameters, fields], axis=1)
-        return Linear(value, moved, columns)
+        """θ before anything is known; forces 0."""
+        return np.concatenate([part.start(rng) for part in self.parts] + [np.zeros(self.forces)])
 
 
 class FreeField(VectorField):
@@ -875,7 +934,7 @@ class FreeField(VectorField):
     """
 
     separable = nystrom = lagrangian = False
-    linear = True
+    linear, forces, drive = True, 0, None
     stepper = None
 
     def __init__(self, scales: Any, degree: int) -> None:

@@ -27,13 +27,13 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import cho_factor, cho_solve
 
-from sympflow.learning.models import Forced, FreeField, Linear, Model, VectorField
+from sympflow.learning.models import FreeField, Linear, Model, VectorField
 from sympflow.learning.trajectories import Run, Trajectories
 from sympflow.schemes import Scheme, scheme_named
 from sympflow.training.least_squares import Damping, LinearModel, Stop, descend, never
 from sympflow.training.session import OutOfTime
 
-Field = Model | Forced | FreeField
+Field = Model | FreeField
 """A vector field with numbers θ."""
 
 MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the cache
@@ -60,19 +60,29 @@ class Stepper(ABC):
         return self
 
     @abstractmethod
-    def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
-        """The states (2d, N) and derivatives (2d, c, N) a time h (N,) after x and X, which may be overwritten.
+    def step(
+        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
+    ) -> Any:
+        """The states (2d, N) and derivatives (2d, c, N) a time h (N,) after x and X at t, which may be overwritten.
 
         The first 2d columns of X are those by the initial state, the others those by θ, if there are any.
         """
 
     def orbit(
-        self, method: Method, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray
+        self,
+        method: Method,
+        model: Field,
+        theta: np.ndarray,
+        x: np.ndarray,
+        X: np.ndarray | None,
+        gaps: np.ndarray,
+        t: np.ndarray,
     ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
-        """States and derivatives after each of the gaps (k, N) between points."""
+        """States and derivatives after each of the gaps (k, N) between points, the first of which follows t (N,)."""
         for gap in gaps:
             if gap.any():
-                x, X = method.over(model, theta, x, X, gap)
+                x, X = method.over(model, theta, x, X, gap, t)
+                t = t + gap
             yield x, X
 
 
@@ -86,15 +96,20 @@ class Splitting(Stepper):
     def cost(self) -> float:  # type: ignore[override]
         return float(self.scheme.force_evaluations)
 
-    def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+    def step(
+        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
+    ) -> Any:
         assert isinstance(model, Model)
         d = model.ndof
         q, p = slice(0, d), slice(d, 2 * d)
         wanted = X is not None, X is not None and X.shape[1] > 2 * d
+        drifted = 0.0
         for b, a in zip(self.scheme.kicks, self.scheme.drifts, strict=True):
             for weight, of, moved in ((-b, q, p), (a, p, q)):
                 if weight:
-                    self._push(model.gradient(theta, x[of], "qp"[of is p], *wanted), weight * h, x, X, of, moved)
+                    here = model.at(t + drifted * h)
+                    self._push(here.gradient(theta, x[of], "qp"[of is p], *wanted), weight * h, x, X, of, moved)
+            drifted += a
         return x, X
 
     @staticmethod
@@ -137,11 +152,14 @@ class Gauss(Stepper):
     def within(self, tolerance: np.ndarray) -> Gauss:
         return replace(self, tolerance=SOLVED * tolerance)
 
-    def step(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray) -> Any:
+    def step(
+        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
+    ) -> Any:
         A, b = self._table
         m, N = x.shape
         s = self.stages
-        K = np.repeat(model.field(theta, x, False, False).value[:, None], s, axis=1)  # (m, s, N)
+        model = model.at((t + h * A.sum(axis=1)[:, None]).ravel())
+        K = np.repeat(model.at(t).field(theta, x, False, False).value[:, None], s, axis=1)  # (m, s, N)
         before, near = math.inf, np.reshape(self.tolerance, (-1, 1, 1))
         for _ in range(self.iterations):
             inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
@@ -210,11 +228,13 @@ class Method:
         """How many steps lead over gaps (N,)."""
         return max(1, math.ceil(float(np.max(np.abs(gaps), initial=0.0)) / self.longest * (1 - 1e-9)))
 
-    def over(self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray) -> Any:
-        """States and derivatives at the end of gaps."""
+    def over(
+        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray
+    ) -> Any:
+        """States and derivatives at the end of gaps that begin at t."""
         n = self.steps(gaps)
-        for _ in range(n):
-            x, X = self.stepper.step(model, theta, x, X, gaps / n)
+        for k in range(n):
+            x, X = self.stepper.step(model, theta, x, X, gaps / n, t + k * gaps / n)
         return x, X
 
 
@@ -235,12 +255,15 @@ class Batch:
         0 where nothing was observed.
     seen : ndarray of shape (k, 2d, N)
         1 where there is an observation, 0 elsewhere.
+    starts : ndarray of shape (N,)
+        Their first times.
     """
 
     index: np.ndarray
     gaps: np.ndarray
     y: np.ndarray
     seen: np.ndarray
+    starts: np.ndarray
 
 
 def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
@@ -262,7 +285,8 @@ def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
             gaps[1 : run.n_points, column] = np.diff(run.t)
             y[: run.n_points, :, column] = run.y.T
         seen = np.isfinite(y)
-        made.append(Batch(index, gaps, np.where(seen, y, 0.0), seen.astype(float)))
+        starts = np.array([runs[i].t[0] for i in index])
+        made.append(Batch(index, gaps, np.where(seen, y, 0.0), seen.astype(float), starts))
         start = stop
     return made
 
@@ -421,7 +445,7 @@ class Problem:
         if derivatives:
             X = np.zeros((m, m + (0 if self.frozen else self.model.n), x.shape[1]))
             X[np.arange(m), np.arange(m)] = 1.0
-        orbit = self.method.stepper.orbit(self.method, self.model, theta, x, X, batch.gaps)
+        orbit = self.method.stepper.orbit(self.method, self.model, theta, x, X, batch.gaps, batch.starts)
         for k, (x, X) in enumerate(orbit):
             if stop():
                 raise OutOfTime
@@ -686,7 +710,7 @@ def chosen_method(
     """
     if model.stepper is not None:
         return Method(model.stepper, model.stepper.longest)
-    starts, gaps = _gaps(data)
+    starts, gaps, times = _gaps(data)
     starts, widest = model.states(theta, starts), float(gaps.max())
     best: tuple[float, Method] | None = None
 
@@ -695,12 +719,12 @@ def chosen_method(
 
     for stepper in reversed(steppers(model)):  # those of a high order first: others are left when they cost more
         method = Method(stepper.within(tolerance), widest)
-        end, before = _ends(model, theta, method, starts, gaps), math.inf
+        end, before = _ends(model, theta, method, starts, gaps, times), math.inf
         for _ in range(halvings):
             if stop() or (best is not None and cost(method) > best[0]):
                 break
             finer = replace(method, longest=method.longest / 2)
-            after = _ends(model, theta, finer, starts, gaps)
+            after = _ends(model, theta, finer, starts, gaps, times)
             with np.errstate(invalid="ignore", over="ignore"):
                 error = np.nanquantile(np.abs(end - after) / tolerance[:, None], 0.99) if len(gaps) else 0.0
             if error <= 1 or (error > before / 2 and error < 1e3):  # rounding
@@ -712,28 +736,32 @@ def chosen_method(
     return best[1]
 
 
-def _gaps(data: Trajectories, most: int = 400) -> tuple[np.ndarray, np.ndarray]:
-    """Some states (2d, N) with the times to the next points (N,), the widest gaps among them."""
+def _gaps(data: Trajectories, most: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Some states (2d, N) with the times to the next points (N,), the widest among them, and their own times."""
     found = [
-        (run.y[:, k], run.t[k + 1] - run.t[k])
+        (run.y[:, k], run.t[k + 1] - run.t[k], run.t[k])
         for run in data.runs
         for k in range(run.n_points - 1)
         if np.isfinite(run.y[:, k]).all()
     ]
     if not found:  # never a whole state
-        found = [(x, float(np.diff(run.t).max())) for x, run in zip(first_states(data), data.runs, strict=True)]
-    gaps = np.array([gap for _, gap in found])
+        found = [
+            (x, float(np.diff(run.t).max()), run.t[0]) for x, run in zip(first_states(data), data.runs, strict=True)
+        ]
+    gaps, times = np.array([one[1:] for one in found]).T
     chosen = np.unique(
         np.concatenate(
             [np.argsort(gaps)[-most // 4 :], np.linspace(0, len(gaps) - 1, min(most, len(gaps))).astype(int)]
         )
     )
-    return np.stack([found[i][0] for i in chosen], axis=1), gaps[chosen]
+    return np.stack([found[i][0] for i in chosen], axis=1), gaps[chosen], times[chosen]
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def _ends(model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-    return model.observed(theta, method.over(model, theta, x.copy(), None, gaps)[0], None)[0]
+def _ends(
+    model: Field, theta: np.ndarray, method: Method, x: np.ndarray, gaps: np.ndarray, t: np.ndarray
+) -> np.ndarray:
+    return model.observed(theta, method.over(model, theta, x.copy(), None, gaps, t)[0], None)[0]
 
 
 def matched(
@@ -781,8 +809,8 @@ def increments_left(model: Field, theta: np.ndarray, data: Trajectories, weights
     pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
     if model.velocities:
         y = np.concatenate([run.y for run in pieces], axis=1)
-        x = model.states(theta, y)
-        rates = model.observed(theta, x, model.field(theta, x, False, False).value[:, None])[1][:, 0]
+        x, here = model.states(theta, y), model.at(np.concatenate([run.t for run in pieces]))
+        rates = model.observed(theta, x, here.field(theta, x, False, False).value[:, None])[1][:, 0]
         parts = np.split(rates, np.cumsum([run.n_points for run in pieces])[:-1], axis=1)
         rests = [run.y - integrals(run.t, part) for run, part in zip(pieces, parts, strict=True)]
         return float(sum((((rest.T - rest.mean(axis=1)) * weights) ** 2).sum() for rest in rests))
@@ -801,7 +829,8 @@ def _increments(
     model: Field, theta: np.ndarray, pieces: Sequence[Run], weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The increments less the integrals of the field, and minus their derivative by θ."""
-    f = model.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)
+    here = model.at(np.concatenate([run.t for run in pieces]))
+    f = here.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)
     assert f.by_parameters is not None
     at, rests, columns = 0, [], []
     for run in pieces:

@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sympflow.learning.diagnosis import DRAG, TURNED
+from sympflow.learning.diagnosis import DRAG, DRIVEN, TURNED
 from sympflow.learning.lagrangian import lagrangian_start
-from sympflow.learning.models import Forced, FreeField, Model, drags, turns
+from sympflow.learning.models import Drive, FreeField, Model, drags, frictions, turns
 from sympflow.learning.shooting import Field, increments_left, matched
 from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.training.least_squares import Stop, never
 
 DEGREES = (1, 2, 3)
 """Degrees of the polynomial fields that need not be Hamiltonian."""
@@ -58,8 +59,8 @@ class Reading:
         The explanation in words.
     advice : str
         What to do then, with a place for the numbers of the forces.
-    forces : int
-        How many forces there are beside those of H; their factors are the last numbers of the field.
+    numbers : slice or None
+        The places of the factors of forces beside those of H.
     """
 
     field: Field
@@ -67,7 +68,7 @@ class Reading:
     share: float
     said: str
     advice: str = ""
-    forces: int = 0
+    numbers: slice | None = None
 
     def of(self, data: Trajectories) -> Trajectories:
         """The data with the coordinates in this order."""
@@ -76,8 +77,14 @@ class Reading:
 
     def remedy(self, theta: np.ndarray) -> str:
         """Advice, with the factors of the forces that were found."""
-        factors = theta[len(theta) - self.forces :]
-        return self.advice.format(", ".join(f"{factor:.3g}" for factor in factors))
+        drive = getattr(self.field, "drive", None)
+        if self.said == DRIVE[0] and drive is not None:
+            return self.advice.format(*2 * [f"{drive.frequency + theta[self.numbers][-1]:.5g}"])
+        return self.advice.format(", ".join(f"{factor:.3g}" for factor in theta[self.numbers or slice(0)]))
+
+    def possible(self, theta: np.ndarray) -> bool:
+        """True unless friction or drag would feed energy."""
+        return self.said not in (FRICTION[0], DRAG_SAID[0]) or bool(theta[self.numbers or slice(0)].sum() > 0)
 
     def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
         """The defect of symplecticity in the coordinates as they are, and the rate at which volumes grow.
@@ -114,18 +121,27 @@ FRICTION = (
 )
 DRAG_SAID = "the best H with a drag p' = -c|p|p", DRAG
 TURNED_SAID = "the best H with a force that turns p", TURNED
+DRIVE = "the best H with a drive", DRIVEN
 PAIRS = ("the same in the order q1, p1, q2, p2, … of columns", 'The columns look like that: pass order="pairs".')
 
 
-def forced(model: Model) -> list[Reading]:
-    """The model with forces that are none of H: friction, what turns p, quadratic drag; from plain to rich."""
+def forced(model: Model, drive: Drive | None = None) -> list[Reading]:
+    """The model with forces that no H(q, p) gives: friction, what turns p, quadratic drag, a drive; from plain to rich.
+
+    Of a model that has a force only a drive is of interest.
+    """
     d = model.ndof
     rows = tuple(range(2 * d))
-    made = [] if model.rates else [Reading(replace(model, rates=d), rows, math.inf, *FRICTION, d)]
-    if model.velocities:  # among whose models there are those in magnetic fields
-        return made
-    made += [Reading(Forced(model, turns), rows, math.inf, *TURNED_SAID, d * (d - 1) // 2)] if d > 1 else []
-    return [*made, Reading(Forced(model, drags), rows, math.inf, *DRAG_SAID, d)]
+    forces = [(frictions, FRICTION), (turns, TURNED_SAID), (drags, DRAG_SAID)]
+    made = []
+    for force, said in forces[: 1 if model.velocities else 3]:  # among those of velocities are magnetic fields
+        if model.force is None and (force is not turns or d > 1):
+            with_force = replace(model, force=force)
+            made.append(Reading(with_force, rows, math.inf, *said, slice(model.n, with_force.n)))
+    if drive is not None and model.drive is None:
+        driven = replace(model, parts=(*model.parts, drive))
+        made.append(Reading(driven, rows, math.inf, *DRIVE, driven.places[-1]))
+    return made
 
 
 def free_reading(scales: np.ndarray, degree: int) -> Reading:
@@ -135,7 +151,11 @@ def free_reading(scales: np.ndarray, degree: int) -> Reading:
 
 
 def best_by_increments(
-    data: Trajectories, held: Trajectories, models: Sequence[Model]
+    data: Trajectories,
+    held: Trajectories,
+    models: Sequence[Model],
+    drive: Drive | None = None,
+    stop: Stop = never,
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
     """The place of the model, linear in its numbers, that explains held-out increments best, and a doubt, if any.
 
@@ -150,29 +170,35 @@ def best_by_increments(
     affordable = [k for k, model in enumerate(models) if _affords(fitted, model)]
     if not affordable or not others.runs:
         return None
-    smooth = smoothed(fitted) if data.velocities else None
-    squares = {k: _left(models[k], fitted, others, scales, smooth) for k in affordable}
+    smooth = smoothed(fitted) if any(model.velocities or model.lagrangian for model in models) else None
+    squares = {k: _left(models[k], fitted, others, scales, smooth) for k in affordable if not stop()}
+    if not squares:
+        return None
     best = min(affordable, key=lambda k: squares[k])
     if not 0 < squares[best] < math.inf:
         return best, None, squares
 
     def compared(reading: Reading) -> Reading:
         a, b = reading.of(fitted), reading.of(others)
-        return replace(reading, share=_left(reading.field, a, b, scales[[*reading.rows]], smooth) / squares[best])
+        return replace(
+            reading,
+            share=_left(reading.field, a, b, scales[[*reading.rows]], smooth if reading.advice != PAIRS[1] else None)
+            / squares[best],
+        )
 
     free = [free_reading(scales, degree) for degree in DEGREES]
     found = [compared(reading) for reading in free if _affords(fitted, reading.field)]
-    plain = [reading for k in affordable for reading in forced(models[k]) if _affords(fitted, reading.field)]
+    plain = [reading for k in squares for reading in forced(models[k], drive) if _affords(fitted, reading.field)]
     if d > 1 and not data.velocities:
         turned = (*range(0, 2 * d, 2), *range(1, 2 * d, 2))
-        plain += [Reading(models[k], turned, math.inf, *PAIRS) for k in affordable]
-    plain = [compared(reading) for reading in plain]
+        plain += [Reading(models[k], turned, math.inf, *PAIRS) for k in squares]
+    plain = [compared(reading) for reading in plain if not stop()]
     least, freest = (min((reading.share for reading in some), default=math.inf) for some in (plain, found))
-    kinds = {kind: [r for r in plain if r.said == kind] for kind, _ in (FRICTION, TURNED_SAID, DRAG_SAID, PAIRS)}
+    kinds = {kind: [r for r in plain if r.said == kind] for kind, _ in (FRICTION, TURNED_SAID, DRAG_SAID, PAIRS, DRIVE)}
     for some in kinds.values():  # the plainest that is about as good as the best
         likeliest = min(some, key=lambda reading: reading.share, default=None)
         if likeliest is not None and likeliest.share <= min(PLAINER * least, PLAINER * freest):
-            return best, (likeliest if likeliest.share < (DAMPED if likeliest.forces else DOUBTFUL) else None), squares
+            return best, (likeliest if likeliest.share < (DAMPED if likeliest.numbers else DOUBTFUL) else None), squares
     likeliest = min(found, key=lambda reading: reading.share, default=None)
     return best, (likeliest if likeliest is not None and likeliest.share < DOUBTFUL else None), squares
 
@@ -186,7 +212,7 @@ def _left(
 ) -> float:
     """The squares that a model which was fitted to increments leaves of held-out ones; infinite where it diverges."""
     theta, moved = np.zeros(model.n), data
-    if model.velocities:
+    if model.velocities or model.lagrangian:
         assert isinstance(model, Model)
         theta, moved = lagrangian_start(model, data, model.start(np.random.default_rng(0)), smooth)
     if model.linear:

@@ -85,7 +85,7 @@ def check_problem(reference: object, system: HamiltonianSystem, t0: float, y0: n
         scale = np.maximum(np.abs(H0), np.abs(y0 * to_numpy(system.gradient(y0))).sum(-1))
         off = np.abs(H - H0).max(0) > OTHER_ENERGY * scale
     if np.all(off):
-        raise ValueError("`reference` has another energy than `y0`: it is no solution of this problem from there.")
+        raise ValueError("`reference` has another energy than `y0`: it does not solve this problem from there.")
 
 
 def _same_field(sol: Solution, system: HamiltonianSystem) -> bool:

@@ -60,7 +60,7 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
         "so that its energy is also lost to friction", "use sympflow.reference_error(sol), or solve it without damping"
     )
     sol.system.check_impulses("at which its energy jumps", "use sympflow.reference_error(sol)")
-    if jumps_in_time(sol.system):
+    if not kept_by(sol.system):
         raise ValueError(
             f"`sol` is of {sol.system.name!r}, of which H jumps at some times, where ∂H/∂t is not finite: use "
             "sympflow.reference_error(sol), sympflow.symplecticity_defect(sol)."
@@ -75,9 +75,13 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
     return np.where(np.isnan(error) & np.isfinite(H), np.inf, error)
 
 
-def jumps_in_time(system: HamiltonianSystem) -> bool:
-    """Return True if H is known to jump at some times, so that there is no energy balance."""
-    return system.symbols is not None and system.symbols.jumps
+def kept_by(system: HamiltonianSystem) -> str:
+    """Return the name of what the flow of a system keeps: its "energy", or the "balance" of a drive, or "" for none."""
+    if not system.conservative:
+        return ""
+    if system.autonomous:
+        return "energy"
+    return "" if system.symbols is not None and system.symbols.jumps else "balance"
 
 
 def _start_energy(sol: Solution) -> np.ndarray:

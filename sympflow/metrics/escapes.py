@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import real_number, warn
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-from sympflow.integrators.contract import FINISHED, Problem
+from sympflow.integrators.contract import FINISHED, Problem, start_of
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings, pieces_of
 from sympflow.integrators.registry import naming_plugin
@@ -244,20 +244,19 @@ def _escapes(
             time[where[lanes]] = np.nan
             found = where[lanes[escaped]]
             begin = grid.t0 + (k + first[lanes[escaped]] - 1) * grid.h
-            groups = [slice(None)] if system.autonomous else [slice(i, i + 1) for i in range(len(found))]
-            for i in groups:  # together, or each at its own time
-                if len(found[i]):
-                    part, state[found[i]] = _located(integrator, system, begin[i][0], before[escaped][i], h, region)
-                    time[found[i]] = begin[i] + part
+            if len(found):
+                part, state[found] = _located(integrator, system, begin, before[escaped], h, region)
+                time[found] = begin + part
             y, where = states[-1, ~gone], where[~gone]
             k += n
     return time, state, status
 
 
 def _located(
-    integrator: FixedStep, system: HamiltonianSystem, t: float, y: np.ndarray, h: float, region: Outside
+    integrator: FixedStep, system: HamiltonianSystem, times: np.ndarray, y: np.ndarray, h: float, region: Outside
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The parts (n,) of steps from y (n, 2d) after which states are outside, and these states."""
+    """The parts (n,) of steps from y (n, 2d) at times (n,) after which states are outside, and these states."""
+    t = start_of(system, times)
     inside, out = np.zeros(len(y)), np.ones(len(y))
     for _ in range(HALVINGS):
         middle = (inside + out) / 2

@@ -133,7 +133,7 @@ def linear_stability(method: Any) -> LinearStability:
     if scheme is None or scheme.level == POLYNOMIAL:
         raise ValueError(
             f"`method` {getattr(method, 'name', method)!r} has no table of kicks and drifts by T and V: its stability "
-            "on an oscillator is no polynomial. Use stability() on a system."
+            "on an oscillator is not a polynomial. Use stability() on a system."
         )
     return _of_table(scheme)
 

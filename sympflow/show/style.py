@@ -115,7 +115,7 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     known = figure.canvas.get_supported_filetypes()
     if path.suffix and path.suffix[1:].lower() not in known:
         raise ValueError(
-            f"`path` {path.name!r} ends in {path.suffix!r}, which is no format of figures: take one of "
+            f"`path` {path.name!r} ends in {path.suffix!r}, which is not a format of figures: take one of "
             f"{', '.join(sorted(known))}."
         )
     path = path if path.suffix else path.with_name(f"{path.name}.png")

@@ -49,16 +49,10 @@ class Identified(Protocol):
 
 @dataclass
 class Known:
-    """The identity of a call, by which a store knows it again.
+    """The identity of a call, by which a store knows it again: texts by the names of arguments and the like.
 
-    Attributes
-    ----------
-    texts : dict of str to str
-        By the names of arguments and the like.
-    python : set of str
-        Names of those in which there are functions or objects of Python, and not values alone.
-    untold : dict of str to str
-        Names of those with a part that cannot be told from another, and that part.
+    `python` are the names of those in which there are functions or objects of Python, and not values alone; `untold`
+    those with a part that cannot be told from another, and that part.
     """
 
     texts: dict[str, str] = field(default_factory=dict)

@@ -62,13 +62,7 @@ def described(arrays: Mapping[str, tuple[Any, ...]]) -> dict[str, tuple[Any, ...
 
 
 def imported(library: str, what: str) -> Any:
-    """Import a library of the extra "data".
-
-    Raises
-    ------
-    ImportError
-        If it is not installed, with what needs it.
-    """
+    """Import a library of the extra "data"."""
     try:
         return import_module(library)
     except ImportError as error:

@@ -63,13 +63,7 @@ class Place:
 
     @classmethod
     def read(cls, arrays: Mapping[str, np.ndarray], batch: tuple[int, ...]) -> Place:
-        """Return the place that arrays stand for, of trajectories of a batch.
-
-        Raises
-        ------
-        KeyError, TypeError, ValueError
-            If they stand for none.
-        """
+        """Return the place that arrays stand for, of trajectories of a batch."""
         steps, counts = int(arrays["steps"]), json.loads(str(arrays["counts"]))
         place = cls(steps, arrays["running"], arrays["finite"], arrays["state"], arrays["failed"], counts)
         kinds = place.running.dtype.kind + place.finite.dtype.kind + place.state.dtype.kind + place.failed.dtype.kind
@@ -82,29 +76,11 @@ class Place:
 
 
 class RunStore:
-    """The store of one call of `solve`; made or opened by `opened`.
+    """The store of one call of `solve`, in the folder `path`; made or opened by `opened`.
 
-    Parameters
-    ----------
-    path : str or path
-        Of a folder.
-    resume : bool
-        Whether to go on with the run that is there.
-    checkpoint_every : float, optional
-        Seconds between two commits, at most; the default is 10.
-    same : bool
-        Whether functions and objects of Python are taken for those of the run that is there.
-
-    Attributes
-    ----------
-    length : int
-        The outputs that it holds, those among them that are not committed.
-    consistent : bool
-        False while outputs are being taken.
-    project : callable
-        The states (..., 2d) of those (..., K) on which steps are made.
-    noted : dict
-        The largest numbers that the method noted, and `domain_exit` and `warning` of an output outside the domain.
+    It holds `length` outputs, those among them that are not committed; `consistent` is False while outputs are being
+    taken. `project` makes states (..., 2d) of those (..., K) on which steps are made. `noted` are the largest numbers
+    that the method noted, and `domain_exit` and `warning` of an output outside the domain.
     """
 
     def __init__(self, path: Any, resume: Any = False, checkpoint_every: Any = None, same: Any = False) -> None:
@@ -129,32 +105,13 @@ class RunStore:
     # opening --------------------------------------------------------------------------------------
 
     def prepare(self, known: Known, attributes: Mapping[str, Any], y0: np.ndarray, n_outputs: int) -> None:
-        """Take what the store is to be made of.
-
-        Parameters
-        ----------
-        known : Known
-            What the run is known by.
-        attributes : mapping
-            Those of the store, as JSON has them.
-        y0 : ndarray of shape (..., 2d)
-        n_outputs : int
-            That are expected.
-        """
+        """Take what the store is to be made of."""
         self.attributes = dict(attributes)
         self._made_of = known, y0, n_outputs
 
     @contextmanager
     def opened(self) -> Iterator[None]:
-        """Make the store, or open the one that is there, which no other process can write then.
-
-        Raises
-        ------
-        ValueError
-            If there is something without `resume`, or a store of another run.
-        StoreError
-            If it cannot be made, or another process writes it.
-        """
+        """Make the store, or open the one that is there, which no other process can write then."""
         known, y0, n_outputs = self._made_of
         try:
             self.store = self._create(known, y0, n_outputs)

@@ -56,22 +56,10 @@ class StoreError(OSError):
 
 @dataclass(frozen=True)
 class Field:
-    """An array of a store.
+    """An array of a store, of numbers or truth values; fields that share a dimension have the same length along it.
 
-    Attributes
-    ----------
-    dims : tuple of str
-        A name for each dimension. Fields that share one have the same length along it.
-    shape : tuple of int
-    dtype : dtype
-        Of numbers or truth values.
-    chunks : tuple of int, optional
-        The default is the whole array.
-    attributes : mapping
-        As JSON has them.
-    missing : int, optional
-        The number that stands where nothing has been written, of an array that is not complete. A reader of zarr may
-        show it as NaN. The default is NaN, or 0 of other numbers than floats.
+    `chunks` is by default the whole array. `missing` is the number where nothing has been written, which a reader of
+    zarr may show as NaN; the default is NaN, or 0 of other numbers than floats.
     """
 
     dims: tuple[str, ...]
@@ -146,15 +134,7 @@ class Field:
 
 
 class Store:
-    """A store that exists: make one by `create`, or `open` it.
-
-    Attributes
-    ----------
-    path : Path
-    fields : dict of str to Field
-    attributes : dict
-        Those of the whole, as JSON has them, of the last commit.
-    """
+    """A store that exists, with fields and attributes of its last commit: make one by `create`, or `open` it."""
 
     def __init__(self, path: Path, fields: dict[str, Field], attributes: dict[str, Any]) -> None:
         self.path, self.fields, self.attributes = path, fields, attributes
@@ -170,13 +150,6 @@ class Store:
         """Make a store, with the values of some arrays of one chunk; the others have none.
 
         It is made beside its place, and moved there: it is whole, or it is not there.
-
-        Raises
-        ------
-        FileExistsError
-            If there is something in this place.
-        StoreError
-            If it cannot be made there.
         """
         place = Path(path)
         for name in fields:
@@ -208,15 +181,7 @@ class Store:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> Store:
-        """Open a store as its last commit left it.
-
-        Raises
-        ------
-        FileNotFoundError
-            If there is none.
-        ValueError
-            If what is there is no such store.
-        """
+        """Open a store as its last commit left it."""
         place = Path(path)
         try:
             found = json.loads(_read(place / METADATA, MOST_METADATA))["metadata"]
@@ -232,40 +197,20 @@ class Store:
             return cls(place, fields, attributes)
         except FileNotFoundError:
             if place.exists():
-                raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from None
+                raise ValueError(f"`store` {str(place)!r} is not a store of sympflow: give another place.") from None
             raise FileNotFoundError(f"`store` {str(place)!r} does not exist.") from None
         except (ValueError, KeyError, TypeError, AttributeError, NotADirectoryError, RecursionError) as error:
-            raise ValueError(f"`store` {str(place)!r} is no store of sympflow: give another place.") from error
+            raise ValueError(f"`store` {str(place)!r} is not a store of sympflow: give another place.") from error
 
     def check_same(self, key: str, mine: Known, asked: str, kind: str, remedy: str, same: bool) -> None:
-        """Check that a store is of the call that asks for it.
-
-        Parameters
-        ----------
-        key : str
-            The attribute that says of which call a store is, as JSON.
-        mine : Known
-            What the call is known by.
-        asked : str
-            The path as it was given.
-        kind : str
-            "run" or "ensemble".
-        remedy : str
-        same : bool
-            Whether functions and objects of Python are taken for those of the store.
-
-        Raises
-        ------
-        ValueError
-            If it is of another call, or of none of this kind, or if that cannot be told.
-        """
+        """Check that a store is of the call that asks for it."""
         try:
             theirs = json.loads(self.attributes[key])
         except (KeyError, TypeError, ValueError):
             theirs = None
         if not isinstance(theirs, dict):
             article = "an" if kind[0] in "aeiou" else "a"
-            raise ValueError(f"`store` {asked!r} is no store of {article} {kind}: name another folder.")
+            raise ValueError(f"`store` {asked!r} is not a store of {article} {kind}: name another folder.")
         known = {name: text for name, text in mine.texts.items() if not (same and name in mine.python)}
         if other := difference(theirs, known):
             name = other.split("`")[1]
@@ -279,13 +224,7 @@ class Store:
             )
 
     def check_made_of(self, fields: Mapping[str, Field]) -> None:
-        """Check that the arrays are those of the call that opens the store.
-
-        Raises
-        ------
-        StoreError
-            If one is missing, or is another, or one too many.
-        """
+        """Check that the arrays are those of the call that opens the store."""
         for name in {**fields, **self.fields}:
             if name in self.fields and not (name in fields and fields[name].is_like(self.fields[name])):
                 raise self.damaged(f"its array {name!r} is none that the call makes")
@@ -319,7 +258,7 @@ class Store:
         assert known.chunks is not None
         values = np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
-            raise ValueError(f"`values` of shape {values.shape} are no chunk of {name!r}, of shape {known.chunks}.")
+            raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
         if values.shape == known.chunks:
             chunk = np.ascontiguousarray(values, dtype=known.dtype)
         else:
@@ -329,24 +268,12 @@ class Store:
             _replace(self._file(name, index), zlib.compress(chunk.data, 0))
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a file beside the arrays, whole or not at all.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be written.
-        """
+        """Write a file beside the arrays, whole or not at all."""
         with _told(self.path):
             _replace(self.path / name, text.encode())
 
     def read(self, name: str, index: tuple[int, ...] | None = None) -> np.ndarray:
-        """Return a chunk, or the whole array; `Field.filled` where nothing has been written.
-
-        Raises
-        ------
-        StoreError
-            If a chunk is damaged.
-        """
+        """Return a chunk, or the whole array; `Field.filled` where nothing has been written."""
         known = self.fields[name]
         if index is None:
             whole = np.empty(known.shape, known.dtype)
@@ -368,13 +295,7 @@ class Store:
         return np.frombuffer(data, known.dtype).reshape(known.chunks)[tuple(map(slice, shape))]
 
     def committed(self, name: str, index: tuple[int, ...]) -> np.ndarray:
-        """Return a chunk that a commit has counted; see `read`.
-
-        Raises
-        ------
-        StoreError
-            If it is damaged, or not there.
-        """
+        """Return a chunk that a commit has counted; see `read`."""
         if not self.has(name, index):
             raise self.damaged(f"{self._file(name, index).name} of {name!r} is missing")
         return self.read(name, index)
@@ -387,22 +308,7 @@ class Store:
         attributes: Mapping[str, Any] | None = None,
         state: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Set the lengths of dimensions, attributes, and the state to go on from, all at once or not at all.
-
-        Parameters
-        ----------
-        lengths : mapping of str to int
-            Of the dimensions that have grown.
-        attributes : mapping
-            Those that change, as JSON has them.
-        state : mapping of str to ndarray
-            Arrays that stand for what a run goes on from; see `state`.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be written: the store is as it was.
-        """
+        """Set the lengths of dimensions, attributes, and the state to go on from, all at once or not at all."""
         fields = {name: known.resized(lengths or {}) for name, known in self.fields.items()}
         changed = self.attributes | dict(attributes or {})
         before = self.attributes.get(KEPT)
@@ -425,13 +331,7 @@ class Store:
                 (self.path / before).unlink(missing_ok=True)
 
     def complete(self, name: str) -> None:
-        """Note that all of an array has been written.
-
-        Raises
-        ------
-        StoreError
-            If it cannot be written.
-        """
+        """Note that all of an array has been written."""
         if self.fields[name].missing is not None:
             self.fields[name] = replace(self.fields[name], missing=None)
             self.commit()
@@ -448,13 +348,7 @@ class Store:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from writing a store that grows; the system takes the lock of one that is killed.
-
-        Raises
-        ------
-        StoreError
-            If another one writes it.
-        """
+        """Keep other processes from writing a store that grows; the system takes the lock of one that is killed."""
         try:
             import fcntl
         except ImportError:  # Windows, where an open file is not replaced anyway
@@ -481,14 +375,7 @@ class Store:
 
 
 class Appender:
-    """Records that are appended to a store along one dimension; a chunk that is not full yet is kept in memory.
-
-    Parameters
-    ----------
-    store : Store
-    dim : str
-        The dimension that grows, along which the fields that have it share their chunks.
-    """
+    """Records that are appended to a store along one dimension; a chunk that is not full yet is kept in memory."""
 
     def __init__(self, store: Store, dim: str) -> None:
         self.store, self.dim = store, dim
@@ -554,13 +441,7 @@ def is_name(name: Any) -> bool:
 
 
 def read_arrays(file: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file, none of which takes more memory than the file has bytes.
-
-    Raises
-    ------
-    OSError, ValueError, EOFError, RuntimeError, BadZipFile
-        If they cannot be read, are packed, or hold other objects than numbers.
-    """
+    """Return the arrays of an .npz file, none of which takes more memory than the file has bytes."""
     arrays = {}
     with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():

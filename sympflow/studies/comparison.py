@@ -18,7 +18,7 @@ from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.problems import check_y0
 from sympflow.metrics.accuracy import check_problem, states_of
 from sympflow.metrics.energy import max_energy_error
-from sympflow.metrics.energy_balance import jumps_in_time
+from sympflow.metrics.energy_balance import kept_by
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
@@ -169,8 +169,8 @@ def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
     if system.between_impulses is not system:
         return ("error",)
     if system.conservative:
-        energy = ("energy", "drift") if system.autonomous else () if jumps_in_time(system) else ("balance",)
-        return ("error", *energy, "volume", "symplecticity")
+        kept = {"energy": ("energy", "drift"), "balance": ("balance",)}.get(kept_by(system), ())
+        return ("error", *kept, "volume", "symplecticity")
     shrinks_evenly = system.external_force is None and system.friction and system.friction.isotropic
     return ("error", "conformal") if shrinks_evenly else ("error",)
 

@@ -19,7 +19,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.problems import check_y0
 from sympflow.metrics.energy import failed
-from sympflow.metrics.energy_balance import jumps_in_time
+from sympflow.metrics.energy_balance import kept_by
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.reference import reference as compute_reference
 from sympflow.show.style import saved
@@ -165,9 +165,7 @@ def _sweep(
 
 def measure_of(system: HamiltonianSystem) -> str:
     """The figure of a row by which methods are judged on a system: of what its flow keeps, if that is an energy."""
-    if not system.conservative or (not system.autonomous and jumps_in_time(system)):
-        return "error"
-    return "energy_error" if system.autonomous else "balance_error"
+    return f"{kept_by(system)}_error".removeprefix("_")
 
 
 _KEPT: dict[str, attempts.Metric] = {"energy_error": attempts.energy, "balance_error": attempts.balance}

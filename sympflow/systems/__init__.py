@@ -124,7 +124,7 @@ def get(name: str) -> Callable[..., HamiltonianSystem]:
         return _load(key, _plugins()[key])
     close = difflib.get_close_matches(key, available(), n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"`name` {name!r} is no known scene.{hint} Choose one of {', '.join(available())}.")
+    raise ValueError(f"`name` {name!r} is not a known scene.{hint} Choose one of {', '.join(available())}.")
 
 
 def register(name: str, factory: Callable[..., HamiltonianSystem]) -> None:
@@ -174,8 +174,8 @@ def _load(key: str, point: "EntryPoint") -> Callable[..., HamiltonianSystem]:
     factory = load_announced(point, "system")
     if isinstance(factory, HamiltonianSystem) or not _makes_a_default(factory):
         raise ImportError(
-            f"`system` {key!r} of the plug-in {distribution(point)} is no function with a default for every parameter: "
-            "report it there."
+            f"`system` {key!r} of the plug-in {distribution(point)} is not a function with a default for every "
+            "parameter: report it there."
         )
     return factory
 

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
+from sympflow.arguments import checked_number
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
 from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -35,8 +36,7 @@ def kepler(e: float = 0.6) -> HamiltonianSystem:
     ----------
     .. [1] E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., Springer 2006, I.2.
     """
-    if not (isinstance(e, int | float) and 0 <= e < 1):
-        raise ValueError(f"`e` must be an eccentricity, 0 ≤ e < 1; got {e!r}.")
+    checked_number("e", e, "an eccentricity, 0 ≤ e < 1", lambda x: 0 <= x < 1)
     period = 2 * math.pi
     return HamiltonianSystem.from_sympy(
         "(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)",
@@ -81,10 +81,8 @@ def decaying_orbit(drag: float = 0.002, e: float = 0.3) -> DoubledSystem:
     .. [1] D. Mittleman, D. Jezewski, "An analytic solution to the classical two-body problem with drag", Celest. Mech.
        28 (1982) 401–413.
     """
-    if not (isinstance(drag, int | float) and 0 < drag <= 0.003):
-        raise ValueError(f"`drag` must be positive, at most 0.003; got {drag!r}.")
-    if not (isinstance(e, int | float) and 0 <= e <= 0.6):
-        raise ValueError(f"`e` must be an eccentricity, 0 ≤ e ≤ 0.6; got {e!r}.")
+    checked_number("drag", drag, "positive, at most 0.003", lambda x: 0 < x <= 0.003)
+    checked_number("e", e, "an eccentricity, 0 ≤ e ≤ 0.6", lambda x: 0 <= x <= 0.6)
     orbit = kepler(e)
     p = 1.25 * math.sqrt((1 + e) / (1 - e))
     high = np.array([1.2 * (1 + e), 1.2 * (1 + e), 0.1, 0.1, 0.1, 0.1, p, p])
@@ -180,8 +178,7 @@ def perihelion_angle(semilatus: float, e: float) -> float:
 
 
 def _check_orbit(semilatus: float, e: float) -> None:
-    if not (isinstance(e, int | float) and 0 <= e <= 0.95):
-        raise ValueError(f"`e` must be an eccentricity, 0 ≤ e ≤ 0.95; got {e!r}.")
+    checked_number("e", e, "an eccentricity, 0 ≤ e ≤ 0.95", lambda x: 0 <= x <= 0.95)
     if not (isinstance(semilatus, int | float) and 6 + 2 * e < semilatus <= 1e6):
         raise ValueError(
             f"`semilatus` must be above 6 + 2e = {6 + 2 * e:g}, within which no orbit is bound and stable, and at most "

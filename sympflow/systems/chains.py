@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sympflow.arguments import check_positive
+from sympflow.arguments import check_positive, checked_count
 from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.domain import Ball, Box, Tube
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -42,10 +42,7 @@ def fput(omega: float = 50.0, m: int = 3) -> HamiltonianSystem:
     .. [1] E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., Springer 2006, I.5.1.
     """
     check_positive("omega", omega)
-    whole = not isinstance(m, bool) and isinstance(m, int | float | np.integer) and 1 <= m <= SPRINGS and int(m) == m
-    if not whole:
-        raise ValueError(f"`m` must be a positive integer, at most {SPRINGS}, the number of stiff springs; got {m!r}.")
-    m = int(m)
+    m = checked_count("m", m, 1, SPRINGS, f"a positive integer, at most {SPRINGS}, the number of stiff springs")
     slow, fast = [f"q{i}" for i in range(1, m + 1)], [f"q{m + i}" for i in range(1, m + 1)]
     soft = [f"({slow[0]} - {fast[0]})**4", f"({slow[-1]} + {fast[-1]})**4"]
     soft += [f"({slow[i + 1]} - {fast[i + 1]} - {slow[i]} - {fast[i]})**4" for i in range(m - 1)]
@@ -106,10 +103,7 @@ def toda_lattice(n: int = 3) -> HamiltonianSystem:
     .. [2] H. Flaschka, "The Toda lattice. II. Existence of integrals", Phys. Rev. B 9 (1974) 1924–1925.
     .. [3] M. Hénon, "Integrals of the Toda lattice", Phys. Rev. B 9 (1974) 1921–1923.
     """
-    whole = not isinstance(n, bool) and isinstance(n, int | float | np.integer) and 2 <= n <= PARTICLES and int(n) == n
-    if not whole:
-        raise ValueError(f"`n` must be an integer from 2 to {PARTICLES}, the number of particles; got {n!r}.")
-    n = int(n)
+    n = checked_count("n", n, 2, PARTICLES, f"an integer from 2 to {PARTICLES}, the number of particles")
     kinetic = " + ".join(f"p{i}**2" for i in range(1, n + 1))
     springs = " + ".join(f"exp(q{i} - q{j})" for i, j in pairwise([*range(1, n + 1), 1]))
     y0 = np.zeros(2 * n)

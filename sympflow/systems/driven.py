@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from sympflow.arguments import check_positive
+from sympflow.arguments import NOT_NEGATIVE, check_positive, checked_count, checked_number, not_negative
 from sympflow.hamiltonian.domain import Box
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -76,7 +76,7 @@ def paul_trap(a: float = 0.0, q: float = 0.4) -> HamiltonianSystem:
     """
     return HamiltonianSystem.from_sympy(
         "(p1**2 + p2**2)/2 + (a - 2*drive*cos(2*t))*(q1**2 - q2**2)/2",
-        params={"a": _finite("a", a), "drive": _not_zero("q", q)},
+        params={"a": checked_number("a", a), "drive": _not_zero("q", q)},
         time="t",
         period=math.pi,
         name="paul_trap",
@@ -120,14 +120,14 @@ def duffing(
     return HamiltonianSystem.from_sympy(
         "p**2/2 + alpha*q**2/2 + beta*q**4/4 - F*q*cos(w*t)",
         params={
-            "alpha": _finite("alpha", alpha),
+            "alpha": checked_number("alpha", alpha),
             "beta": _positive("beta", beta),
             "F": _not_zero("force", force),
             "w": frequency,
         },
         time="t",
         period=period,
-        damping=_not_negative("damping", damping),
+        damping=checked_number("damping", damping, NOT_NEGATIVE, not_negative),
         name="duffing",
         domain=Box([-1.8, -1.3], [1.8, 1.3]),
         y0=[1.0, 0.0],
@@ -255,8 +255,7 @@ def kicked(K: float = 0.97, modes: int = 3) -> HamiltonianSystem:
        263–379.
     .. [2] J. M. Greene, "A method for determining a stochastic transition", J. Math. Phys. 20 (1979) 1183–1201.
     """
-    if isinstance(modes, bool) or not (isinstance(modes, int) and 1 <= modes <= 100):
-        raise ValueError(f"`modes` must be a whole number from 1 to 100; got {modes!r}.")
+    modes = checked_count("modes", modes, 1, 100, "a whole number from 1 to 100")
     waves = " + ".join(f"cos({2 * n}*pi*t)" for n in range(1, modes + 1))
     return HamiltonianSystem.from_sympy(
         f"p**2/2 + K*cos(q)*(1 + 2*({waves}))",
@@ -276,18 +275,8 @@ def _dividing(period: float, longest: float) -> float:
     return period / math.ceil(period / longest)
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _finite(name: str, value: float) -> float:
-    if not _is_number(value):
-        raise ValueError(f"`{name}` must be a finite number; got {value!r}.")
-    return value
-
-
 def _not_zero(name: str, value: float) -> float:
-    if _finite(name, value) == 0:
+    if checked_number(name, value) == 0:
         raise ValueError(
             f"`{name}` must not be 0, for H would not depend on t: define it with from_sympy, without time."
         )
@@ -295,14 +284,7 @@ def _not_zero(name: str, value: float) -> float:
 
 
 def _positive(name: str, value: float) -> float:
-    check_positive(name, value, most=1e100)
-    return value
-
-
-def _not_negative(name: str, value: float) -> float:
-    if not (_is_number(value) and value >= 0):
-        raise ValueError(f"`{name}` must be finite and not negative; got {value!r}.")
-    return value
+    return check_positive(name, value, most=1e100)
 
 
 def _exact(name: str, length: float) -> Fraction:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sympflow.arguments import check_positive
+from sympflow.arguments import NOT_NEGATIVE, check_one_of, check_positive, checked_number, not_negative
 from sympflow.arrays import Array
 from sympflow.hamiltonian.domain import Box, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -23,8 +23,7 @@ def harmonic_oscillator(omega: float = 1.0) -> HamiltonianSystem:
     The domain is the ellipse H < ω²·1.7²/2, that is |q| < 1.7: with ω = 1 it contains [−1.2, 1.2]². The default
     interval is 100 units of 1/ω and the default step 0.05/ω.
     """
-    if not (isinstance(omega, int | float) and 1e-100 <= omega <= 1e100):
-        raise ValueError(f"`omega` must be positive and finite, from 1e-100 to 1e100; got {omega!r}.")
+    _check_frequency(omega)
     amplitude = 1.7
     return HamiltonianSystem.from_sympy(
         "(p**2 + omega**2*q**2)/2",
@@ -59,12 +58,11 @@ def damped_oscillator(omega: float = 1.0, damping: float = 0.1) -> HamiltonianSy
     ----------
     .. [1] L. D. Landau, E. M. Lifshitz, "Mechanics", 3rd ed., Pergamon 1976, § 25.
     """
-    if not (isinstance(omega, int | float) and 1e-100 <= omega <= 1e100):
-        raise ValueError(f"`omega` must be positive and finite, from 1e-100 to 1e100; got {omega!r}.")
+    _check_frequency(omega)
     return HamiltonianSystem.from_sympy(
         "(p**2 + omega**2*q**2)/2",
         params={"omega": omega},
-        damping=_rate(damping),
+        damping=checked_number("damping", damping, NOT_NEGATIVE, not_negative),
         name="damped_oscillator",
         domain=harmonic_oscillator(omega).domain,
         y0=[1.0, 0.0],
@@ -95,7 +93,7 @@ def damped_pendulum(damping: float = 0.1) -> HamiltonianSystem:
     """
     return HamiltonianSystem.from_sympy(
         _H,
-        damping=_rate(damping),
+        damping=checked_number("damping", damping, NOT_NEGATIVE, not_negative),
         name="damped_pendulum",
         domain=pendulum().domain,
         y0=[1.5, 0.0],
@@ -104,10 +102,8 @@ def damped_pendulum(damping: float = 0.1) -> HamiltonianSystem:
     )
 
 
-def _rate(damping: float) -> float:
-    if isinstance(damping, bool) or not (isinstance(damping, int | float) and 0 <= damping < math.inf):
-        raise ValueError(f"`damping` must be a finite number, not negative; got {damping!r}.")
-    return damping
+def _check_frequency(omega: float) -> None:
+    checked_number("omega", omega, "positive and finite, from 1e-100 to 1e100", lambda x: 1e-100 <= x <= 1e100)
 
 
 def pendulum() -> HamiltonianSystem:
@@ -283,10 +279,9 @@ def spring_pendulum(k: float = 100.0, coordinates: str = "cartesian", radial_ene
     .. [1] U. M. Ascher, S. Reich, "The midpoint scheme and variants for Hamiltonian systems: advantages and pitfalls",
        SIAM J. Sci. Comput. 21 (1999) 1045–1065.
     """
-    if not (isinstance(k, int | float) and 1e-6 <= k <= 1e30):
-        raise ValueError(f"`k` must be positive, a stiffness from 1e-6 to 1e30; got {k!r}.")
-    if not (isinstance(radial_energy, int | float) and 0 <= radial_energy < math.inf):
-        raise ValueError(f"`radial_energy` must be finite and not negative; got {radial_energy!r}.")
+    checked_number("k", k, "positive, a stiffness from 1e-6 to 1e30", lambda x: 1e-6 <= x <= 1e30)
+    checked_number("radial_energy", radial_energy, NOT_NEGATIVE, not_negative)
+    check_one_of("coordinates", coordinates, ("cartesian", "polar"))
     c, s = math.cos(ANGLE), math.sin(ANGLE)
     r, speed = 1 + GRAVITY * c / k, math.sqrt(2 * radial_energy)
     stretch = 2 * (speed / math.sqrt(k) + 3 * GRAVITY / k)  # at the bottom 2g(1 − cos 1) + g pull on the spring
@@ -295,13 +290,11 @@ def spring_pendulum(k: float = 100.0, coordinates: str = "cartesian", radial_ene
         expression = "p1**2/2 + k*(q1 - 1)**2/2 + p2**2/(2*q1**2) - g*q1*cos(q2)"
         y0 = [r, ANGLE, speed, 0.0]
         low, high = [max(1 - stretch, 0.1), -1.4, -fast, -1.5], [1 + stretch, 1.4, fast, 1.5]
-    elif coordinates == "cartesian":
+    else:
         expression = "(p1**2 + p2**2)/2 + k*(sqrt(q1**2 + q2**2) - 1)**2/2 + g*q2"
         y0 = [r * s, -r * c, speed * s, -speed * c]
         reach, p = 1 + stretch, 1.5 + fast
         low, high = [-reach, -reach, -p, -p], [reach, 0.1, p, p]
-    else:
-        raise ValueError(f"`coordinates` must be 'cartesian' or 'polar'; got {coordinates!r}.")
     return HamiltonianSystem.from_sympy(
         expression,
         params={"k": k, "g": GRAVITY},
@@ -395,8 +388,7 @@ def charged_particle(field: float = 10.0) -> HamiltonianSystem:
     ----------
     .. [1] T. G. Northrop, "The Adiabatic Motion of Charged Particles", Interscience 1963, chapter 1.
     """
-    if not (isinstance(field, int | float) and 5 <= field <= 100):
-        raise ValueError(f"`field` must be positive, a strength from 5 to 100; got {field!r}.")
+    checked_number("field", field, "positive, a strength from 5 to 100", lambda x: 5 <= x <= 100)
     radius, length = 0.75 + 2 / field, 0.8
     p = math.sqrt(1.4)  # the speed in the domain
     across = p + field * (1 + length**2) * radius / 2

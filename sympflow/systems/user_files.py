@@ -168,12 +168,14 @@ def _table(file: Path) -> dict[str, Any]:
     except RecursionError:
         raise ValueError(f"`system` {str(file)!r} is nested too deeply: write it in fewer brackets.") from None
     except ValueError as error:  # of its grammar, and of numbers with thousands of digits
-        raise ValueError(f"`system` {str(file)!r} is no TOML ({error}): mend it, texts in quotes.") from error
+        raise ValueError(f"`system` {str(file)!r} is not TOML ({error}): mend it, texts in quotes.") from error
     for key, value in table.items():
         if key not in KEYS:
             close = difflib.get_close_matches(key, KEYS, n=1)
             hint = f"Did you mean {close[0]!r}? " if close else ""
-            raise ValueError(f"`{key}` is no key of a system (in {str(file)!r}). {hint}The keys are {', '.join(KEYS)}.")
+            raise ValueError(
+                f"`{key}` is not a key of a system (in {str(file)!r}). {hint}The keys are {', '.join(KEYS)}."
+            )
         kind, words = KEYS[key]
         if not _fits(value, kind) or not all(map(_is_number, _numbers(key, value))):
             raise ValueError(f"`{key}` must be {words}; got {value!r} (in {str(file)!r}).")
@@ -181,7 +183,7 @@ def _table(file: Path) -> dict[str, Any]:
         raise ValueError(f"`hamiltonian` is missing in {str(file)!r}: add {KEYS['hamiltonian'][1]}.")
     reserved = [p for p in table.get("params", {}) if p in ("q", "p", "t")]
     if reserved:
-        raise ValueError(f"`{reserved[0]}` is no name of a parameter (in {str(file)!r}): choose another.")
+        raise ValueError(f"`{reserved[0]}` cannot be the name of a parameter (in {str(file)!r}): choose another.")
     return table
 
 
@@ -231,7 +233,7 @@ def _text(file: Path) -> str:
     except OSError as error:
         raise ValueError(f"`system` {str(file)!r} cannot be read ({error.strerror}): name a file that can.") from error
     except UnicodeDecodeError as error:
-        raise ValueError(f"`system` {str(file)!r} is no text in UTF-8: save it as such.") from error
+        raise ValueError(f"`system` {str(file)!r} is not a text in UTF-8: save it in UTF-8.") from error
 
 
 def _module(file: Path) -> ModuleType:

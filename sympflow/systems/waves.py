@@ -6,13 +6,14 @@ Each has a solution in closed form, `system.exact`.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from sympflow.arguments import check_positive
+from sympflow.arguments import check_one_of, check_positive, checked_count, checked_number
 from sympflow.hamiltonian.domain import Box
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -129,19 +130,17 @@ def sine_gordon(
     """
     n = _sites(n, accuracy)
     h, v = _positive("length", length) / n, _velocity(velocity)
+    check_one_of("wave", wave, ("breather", "kink"))
     if wave == "breather":
-        if not (_is_number(frequency) and 0 < frequency < 1):
-            raise ValueError(f"`frequency` of a breather must lie between 0 and 1; got {frequency!r}.")
+        checked_number("frequency", frequency, "between 0 and 1, of a breather", lambda w: 0 < w < 1)
         shape = partial(_breather, frequency=frequency, velocity=v, length=length)
         boundary, t_end = "periodic", 20 * math.pi / frequency
         top = 4 * math.atan(math.sqrt(1 - frequency**2) / frequency)
         low, high = [-1.1 * top, -4.5], [1.1 * top, 4.5]
-    elif wave == "kink":
+    else:
         shape = partial(_kink, velocity=v, start=_start(v, length))
         boundary, t_end = "free", _crossing(v, length)
         low, high = [-1.0, -3.0], [2 * math.pi + 1.0, 3.0]
-    else:
-        raise ValueError(f"`wave` must be 'breather' or 'kink'; got {wave!r}.")
     scale = np.array([1.0, _gamma(v)])
     return _system(
         "sine_gordon",
@@ -258,7 +257,7 @@ def nonlinear_schroedinger(
        self-modulation of waves in nonlinear media", Sov. Phys. JETP 34 (1972) 62–69.
     """
     n, L = _sites(n, 2), _positive("length", length)
-    eta, v = _positive("amplitude", amplitude), _finite("velocity", velocity)
+    eta, v = _positive("amplitude", amplitude), float(checked_number("velocity", velocity))
     x, high = _grid(n, L / n), np.full(2 * n, 1.6 * eta)
     exact = partial(_states, partial(_soliton, amplitude=eta, velocity=v, start=_start(v, L / 2), length=L), x)
     return HamiltonianSystem.schroedinger(
@@ -312,8 +311,7 @@ def toda_chain(n: int = 128, kappa: float = 0.5) -> HamiltonianSystem:
     .. [1] M. Toda, "Theory of Nonlinear Lattices", 2nd ed., Springer 1989, 2.2 and 3.4.
     """
     n, k = _sites(n, 2), _positive("kappa", kappa)
-    if k > 20:
-        raise ValueError(f"`kappa` must be at most 20, for the soliton is otherwise less than a site wide; got {k!r}.")
+    checked_number("kappa", k, "at most 20, for the soliton is otherwise less than a site wide", lambda x: x <= 20)
     speed = math.sinh(k) / k
     high = np.repeat([1.5 * k, 3 * k * speed * math.sinh(k) + 1e-3], n)
     return _system(
@@ -423,30 +421,14 @@ def _crossing(velocity: float, length: float) -> float:
     return min(200.0, length / 2 / abs(velocity)) if velocity else 50.0
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _positive(name: str, value: float) -> float:
-    check_positive(name, value, most=1e100)
-    return float(value)
-
-
-def _finite(name: str, value: float) -> float:
-    if not _is_number(value):
-        raise ValueError(f"`{name}` must be a finite number; got {value!r}.")
-    return float(value)
+    return float(check_positive(name, value, most=1e100))
 
 
 def _velocity(value: float) -> float:
-    if not (_is_number(value) and -1 < value < 1):
-        raise ValueError(f"`velocity` must lie between −1 and 1, the speed of light; got {value!r}.")
-    return float(value)
+    return checked_number("velocity", value, "a number between −1 and 1, the speed of light", lambda v: -1 < v < 1)
 
 
 def _sites(n: Any, accuracy: Any) -> int:
-    if isinstance(accuracy, bool) or accuracy not in STENCILS:
-        raise ValueError(f"`accuracy` must be 2, 4 or 6, the order of the stencil; got {accuracy!r}.")
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < 8:
-        raise ValueError(f"`n` must be a whole number of sites, at least 8; got {n!r}.")
-    return int(n)
+    checked_number("accuracy", accuracy, "2, 4 or 6, the order of the stencil", STENCILS.__contains__)
+    return checked_count("n", n, 8, sys.maxsize, "a whole number of sites, at least 8")

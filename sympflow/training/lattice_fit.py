@@ -50,7 +50,8 @@ STEPS, SEEN, COPIES, ENDS_STATES = 200, 5, 4, 16
 
 def on_piece(system: HamiltonianSystem) -> bool:
     """Return True for a lattice, which a flow is fitted to by a piece."""
-    return system.local is not None and system.local.has_piece and (system.damping is None or not system.damping.ndim)
+    local, damping = system.local, system.damping
+    return local is not None and local.has_subsystem and (damping is None or not damping.ndim)
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class LatticePiece:
         """The piece of a lattice, for states of a domain of it."""
         found = domain if isinstance(domain, LatticeStates) else LatticeStates.of_states(lattice, domain.sample(DRAWN))
         small = lattice.ndof <= MOST_FITTED
-        few = lattice if small else lattice.piece()
+        few = lattice if small else lattice.subsystem()
         local = few.local
         assert local is not None
         H, written = local.written_out(), few
@@ -123,7 +124,7 @@ class LatticePiece:
         """The system, or a smaller one with the same ends."""
         assert self.lattice.local is not None
         judged = self.lattice.local.judged()
-        return self.lattice.piece(*judged) if judged else self.lattice
+        return self.lattice.subsystem(*judged) if judged else self.lattice
 
     @torch.no_grad()
     def _step_figures(self, flow: PrimedFlow, system: HamiltonianSystem, domain: Domain, n: int) -> dict[str, float]:
@@ -139,9 +140,9 @@ class LatticePiece:
     @torch.no_grad()
     def _error_at(self, flow: PrimedFlow, end: str) -> float:
         """The relative energy error, above rest, of a few pieces in a row with such ends: the median over states."""
-        few = self.lattice.piece()
+        few = self.lattice.subsystem()
         assert few.local is not None
-        row = self.lattice.piece((COPIES * few.local.shape[0], *few.local.shape[1:]), (end, *few.local.ends[1:]))
+        row = self.lattice.subsystem((COPIES * few.local.shape[0], *few.local.shape[1:]), (end, *few.local.ends[1:]))
         domain = self.states.of(row)
         x = torch.as_tensor(states(domain, ENDS_STATES, 0, Stream.VALIDATION))
         own = flow.bound(row)
@@ -216,7 +217,7 @@ class EnergyRuns(RunsFit):
 
 def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
     """Raise ValueError unless a flow of the system can be fitted to the `runs` that are asked for."""
-    if not (system.local is not None and system.local.has_piece and system.conservative):
+    if not (system.local is not None and system.local.has_subsystem and system.conservative):
         raise ValueError(
             f"`runs` need a lattice that conserves its energy, and {system.name!r} is not one: leave it out."
         )
@@ -230,7 +231,7 @@ def runs_of(piece: LatticePiece, runs: int, seed: int, fitted: PrimedFlow) -> En
     """Return the energy errors in so many runs of a larger piece, by the numbers of a flow of the piece."""
     whole = piece.lattice
     assert whole.local is not None
-    larger = whole.piece(*whole.local.many())
+    larger = whole.subsystem(*whole.local.many())
     domain = piece.states.of(larger)
     x = states(domain, runs, seed, Stream.RUNS)
     t_end = PERIODS * 2 * math.pi / frequency(larger, domain)

@@ -40,11 +40,22 @@ class Optimizer(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
-class AdamSteps:
-    """Adam (Kingma & Ba 2015) with a schedule and gradient clipping."""
+class _TorchSteps:
+    """Steps of a method of torch."""
 
     finished: str | None = None
     needs_residuals: ClassVar[bool] = False
+    method: Any
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.method.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.method.load_state_dict(state)
+
+
+class AdamSteps(_TorchSteps):
+    """Adam (Kingma & Ba 2015) with a schedule and gradient clipping."""
 
     def __init__(self, flow: FlowMap, options: fits.Adam) -> None:
         self.options = options
@@ -62,18 +73,9 @@ class AdamSteps:
         self.method.step()
         return float(value.detach())
 
-    def state_dict(self) -> dict[str, Any]:
-        return self.method.state_dict()
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.method.load_state_dict(state)
-
-
-class LBFGSSteps:
+class LBFGSSteps(_TorchSteps):
     """L-BFGS by torch, its memory 30 pairs: 20 iterations a step, on the points of the step."""
-
-    finished: str | None = None
-    needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap) -> None:
         self.parameters = list(flow.parameters())
@@ -104,12 +106,6 @@ class LBFGSSteps:
         except OutOfTime:
             put_weights(self.parameters, x)
             raise
-
-    def state_dict(self) -> dict[str, Any]:
-        return self.method.state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.method.load_state_dict(state)
 
 
 class BFGSSteps:

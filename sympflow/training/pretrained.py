@@ -73,20 +73,17 @@ def main(arguments: list[str] | None = None) -> None:
 def _figures(recipes: list[Recipe], options: argparse.Namespace) -> Iterator[tuple[Path, dict[str, Any]]]:
     """The files of the recipes, as they are written or only measured, and their figures."""
     folder = package_folder() if options.out is None else options.out
-    if options.identify:
-        for recipe in recipes:
-            flow = load(file_of(recipe, folder))
+    for recipe in recipes if options.identify or options.measure else ():
+        path, figures = file_of(recipe, folder), {}
+        flow = load(path)
+        if options.identify:
             recipe.identify(flow)
-            flow.save(file_of(recipe, folder))
-            yield file_of(recipe, folder), {}
-        return
-    if options.measure:
-        for recipe in recipes:
-            flow = load(file_of(recipe, folder))
+        else:
             figures = recipe.measure(flow)
-            if options.keep:
-                flow.save(file_of(recipe, folder))
-            yield file_of(recipe, folder), figures
+        if options.identify or options.keep:
+            flow.save(path)
+        yield path, figures
+    if options.identify or options.measure:
         return
 
     def earlier(recipe: Recipe, name: str) -> FlowMap:

@@ -223,7 +223,7 @@ class Silent:
         pass
 
     def validated(self, step: int, figures: dict[str, float]) -> None:
-        pass
+        self.tries(step, _text(figures))
 
     def tries(self, done: int, what: str) -> None:
         pass
@@ -234,9 +234,6 @@ class Lines(Silent):
 
     def __init__(self, total: int, label: str) -> None:
         self.total, self.label = total, label
-
-    def validated(self, step: int, figures: dict[str, float]) -> None:
-        self.tries(step, _text(figures))
 
     def tries(self, done: int, what: str) -> None:
         print(f"{self.label} {done}/{self.total}  {what}", file=sys.stderr, flush=True)
@@ -249,14 +246,9 @@ class Bar(Silent):
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        self.bar = Progress(
-            TextColumn("[bold]{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[figures]}"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-        )
+        description, figures = TextColumn("[bold]{task.description}"), TextColumn("{task.fields[figures]}")
+        columns = description, BarColumn(), MofNCompleteColumn(), figures, TimeRemainingColumn()
+        self.bar = Progress(*columns, console=Console(stderr=True))
         self.task: Any = self.bar.add_task(label, total=total, completed=start, figures="")
         self.figures = ""
 
@@ -271,11 +263,8 @@ class Bar(Silent):
         if step % 10 == 0:
             self.bar.update(self.task, completed=step, figures=f"loss {loss:.1e}  {self.figures}")
 
-    def validated(self, step: int, figures: dict[str, float]) -> None:
-        self.figures = _text(figures)
-        self.bar.update(self.task, completed=step, figures=self.figures)
-
     def tries(self, done: int, what: str) -> None:
+        self.figures = what
         self.bar.update(self.task, completed=done, figures=what)
 
 

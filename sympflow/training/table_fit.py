@@ -21,7 +21,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -51,9 +51,6 @@ from sympflow.training.points import (
 from sympflow.training.runs import LABEL_SHARE, SearchRun, descended
 from sympflow.training.session import Deadline, Session
 from sympflow.training.table_step import Check, TableStep
-
-if TYPE_CHECKING:
-    from sympflow.kernels.table_loops import LabelErrors
 
 SPREAD = 0.25  # of random coefficients about those of equal steps
 WIDE_SPREAD = 2.0  # without force gradients, where an order above 2 needs negative ones
@@ -345,7 +342,7 @@ class TableRun(SearchRun):
 
     def _continued(self, minimum: Minimum) -> np.ndarray:
         """The parameters that a minimum of the search gives."""
-        return minimum.x if self.frozen is None else self.table.continued(self.frozen.coefficients(minimum.x)[:, 0])
+        return minimum.x if self.frozen is None else self.table.continued(self.frozen.coefficients(minimum.x)[0])
 
     def differences(self) -> np.ndarray:
         """The differences from the exact flow, at the held-out states and times."""
@@ -525,76 +522,32 @@ class TableFit(Problem):
         weight: np.ndarray,
         slope: np.ndarray | None = None,
     ) -> None:
-        self.step, self.offset, self.design = step, offset, design
-        self.times, self.count = len(labels.t), len(labels.x)
-        self._x = np.tile(labels.x.T, (1, self.times))
-        self._t0 = None if labels.t0 is None else np.tile(labels.t0, self.times)
+        self.step, self.offset, self.design = step, offset, np.ascontiguousarray(design)
+        times, count = len(labels.t), len(labels.x)
         y = labels.y if labels.work is None else np.concatenate([labels.y, -labels.work[..., None]], axis=-1)
-        self._y = np.ascontiguousarray(y.reshape(-1, y.shape[-1]).T)
         # The sum of squares is a mean over states and times.
-        each = np.repeat(weight, self.count) / math.sqrt(self.times * self.count)
-        self._scale = each / unit[:, None]
-        self._slope = None if slope is None else each * slope.reshape(-1, slope.shape[-1]).T
-        self._errors_at: LabelErrors | None = None
+        each = np.repeat(weight, count) / math.sqrt(times * count)
+        slopes = np.empty((0, len(each))) if slope is None else each * slope.reshape(-1, slope.shape[-1]).T
+        ends = np.ascontiguousarray(y.reshape(-1, y.shape[-1]).T)
+        of_numbers = self.design[:, step.order]
+        self.errors = step.errors(labels.x.T, labels.t0, ends, each / unit[:, None], slopes, of_numbers)
         self.compiled = step.loops is not None
-        if step.loops is not None:
-            weights = np.empty((0, self._x.shape[1])) if self._slope is None else self._slope
-            at_start = labels.x.T, labels.t0
-            self._errors_at = step.loops.errors(*at_start, self._y, self._scale, weights, design[:, step.order])
-
-    def __getstate__(self) -> dict[str, Any]:
-        """With the order of `design` in memory, by which its products are rounded."""
-        order = tuple(int(axis) for axis in np.argsort(self.design.strides)[::-1])
-        return {**vars(self), "design": (order, self.design.transpose(order))}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        order, packed = state["design"]
-        vars(self).update(state | {"design": packed.transpose(np.argsort(order))})
 
     def coefficients(self, theta: np.ndarray) -> np.ndarray:
-        """(n, P), P = J N."""
-        return np.repeat((self.offset + self.design @ theta).T, self.count, axis=1)
+        """(J, n)."""
+        return self.offset + self.design @ theta
 
     def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
-        if self._errors_at is not None:
-            return self._errors_at((self.offset + self.design @ theta)[:, self.step.order], check)[0]
-        with np.errstate(all="ignore"):
-            y = self.step(self.coefficients(theta), self._x, check, self._t0)
-            return self._rows(self._errors(y - self._y)).ravel()
+        return self.errors(self.coefficients(theta)[:, self.step.order], check)[0]
 
-    @np.errstate(all="ignore")  # as in the residuals: what is not finite is rejected
+    def model(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, Blocks]:
+        r, columns = self.errors(self.coefficients(theta)[:, self.step.order], check, linearized=True)
+        return r, Blocks(columns, self.errors.matrices)
+
+    @np.errstate(all="ignore")  # what is not finite is rejected
     def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
-        if self._errors_at is not None:
-            r, blocks = self._in_blocks(self._errors_at, theta, check)
-            return r, blocks.whole()
-        y, J = self.step.with_jacobian(self.coefficients(theta), self._x, check, self._t0)
-        by_table = self._rows(self._errors(J))  # (J, (2d + 1) N, n)
-        J = (by_table @ self.design).reshape(-1, self.design.shape[-1])
-        return self._rows(self._errors(y - self._y)).ravel(), J
-
-    def model(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray | Blocks]:
-        if self._errors_at is None:
-            return self.linearized(theta, check)
-        return self._in_blocks(self._errors_at, theta, check)
-
-    def _in_blocks(self, errors: LabelErrors, theta: np.ndarray, check: Check) -> tuple[np.ndarray, Blocks]:
-        numbers = (self.offset + self.design @ theta)[:, self.step.order]
-        r, columns = errors(numbers, check, linearized=True)
-        return r, Blocks(columns, errors.matrices)
-
-    def _errors(self, change: np.ndarray) -> np.ndarray:
-        """The errors of each coordinate and, with a slope, of the energy: (..., 2d + 1, P), else (..., 2d, P)."""
-        scaled = change[..., : len(self._scale), :] * self._scale
-        if self._slope is None:
-            return scaled
-        return np.concatenate([scaled, (change * self._slope).sum(-2, keepdims=True)], axis=-2)
-
-    def _rows(self, values: np.ndarray) -> np.ndarray:
-        """(..., 2d + 1, P) with times first: (J, (2d + 1) N, ...)."""
-        split = values.reshape(*values.shape[:-1], self.times, self.count)
-        rows = np.moveaxis(split, -2, 0)  # (J, ..., 2d + 1, N)
-        rows = rows.reshape(self.times, *rows.shape[1:-2], -1)
-        return np.moveaxis(rows, -1, 1)
+        r, blocks = self.model(theta, check)
+        return r, blocks.whole()
 
 
 # a table ------------------------------------------------------------------------------------------------------------

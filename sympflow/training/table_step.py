@@ -23,7 +23,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 if TYPE_CHECKING:
-    from sympflow.kernels.table_loops import TableLoops
+    from sympflow.kernels.table_loops import LabelErrors, TableLoops
 
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
 PRODUCT = 1e-3  # length of the difference, relative to q, that gives ∇²V·v where it is not known
@@ -129,6 +129,10 @@ class TableStep:
         """−Γp of momenta (d, P), their rate in a drift."""
         return np.zeros_like(p) if not self._friction else self._friction.force(p.T).T
 
+    def errors(self, *given: Any) -> LabelErrors | ArrayErrors:
+        """Weighted errors of labels after a step: see `LabelErrors`."""
+        return ArrayErrors(self, *given) if self.loops is None else self.loops.errors(*given)
+
     def with_jacobian(
         self, c: np.ndarray, y: np.ndarray, check: Check = lambda: None, t0: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -165,6 +169,36 @@ class TableStep:
     def _velocity(self, p: np.ndarray) -> np.ndarray:
         """M⁻¹p: (..., d, P)."""
         return self._times_inverse_mass(p.swapaxes(-1, -2)).swapaxes(-1, -2)
+
+
+class ArrayErrors:
+    """Weighted errors of labels after a step of arrays: see `LabelErrors`."""
+
+    def __init__(self, step: TableStep, x: np.ndarray, t0: Any, *given: np.ndarray) -> None:
+        self.step, self._count = step, x.shape[1]
+        self._y, self._scale, self._slope, self.matrices = given
+        self._times = len(self.matrices)
+        self._x = np.tile(x, (1, self._times))
+        self._t0 = None if t0 is None else np.tile(t0, self._times)
+
+    @np.errstate(all="ignore")
+    def __call__(self, c: np.ndarray, check: Check = lambda: None, linearized: bool = False) -> Any:
+        """The errors (m,) for numbers c (J, n), and if they are asked for their derivatives by these, (n, m)."""
+        order = self.step.order
+        c = np.repeat(c[:, np.argsort(order)].T, self._count, axis=1)
+        if not linearized:
+            return self._rows(self.step(c, self._x, check, self._t0) - self._y), np.empty((0, 0))
+        y, J = self.step.with_jacobian(c, self._x, check, self._t0)
+        return self._rows(y - self._y), self._rows(J[order])
+
+    def _rows(self, change: np.ndarray) -> np.ndarray:
+        """The errors of changes (..., R, J N), times first: (..., m)."""
+        parts = [change[..., : len(self._scale), :] * self._scale]
+        if len(self._slope):
+            parts.append((change * self._slope).sum(-2, keepdims=True))
+        errors = np.concatenate(parts, axis=-2)
+        split = errors.reshape(*errors.shape[:-1], self._times, self._count)
+        return split.swapaxes(-2, -3).reshape(*errors.shape[:-2], -1)
 
 
 def _extended(matrix: np.ndarray, of_time: float) -> np.ndarray:

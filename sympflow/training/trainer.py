@@ -299,7 +299,7 @@ def _known_system(system: Any, data: Any) -> HamiltonianSystem:
 def _domain_for(system: HamiltonianSystem, domain: Domain | None) -> Domain:
     """Ω of a training: the domain that is given, else that of the system; checked."""
     domain = system.domain if domain is None else domain
-    if domain is None and system.local is not None and system.local.has_piece and system.y0 is not None:
+    if domain is None and system.local is not None and system.local.has_subsystem and system.y0 is not None:
         domain = system.local_states()
     if domain is None:
         raise ValueError(

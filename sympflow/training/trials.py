@@ -274,7 +274,7 @@ def trial(start: Resolved, system: HamiltonianSystem, domain: Domain, deadline: 
     best = min(run.minima, key=lambda m: m.cost)
     for final in filter(None, (frozen, run.weighted)):
         best = final.minimize(best.x, FINAL_STEPS, deadline, thorough=True)
-    table = frozen.coefficients(best.x)[:, :1]
+    table = frozen.coefficients(best.x).T
     exact = states(domain, ORBITS, SEED, Stream.REFERENCE)
     t = start_times(system, dt, len(exact), SEED, Stream.REFERENCE)
     H, worst, y = system.hamiltonian(exact, t), np.zeros(len(exact)), exact.T

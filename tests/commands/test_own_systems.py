@@ -195,11 +195,11 @@ def test_a_wrong_word_is_named(word, message, files):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("f.toml", 'hamiltonain = "p**2/2"', "`hamiltonain` is no key of a system (in 'f.toml'). Did you mean"),
+        ("f.toml", 'hamiltonain = "p**2/2"', "`hamiltonain` is not a key of a system (in 'f.toml'). Did you mean"),
         ("f.toml", "dt = 1", "`hamiltonian` is missing in 'f.toml'"),
-        ("f.toml", "hamiltonian = p**2", "`system` 'f.toml' is no TOML"),
+        ("f.toml", "hamiltonian = p**2", "`system` 'f.toml' is not TOML"),
         ("f.toml", "y0 = " + "[" * 5000, "`system` 'f.toml' is nested too deeply"),
-        ("f.toml", "dt = " + "9" * 5000, "`system` 'f.toml' is no TOML"),
+        ("f.toml", "dt = " + "9" * 5000, "`system` 'f.toml' is not TOML"),
         ("f.toml", "hamiltonian = 'p**2 + q99999999999'", "`hamiltonian` has coordinates of the number 99999999999"),
         ("f.toml", 'hamiltonian = "p**2/2 + q**"', "`hamiltonian` cannot be parsed"),
         ("f.toml", 'hamiltonian = "p**2/2 + w*q**2"', "`hamiltonian` holds w without a value: give it in `params`"),

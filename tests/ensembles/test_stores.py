@@ -119,7 +119,7 @@ def test_a_store_that_is_there_or_of_another_ensemble(tmp_path):
             run(store=path, resume=True, **other)
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "notes.txt").write_text("mine")
-    with pytest.raises(ValueError, match="is no store of sympflow"):
+    with pytest.raises(ValueError, match="is not a store of sympflow"):
         run(store=tmp_path / "b", resume=True)
     with pytest.raises(ValueError, match="`resume` goes on with a `store`"):
         run(resume=True)

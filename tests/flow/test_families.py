@@ -1,15 +1,19 @@
-"""The families of flows: each builds itself from its architecture, and answers all that the rest asks of a flow map."""
+"""The families of flows: laws that all of them obey, and what the rest of the package asks of a flow map."""
 
 import copy
 import pickle
 
+import numpy as np
 import pytest
 import torch
+from test_primed import FLOWS as PRIMED
 
-from sympflow import HamiltonianSystem, MLPFlow, SympFlow, solve, systems, time_transformed
+from sympflow import HamiltonianSystem, MLPFlow, SympFlow, load, solve, systems, time_transformed
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.families import FAMILIES, family, family_of
 from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.layers import Drift, Kick
+from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.kernels.protocol import Kernel
 
@@ -112,6 +116,129 @@ def test_compiled_loops_are_kept_while_no_weight_changes(name):
     else:
         with pytest.raises(ValueError, match=r"^`compensated` sums need the compiled loops of a primed flow"):
             flow.kernel_for(system, compensated=True)
+
+
+# laws -----------------------------------------------------------------------------------------------------------------
+
+
+def rough(flow, spread=0.0):
+    """The flow with larger weights than it begins with, or with coefficients that are free of any pattern."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for w in flow.parameters():
+            noise = torch.randn(w.shape, generator=generator, dtype=w.dtype)
+            w.copy_(w + spread * noise if spread else 2 * w)
+    return flow.requires_grad_(False)
+
+
+POLAR = systems.spring_pendulum(1e4, coordinates="polar")
+
+
+def split(system, **options):
+    return rough(SympFlow.split(system, terms=4, **options), 0.05)
+
+
+def hh(**options):
+    return split(systems.henon_heiles(), dt=0.7, **options)
+
+
+LAWFUL = {
+    "published": lambda: rough(SympFlow(2, pairs=3, seed=1)),
+    "one degree of freedom, one hidden layer": lambda: rough(SympFlow(1, pairs=2, hidden=(8,), seed=2)),
+    "three degrees, deep": lambda: rough(SympFlow(3, pairs=2, hidden=(6, 7, 5), activation="sin", seed=3)),
+    "softplus": lambda: rough(SympFlow(2, pairs=2, hidden=(9, 9), activation="softplus", seed=4)),
+    "scaled": lambda: rough(SympFlow(2, pairs=2, dt=0.1, scale=Scaling((0.1, 0.2), (30.0, 20.0), 0.1), seed=5)),
+    "layers in another order": lambda: rough(
+        SympFlow.from_layers([layer(MLPPotential(2)) for layer in (Drift, Kick, Kick, Drift)], dt=1.0)
+    ),
+    **PRIMED,
+    "kicks": lambda: hh(stages=3),
+    "shears": lambda: split(POLAR, dt=0.05, stages=2),
+    "no filters": lambda: hh(stages=2, filters=False, force_gradient=False),
+    "linear part inside": lambda: hh(stages=3, linear_outside=False, force_gradient=(1, 2)),
+    "midpoint rule": lambda: SympFlow.collocated(systems.double_pendulum(), dt=0.5, stages=1, steps=3),
+    "Gauss": lambda: SympFlow.collocated(systems.double_pendulum(), dt=0.5, stages=3, steps=1),
+    "clocked": FLOWS["clocked"][0],
+    "timed": FLOWS["timed"][0],
+    "driven": lambda: rough(SympFlow.primed(DRIVEN, 2, processor=2, dt=0.4), 0.05),
+}
+
+
+def states_of(flow):
+    """States (5, 2d), and the units of their coordinates."""
+    d, generator = flow.ndof, torch.Generator().manual_seed(1)
+    system = flow.system
+    if system is None:
+        of = {layer.kind: layer.potential.scale[:d] for layer in flow.layers}
+        unit = torch.cat([of["kick"], of["drift"]])
+        return unit * torch.randn(5, 2 * d, dtype=torch.float64, generator=generator), unit
+    if system is TRANSFORMED:
+        return torch.as_tensor(system.y0) * torch.linspace(0.9, 1, 5)[:, None].double(), torch.ones(2 * d).double()
+    return torch.as_tensor(system.domain.sample(5, 0)), torch.ones(2 * d).double()
+
+
+def canonical(d):
+    return torch.kron(torch.tensor([[0.0, 1.0], [-1.0, 0.0]]), torch.eye(d)).double()
+
+
+@pytest.fixture(params=LAWFUL.values(), ids=LAWFUL.keys())
+def lawful(request):
+    flow = request.param().requires_grad_(False)
+    return (flow, *states_of(flow))
+
+
+def test_it_is_the_identity_at_zero_and_has_an_exact_inverse(lawful):
+    flow, x, unit = lawful
+    begun = started(flow)
+    assert torch.equal(flow(0.0, x, **begun), x)
+    assert torch.equal(flow(torch.zeros(5).double(), x, **begun), x)
+    each = flow.dt * torch.tensor([0.4, 1.0, 0.0, 2.3, -1.7]).double()
+    for t in (0.4 * flow.dt, 2.3 * flow.dt, -1.7 * flow.dt, each):
+        y = flow(t, x, **begun)
+        close = {"rtol": 0, "atol": 2e-11 * float(1 + (y / unit).abs().max())}
+        torch.testing.assert_close(flow.inverse(t, y, **begun) / unit, x / unit, **close)
+        torch.testing.assert_close(flow(t, flow.inverse(t, x, **begun), **begun) / unit, x / unit, **close)
+    alone = torch.stack([flow(float(t), row, **begun) for t, row in zip(each, x, strict=True)])
+    torch.testing.assert_close(y / unit, alone / unit, rtol=1e-12, atol=1e-12)
+
+
+def test_it_is_symplectic_at_every_t(lawful):
+    flow, x, _ = lawful
+    J = canonical(flow.ndof)
+    for t in (0.3 * flow.dt, 2.6 * flow.dt, -1.4 * flow.dt):
+        for row in x[:2]:
+            A = torch.autograd.functional.jacobian(lambda y, t=t: flow(t, y, **started(flow)), row)
+            assert (A.T @ J @ A - J).abs().max() < 1e-12 * torch.linalg.matrix_norm(A, 2) ** 2
+
+
+def test_its_velocity_is_the_time_derivative_and_that_of_its_hamiltonian(lawful):
+    flow, x, unit = lawful
+    t, begun = flow.dt * torch.linspace(0.05, 0.95, 5, dtype=torch.float64), started(flow)
+    y, velocity = flow.psi_and_velocity(t, x, **begun)
+    torch.testing.assert_close(y, flow.psi(t, x, **begun), rtol=1e-12, atol=1e-12)
+    size = float((velocity / unit).abs().max())
+    h = 1e-3 * flow.dt
+    near, far = (flow.psi(t + k * h, x, **begun) - flow.psi(t - k * h, x, **begun) for k in (1, 2))
+    torch.testing.assert_close(velocity / unit, (8 * near - far) / (12 * h) / unit, rtol=0, atol=1e-7 * size)
+    y = y.detach().requires_grad_()
+    (slope,) = torch.autograd.grad(flow.hamiltonian(t, y, **begun).sum(), y)
+    torch.testing.assert_close(velocity / unit, slope @ canonical(flow.ndof).T / unit, rtol=0, atol=1e-10 * size)
+
+
+def test_runs_files_and_copies_are_the_flow(lawful, tmp_path):
+    flow, x, _ = lawful
+    begun, t = started(flow), 2.3 * flow.dt
+    end = flow(t, x, **begun)
+    flow.save(tmp_path / "flow.safetensors")
+    again = load(tmp_path / "flow.safetensors", system=flow.system)
+    for other in (again, copy.deepcopy(flow), pickle.loads(pickle.dumps(flow))):
+        assert torch.equal(other(t, x, **begun), end)
+    if flow.system is None or flow.system is TRANSFORMED:
+        return
+    span = (begun.get("t0", 0.0), begun.get("t0", 0.0) + t)
+    for backend in ("auto", "array"):
+        run = solve(flow.system, flow, span, x.numpy(), backend=backend, on_domain_exit="ignore")
+        np.testing.assert_allclose(run.y[..., -1], end, rtol=1e-12, atol=2e-11)
 
 
 def test_a_flow_in_another_time_knows_the_system_that_it_is_for():

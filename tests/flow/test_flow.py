@@ -8,7 +8,7 @@ import textwrap
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sympflow.flow.flow_map import whole_steps
@@ -36,79 +36,6 @@ def states(n, ndof, seed=0):
 
 def times(n, dt=1.0, seed=1):
     return dt * torch.rand(n, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-def structure(ndof):
-    identity, zero = torch.eye(ndof, dtype=torch.float64), torch.zeros(ndof, ndof, dtype=torch.float64)
-    return torch.cat([torch.cat([zero, identity], 1), torch.cat([-identity, zero], 1)])
-
-
-FLOWS = {
-    "published": lambda: SympFlow(2, pairs=3, seed=1),
-    "one degree of freedom, one hidden layer": lambda: SympFlow(1, pairs=2, hidden=(8,), seed=2),
-    "three degrees, deep": lambda: SympFlow(3, pairs=2, hidden=(6, 7, 5), activation="sin", seed=3),
-    "softplus": lambda: SympFlow(2, pairs=2, hidden=(9, 9), activation="softplus", seed=4),
-    "scaled": lambda: SympFlow(2, pairs=2, dt=0.1, scale=Scaling((0.1, 0.2), (30.0, 20.0), 0.1), seed=5),
-    "layers in another order": lambda: SympFlow.from_layers(
-        [Drift(MLPPotential(2)), Kick(MLPPotential(2)), Kick(MLPPotential(2)), Drift(MLPPotential(2))], dt=1.0
-    ),
-}
-
-
-@pytest.fixture(params=FLOWS.values(), ids=FLOWS.keys())
-def flow(request):
-    return rough(request.param())
-
-
-def test_is_symplectic(flow):
-    """AᵀJA = J for the Jacobian A of ψ_t at any t, to rounding."""
-    x = states(5, flow.ndof) * torch.tensor(units(flow))
-    J = structure(flow.ndof)
-    for t in (0.3 * flow.dt, 2.6 * flow.dt, -1.4 * flow.dt):
-        A = torch.stack([torch.autograd.functional.jacobian(lambda x, t=t: flow(t, x), row) for row in x])
-        defect = torch.linalg.matrix_norm(A.mT @ J @ A - J, 2) / torch.linalg.matrix_norm(A, 2) ** 2
-        assert defect.max() < 1e-13
-
-
-def units(flow):
-    potentials = {layer.kind: layer.potential for layer in flow.layers}
-    return torch.cat([potentials["kick"].scale, potentials["drift"].scale]).tolist()
-
-
-def test_inverse_to_rounding(flow):
-    s = torch.tensor(units(flow), dtype=torch.float64)
-    x = states(50, flow.ndof) * s
-    for t in (0.4 * flow.dt, flow.dt, 3.7 * flow.dt, -2.2 * flow.dt):
-        scale = 1 + (flow(t, x) / s).abs().max()
-        assert ((flow.inverse(t, flow(t, x)) - x) / s).abs().max() < 1e3 * EPS * scale
-        assert ((flow(t, flow.inverse(t, x)) - x) / s).abs().max() < 1e3 * EPS * scale
-
-
-def test_hamiltonian_generates_the_map(flow):
-    """∂_t ψ̄_t(x) = J∇𝓗(t, ψ̄_t(x))."""
-    s = torch.tensor(units(flow), dtype=torch.float64)
-    x, t = states(40, flow.ndof) * s, times(40, flow.dt)
-    y = flow(t, x).detach().requires_grad_()
-    gradient = torch.autograd.grad(flow.hamiltonian(t, y).sum(), y)[0]
-    velocity = flow.velocity(t, x)
-    assert ((velocity - gradient @ structure(flow.ndof).T) * flow.dt / s).abs().max() < 1e-10
-
-
-def test_velocity_is_the_time_derivative(flow):
-    x, t = states(20, flow.ndof) * torch.tensor(units(flow)), times(20, flow.dt)
-    y, dy = torch.func.jvp(lambda t: flow.psi(t, x), (t,), (torch.ones_like(t),))
-    torch.testing.assert_close(flow.velocity(t, x), dy, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(flow.psi_and_velocity(t, x)[0], y, rtol=1e-14, atol=1e-14)
-    h = 1e-5 * flow.dt
-    inside = t.clamp(h, flow.dt - h)
-    difference = (flow(inside + h, x) - flow(inside - h, x)) / (2 * h)
-    torch.testing.assert_close(flow.velocity(inside, x), difference, rtol=1e-6, atol=1e-6)
-
-
-def test_identity_at_zero(flow):
-    x = states(7, flow.ndof)
-    assert torch.equal(flow(0, x), x)
-    assert torch.equal(flow(torch.zeros(7, dtype=torch.float64), x), x)
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
@@ -197,16 +124,6 @@ def test_extension_composes_whole_steps():
     torch.testing.assert_close(
         flow(-0.14, x), flow.psi_inverse(0.14 - 0.1, flow.psi_inverse(0.1, x)), rtol=1e-13, atol=1e-13
     )
-
-
-@settings(max_examples=25, deadline=None)
-@given(t=st.lists(st.floats(-3.5, 3.5), min_size=1, max_size=8))
-def test_a_tensor_of_times_is_each_time_alone(t):
-    flow, x = SympFlow(1, hidden=(4,), dt=0.5), states(len(t), 1)
-    for call in (flow, flow.inverse):
-        together = call(torch.tensor(t, dtype=torch.float64), x)
-        alone = torch.stack([call(value, row) for value, row in zip(t, x, strict=True)])
-        torch.testing.assert_close(together, alone, rtol=1e-13, atol=1e-13)
 
 
 def test_gradients_flow_through_the_extension():
@@ -398,6 +315,7 @@ def test_a_device_that_is_not_there_is_refused(make):
     assert make(1, device=torch.device("cpu")).device == torch.device("cpu")
 
 
+@pytest.mark.slow
 def test_forward_mode_gives_no_warnings_of_torch_itself():
     """In a new process, since torch warns but once."""
     code = """

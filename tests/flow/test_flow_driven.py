@@ -10,7 +10,6 @@ import torch
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, SympFlow, solve
-from sympflow.training.table_step import TableStep
 
 DT, T0, W = 0.4, 1.3, 2.7
 
@@ -112,32 +111,6 @@ def test_loops_arrays_and_the_map_itself_agree(system, flow, damping):
     np.testing.assert_allclose(flow(t, y, starts)[3].detach(), compiled[3, :, -1], atol=1e-14)
     later = flow(t, y, T0 + 7 * system.period)
     torch.testing.assert_close(later, flow(t, y, T0), atol=1e-13, rtol=0)
-
-
-def test_its_velocity_is_that_of_its_hamiltonian(system, flow):
-    y, t, h = torch.tensor(states(system)), torch.tensor([0.1, 0.2, 0.3, 0.39], dtype=torch.float64), 1e-5
-    slope = (flow.psi(t + h, y, T0) - flow.psi(t - h, y, T0)) / (2 * h)
-    velocity = flow.velocity(t, y, T0).detach()
-    torch.testing.assert_close(velocity, slope.detach(), atol=1e-9, rtol=0)
-    end = flow.psi(t, y, T0).detach().requires_grad_(True)
-    (gradient,) = torch.autograd.grad(flow.hamiltonian(t, end, T0).sum(), end)
-    torch.testing.assert_close(torch.cat([gradient[:, 1:], -gradient[:, :1]], -1), velocity, atol=1e-13, rtol=0)
-    H = flow.hamiltonian(t, end, T0) - torch.as_tensor(system.hamiltonian(end.detach().numpy(), T0 + t.numpy()))
-    assert (H - H.mean()).abs().max() < 1e-2
-
-
-@pytest.mark.parametrize("damping", [None, 0.3])
-@pytest.mark.parametrize("level", [1, 2])
-def test_the_derivatives_of_a_step_by_its_numbers(damping, level):
-    step = TableStep(driven(damping=damping), ("drift", "kick", "drift", "kick", "drift"), level)
-    rng = np.random.default_rng(0)
-    c, y, t = 0.4 * rng.normal(size=(step.n_coefficients, 4)), 0.3 * rng.normal(size=(2, 4)), 3 * rng.random(4)
-    at, J = step.with_jacobian(c, y, t0=t)
-    np.testing.assert_allclose(at, step(c, y, t0=t), atol=1e-14)
-    for k in range(len(c)):
-        e = np.zeros_like(c)
-        e[k] = 1e-6
-        np.testing.assert_allclose(J[k], (step(c + e, y, t0=t) - step(c - e, y, t0=t)) / 2e-6, atol=1e-7)
 
 
 def test_a_drive_given_by_samples_is_fitted(plain):

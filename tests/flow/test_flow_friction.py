@@ -7,7 +7,6 @@ import torch
 import sympflow
 from sympflow import HamiltonianSystem, SympFlow, solve
 from sympflow.systems import damped_pendulum, henon_heiles, pendulum
-from sympflow.training.table_step import TableStep
 
 DT = 0.8
 MATRIX = [[0.3, 0.1], [0.1, 0.2]]
@@ -74,20 +73,6 @@ def test_loops_arrays_and_outputs_between_steps_agree(system, flow, damping):
     slope = (flow.psi(t + h, y) - flow.psi(t - h, y)) / (2 * h)
     torch.testing.assert_close(flow.velocity(t, y), slope, atol=1e-9, rtol=0)
     torch.testing.assert_close(flow.psi_inverse(t, flow.psi(t, y)), y, atol=1e-14, rtol=0)
-
-
-@pytest.mark.parametrize("damping", [0.3, [0.1, 0.4], MATRIX])
-def test_the_derivatives_of_a_step_by_its_numbers(damping):
-    system = HamiltonianSystem.from_sympy(henon_heiles().symbols.H, damping=damping)
-    step = TableStep(system, ("drift", "kick", "drift", "kick", "drift"), 1)
-    rng = np.random.default_rng(0)
-    c, y = 0.4 * rng.normal(size=(step.n_coefficients, 4)), 0.3 * rng.normal(size=(4, 4))
-    at, J = step.with_jacobian(c, y)
-    np.testing.assert_allclose(at, step(c, y), atol=1e-14)
-    for k in range(len(c)):
-        e = np.zeros_like(c)
-        e[k] = 1e-6
-        np.testing.assert_allclose(J[k], (step(c + e, y) - step(c - e, y)) / 2e-6, atol=1e-8)
 
 
 def test_a_file_knows_the_friction(system, flow, tmp_path):

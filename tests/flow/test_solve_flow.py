@@ -96,6 +96,7 @@ def test_a_shipped_flow_takes_the_precision_of_the_state():
         assert np.abs(np.asarray(sol.y) - solve(HH, "sympflow", (0.0, 2.0)).y).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_no_warning_of_torch_escapes_even_where_warnings_are_errors():
     code = (
         "import sympflow as sf\ns = sf.systems.henon_heiles()\n"

@@ -40,7 +40,13 @@ def comb(times):
     return np.stack([(on * np.sin(since)).sum(1), (on * np.cos(since)).sum(1)])
 
 
-@pytest.mark.parametrize("method", ["kahan_li8", "gauss_legendre6", "tao8", "linear_kahan_li8", "dop853", "dopri5"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        *("kahan_li8", "gauss_legendre6", "linear_kahan_li8", "dop853"),
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ("tao8", "dopri5")),
+    ],
+)
 def test_an_oscillator_under_impulses_is_a_sum_of_sines(method):
     """There and back, at given times and at the steps, by the dense output and in a batch."""
     adaptive = method in ("dop853", "dopri5")
@@ -231,6 +237,31 @@ CONTINUOUS = {
 def test_a_potential_that_jumps_is_refused(name):
     with pytest.raises(ValueError, match=r"^`expression` jumps where .* = 0, at [qp]\d? = .* reflect p\.$"):
         HamiltonianSystem.from_sympy(JUMPING[name])
+
+
+def of_functions(H):
+    """½p² + V(q) as functions of arrays."""
+    H = sp.sympify(H)
+    names = [f"q{i + 1}" for i in range(2)] if H.has(sp.Symbol("q1")) else ["q"]
+    V = sp.lambdify(names, H.subs(dict.fromkeys(sp.symbols("p p1 p2"), 0)), "numpy")
+    return HamiltonianSystem(
+        lambda q: V(*(q[..., i] for i in range(len(names)))), ndof=len(names), y0=[0.3, 0.1] * len(names)
+    )
+
+
+@pytest.mark.parametrize("name", ["step", "pieces", "sign", "angle", "far", "small", "barrier", "waves"])
+def test_functions_that_jump_are_refused(name):
+    with pytest.raises(ValueError, match=r"^`potential` jumps where .* = 0, at q\d? = .* reflect p\.$"):
+        solve(of_functions(JUMPING[name]), "verlet", (0, 0.1), dt=0.01)
+    with pytest.raises(ValueError, match=r"^`potential` jumps where q1 - 1 = 0"):
+        solve(HamiltonianSystem(lambda q: 5.0 * (q[..., 0] > 1), ndof=1, y0=[0, 1]), "verlet", (0, 0.1), dt=0.01)
+
+
+@pytest.mark.parametrize(
+    "name", ["wall", "pieces", "seven figures", "three", "kink", "one side", "odd", "ring", "well"]
+)
+def test_functions_with_kinks_stay(name):
+    assert solve(of_functions(CONTINUOUS[name]), "verlet", (0, 0.1), dt=0.01).success
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)

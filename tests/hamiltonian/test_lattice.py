@@ -294,7 +294,7 @@ class TestPoles:
     @pytest.mark.parametrize("bond", ["r**4/4", "1/(1 + r**2)", "exp(-r) + r", "sin(r)/r", "r**n", "log(cosh(r))"])
     def test_where_there_are_none_nothing_is_looked_at(self, bond):
         params = {"n": 4.0} if "n" in bond.replace("sin", "") else None
-        assert not HamiltonianSystem.lattice(bond=bond, params=params, shape=6).poles
+        assert not HamiltonianSystem.lattice(bond=bond, params=params, shape=6).definition.poles
 
     @pytest.mark.parametrize(
         "bond", ["1/r", "(1 + r)**-n", "1/sqrt(r**2)", "log(r)", "tan(r)", "1/(r**2 - 4)", "r/(1 + r)"]
@@ -302,7 +302,7 @@ class TestPoles:
     def test_where_there_are_some_they_are_found(self, bond):
         assert HamiltonianSystem.lattice(
             bond=bond, params={"n": 6.0} if "n)" not in bond and "-n" in bond else None, shape=6
-        ).poles
+        ).definition.poles
 
 
 def test_derivatives_are_made_once(monkeypatch):

@@ -234,6 +234,33 @@ class TestRuns:
         np.testing.assert_allclose(sol.y, solve(system, "verlet", (0, 0.5), backend="array").y, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize(
+    ("V", "more", "y0", "dt", "where"),
+    [
+        ("1/r", {"dim": 1}, [0, 1, 5, -5], 0.3, "r = 0"),
+        ("r**-2", {"dim": 1}, [0, 1, 20, -20], 0.1, "r = 0"),
+        ("log(r - a)", {"dim": 2, "params": {"a": 1.0}}, [0, 0, 3, 0, 9, 0, -9, 0], 0.1, "a - r = 0"),
+        ("atanh(r/10)", {"dim": 2}, [0, 0, 8, 0, -10, 0, 10, 0], 0.05, "r - 10 = 0"),
+        ("-log(1 - (r/2)**2)", {"dim": 3}, [0, 0, 0, 1.5, 0, 0, -10, 0, 0, 10, 0, 0], 0.05, "r - 2 = 0"),
+        ("-log(1 - (r/2)**2)", {"dim": 1, "softening": 0.1}, [0, 1.5, -10, 10], 0.05, "r - 2 = 0"),
+        ("-log(1 - (r/2)**2)", {"dim": 1, "box": 6.0}, [5, 0.5, -10, 10], 0.05, "r - 2 = 0"),
+        ("1/(1 - cos(r))", {"dim": 2}, [0, 0, 9, 0, 10, 0, -10, 0], 0.05, "1 - cos(r) = 0"),
+        ("-tan(r)", {"dim": 2, "cutoff": 2.0}, [0, 0, 1.9, 0, 9, 0, -9, 0], 0.1, "cos(r) = 0"),
+    ],
+)
+def test_a_run_that_passes_a_place_without_v_ends_there(V, more, y0, dt, where):
+    system = HamiltonianSystem.pairs(V, masses=[1.0, 1.0], **more)
+    still = np.array(y0, dtype=float) * np.repeat([1, 1e-3], len(y0) // 2)
+    sol = solve(system, "verlet", (0, 3 * dt), np.stack([still, y0]), dt=dt)
+    np.testing.assert_array_equal(sol.status, [0, -1])
+    assert f"passed {where} of two bodies, where H is infinite" in sol.message
+
+
+@pytest.mark.parametrize("V", ["1/r", "r**-12 - r**-6", "sin(r)/r", "exp(-r)/r", "erfc(r)/r", "log(1 + r**2)", "r"])
+def test_where_there_is_none_nothing_is_looked_at(V):
+    assert not HamiltonianSystem.pairs(V, masses=np.ones(3), dim=3).definition.poles
+
+
 class TestBadInput:
     @pytest.mark.parametrize(
         ("change", "message"),
@@ -268,8 +295,9 @@ class TestBadInput:
 
     @pytest.mark.parametrize("softening", [None, 0.1])
     def test_bodies_that_a_step_leaps_over_are_named(self, softening):
-        system = HamiltonianSystem.pairs("-1/r", masses=np.ones(2), dim=1, softening=softening)
-        y0 = np.array([[0.0, 9.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])  # the second pair meets at t = π/4
+        system = HamiltonianSystem.pairs("-1/r", masses=np.ones(2), dim=2, softening=softening)
+        y0 = np.zeros((2, 8))
+        y0[:, 2] = 9.0, 1.0  # the second pair meets at t = π/4
         with warnings.catch_warnings(record=True) as found:
             warnings.simplefilter("always")
             for start in (y0, y0[1]):

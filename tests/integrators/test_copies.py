@@ -32,6 +32,7 @@ def test_orders(system, method, order, dt):
     assert np.log2(errors[1] / errors[2]) == pytest.approx(order, abs=0.25)
 
 
+@pytest.mark.slow
 def test_a_run_is_symplectic_on_the_two_copies_and_keeps_the_energy(system):
     sol = sympflow.solve(system, "tao4", (0, 200), dt=0.05, t_eval=np.linspace(0, 200, 401))
     assert sympflow.symplecticity_defect(sol) < 1e-13

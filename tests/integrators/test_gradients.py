@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from sympflow import Box, HamiltonianSystem, solve
+from sympflow import Box, HamiltonianSystem, solve, systems
 from sympflow.kernels import reverse
 
 CUBIC = HamiltonianSystem.from_sympy(
@@ -17,6 +17,7 @@ DRIVEN = HamiltonianSystem.from_sympy(
 DAMPED = HamiltonianSystem.from_sympy("p**2/2 - w*cos(q)", params={"w": 1.0}, damping=0.2)
 RELATIVISTIC = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4/4")
 KEPLER = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2 + 0.3)")
+GEODESIC = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2*(1 + q1**2) + (q1**4 + q2**4)/4")
 SYSTEMS = [
     (CUBIC, "verlet"),
     (CUBIC, "srkn11b"),
@@ -25,6 +26,9 @@ SYSTEMS = [
     (DAMPED, "verlet"),
     (RELATIVISTIC, "blanes_moan4"),
     (KEPLER, "leapfrog"),
+    (GEODESIC, "rk4"),
+    (DRIVEN, "heun3"),
+    (DAMPED, "midpoint"),
 ]
 RUNS = [
     {"t_span": (0, 2), "dt": 0.1, "t_eval": [2.0]},
@@ -83,6 +87,23 @@ def test_gradients_by_parameters(system, method, params, run):
     for name, gradient in zip(params, torch.autograd.grad(weighted(sol), list(tensors.values())), strict=True):
         difference = (value(**{name: params[name] + h}) - value(**{name: params[name] - h})) / (2 * h)
         np.testing.assert_allclose(float(gradient.sum()), difference, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("system", "method", "options"),
+    [
+        (GEODESIC, "gauss_legendre4", {"dt": 0.1}),
+        (DRIVEN, "implicit_midpoint", {"dt": 0.1}),
+        (GEODESIC, "tao4", {"dt": 0.1, "omega": 2.0}),
+        (systems.henon_heiles(), "sympflow", {}),
+    ],
+)
+def test_tensors_without_gradients_run_compiled(system, method, options):
+    y0, run = start(system, (3,)), {"t_span": (0, 2), "t_eval": [1.03, 2.0], **options}
+    sol = solve(system, method, y0=torch.tensor(y0), **run)
+    assert sol.stats["backend"] == "compiled"
+    np.testing.assert_array_equal(sol.y.numpy(), solve(system, method, y0=y0, **run).y)
+    assert solve(system, method, y0=torch.tensor(y0, requires_grad=True), **run).y.requires_grad
 
 
 def test_first_and_second_derivatives():

@@ -132,7 +132,7 @@ def test_an_announced_scheme_is_a_method_and_a_start_of_a_flow(announced):
     assert solve(HH, "ruth", (0, 1), splitting="kinetic").stats["backend"] == "compiled"
     flow = SympFlow.primed(HH, scheme="ruth", dt=0.5, palindromic=False)
     assert flow.scheme(0.5).kicks[0] == pytest.approx(RUTH3.kicks[0])
-    with pytest.raises(ImportError, match=r"^`scheme` 'seven' of the plug-in .* is no usable scheme"):
+    with pytest.raises(ImportError, match=r"^`scheme` 'seven' of the plug-in .* is not a usable scheme"):
         get("seven")
     with pytest.raises(ImportError, match=r"^`scheme` 'absent' of the plug-in .* cannot be loaded"):
         solve(HH, "absent", (0, 1))

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+import sympy as sp
 from watchdog import watched
 
 import sympflow as sf
@@ -69,6 +70,31 @@ def test_a_run_over_a_pole_ends_before_it(V):
     assert sol.stats["failed_at"] == pytest.approx(last.stats["failed_at"])
     assert sol.t[-1] == sol.stats["failed_at"]
     assert last.t.size == 0
+
+
+def of_functions(V):
+    """The same as a function of arrays."""
+    potential = sp.lambdify("q", sp.sympify(V), "numpy")
+    return HamiltonianSystem(lambda q: potential(q[..., 0]), ndof=1)
+
+
+LEAPT_UNSEEN = "1/(1 + sin(q))/1e6", "1/(q**2 - 1)", "1/(exp(q) - 1 - q)"
+"""V of which no divisor has another sign, and H no other value, after the leap."""
+
+
+@pytest.mark.parametrize("V", [V for V in CROSSED if V not in LEAPT_UNSEEN])
+def test_a_run_of_functions_ends_there_too(V):
+    y0, dt, t1 = CROSSED[V]
+    sols = [solved(f, "verlet", (0, t1), y0, dt=dt)[0] for f in (of_functions(V), in_units(V, 1.0))]
+    assert sols[0].status == -1
+    assert sols[0].stats["failed_at"] == sols[1].stats["failed_at"]
+
+
+@pytest.mark.parametrize("V", [V for V in SILENT if V not in ("-q*cot(q)", "cbrt(q**2)")])
+def test_a_run_of_functions_over_none_is_left_alone(V):
+    sol, told = solved(of_functions(V), "verlet", (0, 3), SILENT[V], dt=0.03)
+    assert sol.success
+    assert not told
 
 
 @pytest.mark.parametrize(
@@ -211,6 +237,30 @@ def test_a_run_about_a_place_where_terms_cancel_is_warned_of_once(V):
         told.append([str(w.message) for w in caught if "cancel" in str(w.message)])
     assert [len(each) for each in told] == [lost, 0]
     assert all(text.startswith("`system` has terms that cancel at q1 = 0, ") and "sinc" in text for text in told[0])
+
+
+@pytest.mark.parametrize(
+    ("system", "y0", "lost"),
+    [
+        (HamiltonianSystem.lattice(shape=2, bond="csch(r) - 1/r", boundary="fixed"), [0.01, -0.02, 0, 0], True),
+        (
+            HamiltonianSystem.lattice(shape=2, bond="k*csch(r) - 1/r", params={"k": 1.0}, boundary="fixed"),
+            [0.01, -0.02, 0, 0],
+            True,
+        ),
+        (HamiltonianSystem.lattice(shape=2, onsite="(cosh(q) - 1)/q**2"), [0.01, -0.02, 1, -1], True),
+        (HamiltonianSystem.lattice(shape=2, onsite="sin(q)/q"), [0.01, -0.02, 1, -1], False),
+        (HamiltonianSystem.pairs("1/r - 1/sinh(r)", masses=[1, 1], dim=2), [0, 0, 1e-3, 0, 0, 0, 0, 0], True),
+        (HamiltonianSystem.pairs("1/r - 1/sinh(r)", masses=[1, 1], dim=2), [0, 0, 1, 0, 0, 0, 0, 0], False),
+        (HamiltonianSystem.pairs("(cosh(r) - 1)/r**2", masses=[1, 1], dim=1), [0, 1, 3, -3], True),
+    ],
+)
+def test_terms_of_lattices_and_pairs_that_cancel_are_told(system, y0, lost):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sf.solve(system, "verlet", (0, 0.5), y0, dt=1e-4)
+    told = [str(w.message) for w in caught if "cancel" in str(w.message)]
+    assert len(told) == lost
 
 
 def test_a_start_where_terms_cancel_is_told_why_it_fails():

@@ -174,7 +174,7 @@ def test_plugins_break_on_use_and_not_before(plugins):
     assert get("verlet").name == "verlet"
     with pytest.raises(ImportError, match=r"^`method` 'broken' of the plug-in .* cannot be loaded"):
         get("broken")
-    with pytest.raises(ImportError, match=r"^`method` 'nothing' of the plug-in .* is no Integrator class"):
+    with pytest.raises(ImportError, match=r"^`method` 'nothing' of the plug-in .* is not an Integrator class"):
         get("nothing")
 
 

@@ -273,7 +273,7 @@ def test_a_flow_and_a_name_without_system():
 
 class TestBadInput:
     def test_at_the_door(self):
-        with pytest.raises(TypeError, match=r"^`method` 'rk45' is no fixed-step map"):
+        with pytest.raises(TypeError, match=r"^`method` 'rk45' is not a fixed-step map"):
             as_scipy("rk45", HH)
         with pytest.raises(ValueError, match=r"^`method` 'nothing' is unknown"):
             as_scipy("nothing", HH)

@@ -493,7 +493,7 @@ class TestRegistration:
     @pytest.mark.parametrize(
         ("method", "error", "message"),
         [
-            ("rk45", TypeError, r"^`method` 'rk45' is no fixed-step map"),
+            ("rk45", TypeError, r"^`method` 'rk45' is not a fixed-step map"),
             ("verlett", ValueError, r"^`method` 'verlett' is unknown. Did you mean 'verlet'\?"),
             (3, TypeError, r"^`method` must be the name of a method"),
         ],
@@ -636,7 +636,7 @@ class TestAnotherSystem:
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"method": "rk45"}, TypeError, r"^`method` 'rk45' is no fixed-step map"),
+        ({"method": "rk45"}, TypeError, r"^`method` 'rk45' is not a fixed-step map"),
         (
             {"method": "nothing"},
             ValueError,
@@ -652,7 +652,7 @@ class TestAnotherSystem:
         (
             {"options": {"system": "pendulum"}},
             TypeError,
-            r"^`options` has a 'system' that is no HamiltonianSystem: str",
+            r"^`options` has a 'system' that is not a HamiltonianSystem: str",
         ),
         ({"method": "log_leapfrog"}, TypeError, r"^`method` 'log_leapfrog' takes steps that are not equal in t"),
         ({"y0": times(1.0, np.nan)}, ValueError, r"^`y0` must be finite"),

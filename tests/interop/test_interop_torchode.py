@@ -115,7 +115,7 @@ def test_bad_arguments_are_named():
         register("verlet", lambda t, y: y)
     with pytest.raises(TypeError, match=r"^`dt` is not an option here"):
         step_method("verlet", HH, dt=0.1)
-    with pytest.raises(TypeError, match=r"^`method` 'dopri5' is no fixed-step map"):
+    with pytest.raises(TypeError, match=r"^`method` 'dopri5' is not a fixed-step map"):
         step_method("dopri5", HH)
     with pytest.raises(ValueError, match=r"^`system` .* degrees of freedom"):
         step_method(SympFlow(1), HH)

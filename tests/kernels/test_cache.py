@@ -64,6 +64,7 @@ def test_threads_that_compile_at_once(method, tmp_path):
     assert not [*tmp_path.rglob("*.part")]
 
 
+@pytest.mark.slow
 def test_processes_that_compile_at_once(tmp_path):
     """Each finds or makes the same file, and none reads what another one is about to write."""
     processes = [started(tmp_path, SCRIPT) for _ in range(4)]

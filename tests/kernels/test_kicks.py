@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import sympy as sp
 
 from sympflow import Box, SympFlow, systems
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.approximations import on_interval, position_ranges
+from sympflow.kernels.approximations import position_ranges
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.stages import StageTable
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
@@ -78,19 +77,6 @@ def test_kinks_and_polynomials_have_no_ranges():
     for V in ("Abs(q)", "q**4"):
         system = HamiltonianSystem.from_sympy(f"p**2/2 + {V}", domain=Box([-1, -1], [1, 1]))
         assert position_ranges(system.symbols, system.domain) == ()
-
-
-def test_functions_are_polynomials_where_few_powers_are_exact():
-    x = sp.Symbol("x", real=True)
-    sine = on_interval([sp.sin(x)], x, -2.5, 2.4)
-    assert sine is not None
-    assert (sine.low, sine.high, sine.center) == (-2.5, 2.5, 0.0)
-    assert not sine.coefficients[0, ::2].any()  # odd
-    at = np.linspace(-2.5, 2.5, 201)
-    np.testing.assert_allclose(np.polyval(sine.coefficients[0, ::-1], at), np.sin(at), rtol=0, atol=2e-15)
-    assert on_interval([sp.sin(40 * x)], x, -1.0, 1.0) is None  # too long
-    assert on_interval([1 / x**2], x, 0.01, 1.0) is None
-    assert on_interval([sp.log(x)], x, -1.0, 2.0) is None  # not defined everywhere
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -24,7 +24,19 @@ from sympflow.learning.learner import (
     without_growth,
 )
 from sympflow.learning.library import Library, Terms
-from sympflow.learning.models import Distances, FixedKinetic, Formula, Kinetic, Model, Network, Polynomial, Waves
+from sympflow.learning.models import (
+    Distances,
+    Drive,
+    FixedKinetic,
+    Formula,
+    Kinetic,
+    Model,
+    Network,
+    Polynomial,
+    Waves,
+    drags,
+    friction,
+)
 from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
@@ -49,9 +61,9 @@ def trajectories(n, points, rate=0.0, noise=0.0, span=2.0, seed=0):
     return runs
 
 
-def quartic(data, rates=0):
+def quartic(data, force=None):
     q, p = data.scales
-    return Model(1, (Kinetic([p]), Polynomial.up_to(4, "q", [q])), rates)
+    return Model(1, (Kinetic([p]), Polynomial.up_to(4, "q", [q])), force)
 
 
 def problem(model, data, sigma, **options):
@@ -76,11 +88,15 @@ def test_shooting_finds_h_to_rounding(clean):
     assert potential.coefficients(found.theta[1:]) == pytest.approx([0, STIFF / 2, 0, QUARTIC / 4], abs=1e-10)
 
 
-@pytest.mark.parametrize("rates", [0, 1])
-def test_derivatives_are_those_of_the_orbits(clean, rates):
+@pytest.mark.parametrize("driven", [False, True])
+@pytest.mark.parametrize("force", [None, friction, drags])
+def test_derivatives_are_those_of_the_orbits(clean, force, driven):
     """A splitting scheme and collocation, by the initial state and by θ, against differences."""
-    model = quartic(clean, rates)
+    model = quartic(clean, force)
+    if driven:
+        model = replace(model, parts=(*model.parts, Drive(Polynomial.up_to(2, "q", [1.0]), 1.3)))
     theta, problem_ = problem(model, clean, clean.scales)
+    theta = theta + 0.05
     batch, states = problem_.batches[0], first_states(clean)
     *_, (_, _, X) = problem_._orbits(batch, theta, states, True)
 
@@ -100,14 +116,13 @@ def test_derivatives_are_those_of_the_orbits(clean, rates):
 def test_collocation_is_symplectic():
     model = Model(1, (Polynomial("y", [[2, 0], [0, 2], [2, 2]], [1.0, 1.0]),))
     x, X = np.array([[0.3], [0.8]]), np.eye(2)[..., None]
-    _, X = Method(Gauss(3), 0.5).over(model, np.array([0.5, 0.5, 0.4]), x, X, np.array([2.0]))
+    _, X = Method(Gauss(3), 0.5).over(model, np.array([0.5, 0.5, 0.4]), x, X, np.array([2.0]), np.zeros(1))
     A, J = X[..., 0], np.array([[0.0, 1.0], [-1.0, 0.0]])
     assert pytest.approx(J, abs=1e-12) == A.T @ J @ A
     exact, tolerance = Method(Gauss(3), 0.5), np.full(2, 1e-3)
     rough = Method(Gauss(3).within(tolerance), 0.5)
-    ends = [
-        method.over(model, np.array([0.5, 0.5, 0.4]), x.copy(), None, np.array([2.0]))[0] for method in (exact, rough)
-    ]
+    theta, zero = np.array([0.5, 0.5, 0.4]), np.zeros(1)
+    ends = [method.over(model, theta, x.copy(), None, zero + 2, zero)[0] for method in (exact, rough)]
     assert 0 < np.abs(ends[1] - ends[0]).max() < 1e-3 * tolerance.max()
     assert rough.stepper == exact.stepper  # by which a checkpoint finds it
 
@@ -155,7 +170,7 @@ def test_outliers_count_less_by_hubers_loss():
 
 def test_friction_is_learned():
     data = Trajectories.read(trajectories(8, 15, rate=RATE))
-    theta, fit = problem(quartic(data, rates=1), data, 1e-9 * data.scales)
+    theta, fit = problem(quartic(data, friction), data, 1e-9 * data.scales)
     assert minimized(fit, theta, first_states(data)).theta[-1] == pytest.approx(RATE, abs=1e-9)
 
 
@@ -354,6 +369,8 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
         (4, {"family": "unknown"}, "`family`"),
         (4, {"loss": "absolute"}, "`loss`"),
         (4, {"damping": 0.1}, "`damping`"),
+        (4, {"drive": -1.0}, "`drive`"),
+        (4, {"drive": 1.0, "separable": False}, "`drive`"),
         (4, {"mass": 1.0, "separable": False}, "`mass`"),
         (4, {"dt": -1.0}, "`dt`"),
         (4, {"seed": "x"}, "`seed`"),
@@ -405,6 +422,45 @@ def test_data_of_no_hamiltonian_are_called_so():
     assert freedom.share < 1e-3
     assert 0.05 < freedom.defect < 0.2  # of L the friction is a fifth of the frequency, about 1, in one entry of four
     assert "damping" in str(record[0].message)
+
+
+T = np.linspace(0, 10, 51)
+CLOCKS = {
+    "drive": (lambda t, q, p: [p, -q - q**3 + 0.3 * np.cos(1.7 * t)], r"drive=1\.(69|70)", {"drive": True}),
+    "stiffness": (lambda t, q, p: [p, -(1 + 0.3 * np.cos(2.3 * t)) * q], r"drive=2\.(29|30)", {"drive": 2.3}),
+    "drag": (lambda t, q, p: [p, -q - q**3 - 0.3 * abs(p) * p], 'damping="quadratic"', {"damping": "quadratic"}),
+}
+
+
+@pytest.fixture(scope="module", params=CLOCKS)
+def forced(request):
+    """Noisy trajectories of what no H(q, p) explains, with the remedy that a warning names."""
+    field, remedy, options = CLOCKS[request.param]
+    rng = np.random.default_rng(0)
+    y = [
+        solve_ivp(lambda t, y: field(t, *y), (0, 10), start, t_eval=T, rtol=1e-9, atol=1e-10).y
+        for start in rng.uniform(-1, 1, (8, 2))
+    ]
+    return np.array(y), Trajectories.read((T, y + 0.005 * rng.normal(size=np.shape(y)))), remedy, options
+
+
+def test_drives_and_drag_are_named_with_the_remedy(forced):
+    _, data, remedy, _ = forced
+    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search.run(["polynomial"], Session())
+    with pytest.warns(UserWarning, match=f"pass {remedy}|Pass {remedy}"):
+        search.diagnose(Session())
+
+
+def test_drives_and_drag_are_learned(forced):
+    """The orbits of what was learned are those without noise, to a part of it."""
+    y, data, _, options = forced
+    flow = sympflow.learn(data, family="polynomial", time_budget=30, dt=0.25, **options)
+    assert flow.figures["noise"] == pytest.approx(0.005, rel=0.1)
+    starts = flow.system.lift(y[:, :, 0]) if "damping" in options else y[:, :, 0]
+    made = sympflow.solve(flow.system, flow, (0, 5), starts, t_eval=T[:26]).y
+    made = made[:, [0, 3]] if "damping" in options else made
+    assert np.abs(made - y[:, :, :26]).max() < 0.01
 
 
 def test_orbits_that_diverge_are_left_out_of_the_region_of_a_flow():
@@ -462,10 +518,10 @@ def test_friction_that_chance_makes_negative_is_none(damping, seed):
 def test_friction_below_0_is_0_and_one_that_is_no_chance_is_told(clean):
     growing = Trajectories.read(trajectories(8, 15, rate=-RATE, noise=0.01))
     with pytest.warns(UserWarning, match=r"`damping` is -0.2.* by the data, whose energy grows: it is taken as 0"):
-        found = without_growth(fitted(quartic(growing, 1), growing, Setting()))
+        found = without_growth(fitted(quartic(growing, friction), growing, Setting()))
     assert found.theta[-1] == 0
     rest = Trajectories.read(trajectories(8, 15, noise=0.01))
-    fit = fitted(quartic(rest, 1), rest, Setting())
+    fit = fitted(quartic(rest, friction), rest, Setting())
     shifted = replace(fit, theta=fit.theta - [*np.zeros(len(fit.theta) - 1), fit.theta[-1] + 1e-4])
     conservative = [*fitted(quartic(rest), rest, Setting()).theta, 0.0]
     np.testing.assert_allclose(without_growth(shifted).theta, conservative, rtol=0.02, atol=0.02)

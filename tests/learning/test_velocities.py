@@ -10,7 +10,7 @@ from sympflow.learning.families import FAMILIES, Said, families
 from sympflow.learning.fitting import Setting, fitted
 from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.learner import _said
-from sympflow.learning.models import FixedKinetic, Kinetic, Model, Polynomial
+from sympflow.learning.models import FixedKinetic, Kinetic, Model, Polynomial, friction
 from sympflow.learning.shooting import first_states
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import double_pendulum
@@ -58,12 +58,12 @@ def test_lagranges_equations_give_the_masses_of_a_double_pendulum(observed):
     assert np.sqrt(np.mean((found - right) ** 2)) < 0.01 * right.std()
 
 
-@pytest.mark.parametrize("rates", [0, 1])
+@pytest.mark.parametrize("force", [None, friction])
 @pytest.mark.parametrize("inertial", [False, True])
-def test_what_is_observed_of_a_state_has_the_derivatives_that_are_said(inertial, rates):
+def test_what_is_observed_of_a_state_has_the_derivatives_that_are_said(inertial, force):
     data, _ = observations(double_pendulum() if inertial else CARTS, "qv")
     model = candidate("inertia" if inertial else "polynomial", data, 1, 2 * np.pi if inertial else None)
-    model = replace(model, rates=rates)
+    model = replace(model, force=force)
     rng, h = np.random.default_rng(0), 1e-6
     theta = rng.uniform(0.1, 0.2, model.n)
     y = data.runs[0].y[:, ::20]
@@ -105,7 +105,7 @@ def test_friction_is_told_by_velocities():
     system = sympflow.HamiltonianSystem.from_sympy("p**2 + q**2", damping=0.2, name="damped")
     y = [sympflow.solve(system, "dop853", (0, 2), start, t_eval=t, rtol=1e-11, atol=1e-12).y for start in np.eye(2)]
     data = Trajectories.read((t, np.array(y) * np.array([1.0, 2.0])[:, None]), observed="qv")
-    found = fitted(replace(candidate("polynomial", data, 0), rates=1), data, Setting())
+    found = fitted(replace(candidate("polynomial", data, 0), force=friction), data, Setting())
     assert found.theta[-1] == pytest.approx(0.2, abs=1e-6)
 
 
@@ -151,7 +151,7 @@ def test_velocities_of_no_momenta_are_refused():
 
 
 def test_families_are_those_that_velocities_tell():
-    said = Said(np.ones(4), None, None, 0, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
+    said = Said(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
     assert families(said, None) == ["central", "pairs", "waves", "polynomial", "network", "inertia", "magnetic"]
     assert "magnetic" not in families(replace(said, velocities=False), None)
     with pytest.raises(ValueError, match="`family` 'whole-polynomial' does not apply"):
@@ -162,7 +162,7 @@ def test_families_are_those_that_velocities_tell():
 
 def test_only_the_factor_of_h_is_given():
     """(M⁻¹)₁₁ = 1 beside the numbers of all others."""
-    said = Said(np.ones(4), None, None, 0, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
+    said = Said(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
     model = said.separated(Polynomial.up_to(2, "q", np.ones(2)))
     assert model.n == Kinetic([1.0, 1.0]).n - 1 + 5
     assert isinstance(model.parts[0], FixedKinetic)

@@ -255,6 +255,6 @@ def test_a_store_of_another_run_is_left_as_it_is(tmp_path):
     with Store.open(path).locked(), pytest.raises(StoreError, match="is being written by another process"):
         solve(SYSTEM, "verlet", (0, END), store=path, resume=True)
     (tmp_path / "notes").write_text("of mine")
-    with pytest.raises(ValueError, match="is no store of sympflow: give another place"):
+    with pytest.raises(ValueError, match="is not a store of sympflow: give another place"):
         solve(SYSTEM, "verlet", (0, END), store=tmp_path / "notes", resume=True)
     np.testing.assert_array_equal(solve(SYSTEM, "verlet", (0, END), store=path, resume=True).y, before)

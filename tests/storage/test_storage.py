@@ -116,9 +116,9 @@ def test_places_that_are_no_store(tmp_path):
         Store.open(tmp_path / "none.zarr")
     for contents in ("", "{}", '{"metadata": []}'):
         Path(tmp_path / ".zmetadata").write_text(contents)
-        with pytest.raises(ValueError, match=r"`store` .* is no store of sympflow"):
+        with pytest.raises(ValueError, match=r"`store` .* is not a store of sympflow"):
             Store.open(tmp_path)
-    with pytest.raises(ValueError, match="is no store"):
+    with pytest.raises(ValueError, match="is not a store"):
         Store.open(tmp_path / ".zmetadata")
     with pytest.raises(FileExistsError, match=r"`store` .* exists"):
         Store.create(tmp_path, FIELDS, {})
@@ -151,7 +151,7 @@ def test_of_two_that_make_a_store_at_once_one_does(tmp_path, monkeypatch):
 
 def test_chunks_and_their_values_must_fit(tmp_path):
     store = made(tmp_path / "run.zarr")
-    with pytest.raises(ValueError, match="are no chunk of 'q'"):
+    with pytest.raises(ValueError, match="are not a chunk of 'q'"):
         store.write("q", (0, 0), np.zeros((2, 5)))
     with pytest.raises(ValueError, match="must agree"):
         Field(("a",), (1, 2))

@@ -237,7 +237,7 @@ def test_writers_name_the_path_that_they_cannot_write(tmp_path):
             write(3)
         write(tmp_path / f"new_{write.__name__}" / "folder" / "x.png")
         assert (tmp_path / f"new_{write.__name__}" / "folder" / "x.png").is_file()
-    with pytest.raises(ValueError, match=r"^`path` 'x.xyz' ends in '.xyz', which is no format of figures"):
+    with pytest.raises(ValueError, match=r"^`path` 'x.xyz' ends in '.xyz', which is not a format of figures"):
         study.plot(tmp_path / "x.xyz")
 
 

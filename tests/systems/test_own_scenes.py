@@ -46,7 +46,7 @@ def test_scenes_of_plugins_are_listed_and_made(announced):
         assert {"anharmonic-well", "seven", "absent"} <= set(systems.available())
     assert systems.get("anharmonic-well") is systems.get("anharmonic_well") is anharmonic
     assert systems.get("henon_heiles") is systems.henon_heiles
-    with pytest.raises(ImportError, match=r"^`system` 'seven' of the plug-in .* is no function with a default"):
+    with pytest.raises(ImportError, match=r"^`system` 'seven' of the plug-in .* is not a function with a default"):
         systems.get("seven")
     with pytest.raises(ImportError, match=r"^`system` 'absent' of the plug-in .* cannot be loaded \(ModuleNotFound"):
         systems.get("absent")
@@ -87,5 +87,5 @@ def test_registered_scenes_are_known(announced):
     ):
         with pytest.raises(error, match=message):
             systems.register(name, factory)
-    with pytest.raises(ValueError, match=r"^`name` 'my-wel' is no known scene. Did you mean 'my-well'"):
+    with pytest.raises(ValueError, match=r"^`name` 'my-wel' is not a known scene. Did you mean 'my-well'"):
         systems.get("my-wel")

@@ -98,9 +98,9 @@ def test_a_scene_with_an_exact_solution_can_be_copied_and_changed():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: systems.sine_gordon("soliton"), "`wave` must be 'breather' or 'kink'"),
-        (lambda: systems.sine_gordon(frequency=1.0), "`frequency` of a breather"),
-        (lambda: systems.sine_gordon("kink", velocity=1.0), "`velocity` must lie between"),
+        (lambda: systems.sine_gordon("soliton"), "`wave` must be one of 'breather', 'kink'"),
+        (lambda: systems.sine_gordon(frequency=1.0), "`frequency` must be between 0 and 1, of a breather"),
+        (lambda: systems.sine_gordon("kink", velocity=1.0), "`velocity` must be a number between"),
         (lambda: systems.sine_gordon(length=math.inf), "`length` must be positive"),
         (lambda: systems.phi4(accuracy=3), "`accuracy` must be 2, 4 or 6"),
         (lambda: systems.phi4(n=4), "`n` must be a whole number"),

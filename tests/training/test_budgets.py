@@ -10,8 +10,6 @@ import torch
 
 import sympflow
 from sympflow import Box, HamiltonianSystem, SympFlow, systems, train
-from sympflow.flow import weights
-from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.primed import PrimedFlow
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.kernels.network_tangents import NetworkTangents
@@ -233,37 +231,6 @@ def test_a_domain_whose_squares_overflow_is_refused():
 
 
 # memory -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"hidden": (10**6, 10**6)}, r"^`hidden` \(1000000, 1000000\) with `pairs` 3 would take 4\.47e\+04 GiB"),
-        ({"hidden": (10**6, 10**6), "kind": "mlp"}, r"^`hidden` .* would take .* GiB of memory, and this machine has"),
-        ({"pairs": 10**9}, r"^`pairs` must be at most 500, as many as a file may hold; got 1000000000"),
-        ({"stages": 10**6}, r"^`stages` must be at most 499"),
-        ({"processor": 10**6}, r"^`processor` must be at most 499"),
-        ({"points": 10**12, "stages": 2, "dt": 0.5}, r"^`points` 1000000000000, .* would take .* GiB.*: take fewer"),
-        ({"points": 10**12, "kind": "sympflow"}, r"^`points` 1000000000000 .* would take .* GiB.*: take fewer"),
-        (
-            {"points": 10**10, "kind": "sympflow", "optimizer": "gauss-newton"},
-            r"^`(points|optimizer)` .* would take .* GiB",
-        ),
-    ],
-)
-def test_what_the_memory_cannot_hold_is_refused_before_it_is_asked_for(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        train(PENDULUM, **arguments)
-
-
-def test_networks_are_refused_by_their_weights(monkeypatch):
-    flow, baseline = SympFlow(2, pairs=2, hidden=(7, 5)), MLPFlow(2, hidden=(7, 5))
-    for network, make in ((flow, lambda: SympFlow(2, 2, (7, 5))), (baseline, lambda: MLPFlow(2, (7, 5)))):
-        monkeypatch.setattr(weights, "_machine_memory", lambda n=network.n_parameters: 8.0 * n)
-        make()
-        monkeypatch.setattr(weights, "_machine_memory", lambda n=network.n_parameters: 8.0 * n - 40)
-        with pytest.raises(ValueError, match=r"^`hidden` \(7, 5\).* would take .* GiB of memory"):
-            make()
 
 
 # primed flows of every H = ½ pᵀM⁻¹p + V(q) --------------------------------------------------------------------

@@ -39,6 +39,7 @@ for system, method, y0, options, t_end in cases:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends the process there")
 def test_compiled_runs_can_be_interrupted():
     found = subprocess.run([sys.executable, "-c", SCRIPT], check=False, capture_output=True, text=True, timeout=120)

@@ -29,7 +29,7 @@ def test_states_have_the_density_of_the_lattice_at_every_size():
     large = ring(400, domain=LatticeStates(0.2)).domain
     assert large is not None
     many = large.sample(20)
-    few = ring(400, domain=LatticeStates(0.2)).piece(8).domain
+    few = ring(400, domain=LatticeStates(0.2)).subsystem(8).domain
     of_large, of_few = (s.system.energy_density(x).mean(-1) for s, x in ((large, many), (few, few.sample(2000))))
     # a gamma distribution of as many oscillators: relative spreads d^(-1/2), of the mean over n states (d n)^(-1/2)
     for density, d in ((of_large, 400), (of_few, 8)):
@@ -44,20 +44,20 @@ def test_states_have_the_density_of_the_lattice_at_every_size():
 
 def test_a_piece_has_the_states_of_the_lattice():
     y0 = LatticeStates(0.3, ring(200)).sample(1)[0]
-    low, high = ring(200, y0=y0).piece(8).domain.bounds
+    low, high = ring(200, y0=y0).subsystem(8).domain.bounds
     assert low == pytest.approx(0.3, rel=0.3)
     assert high == pytest.approx(low, rel=1.0)
-    of_box = ring(6, domain=Box([-0.5] * 12, [0.5] * 12)).piece().domain
+    of_box = ring(6, domain=Box([-0.5] * 12, [0.5] * 12)).subsystem().domain
     assert 0.01 < of_box.bounds[0] < of_box.bounds[1] < 1
     large = ring(200)
     fitted = LatticePiece.of(large, LatticeStates((0.1, 0.3)).of(large))
     assert fitted.domain.bounds == (0.1, TAIL * 0.3)  # a few neighbours have more than all of them
     assert fitted.states.bounds == (0.1, 0.3)
-    assert ring(200).piece(8).domain is None
-    with pytest.raises(TypeError, match=r"^`system` 'custom' is no lattice"):
-        HamiltonianSystem.from_sympy("p**2/2 + q**2/2").piece()
+    assert ring(200).subsystem(8).domain is None
+    with pytest.raises(TypeError, match=r"^`system` 'custom' is not a lattice"):
+        HamiltonianSystem.from_sympy("p**2/2 + q**2/2").subsystem()
     with pytest.raises(ValueError, match=r"^`sites` must be one to 3 positive integers"):
-        ring(200).piece(0)
+        ring(200).subsystem(0)
     with pytest.raises(ValueError, match=r"^`density` must be positive"):
         LatticeStates((0.3, 0.2))
     with pytest.raises(ValueError, match="`domain` is not known"):
@@ -99,6 +99,7 @@ def test_a_flow_serves_every_shape(flow, tmp_path):
     assert sympflow.load(tmp_path / "flow.safetensors", system=ring(12)).system.ndof == 12
 
 
+@pytest.mark.slow
 def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
     """With the table that they found at Δt, which the numbers at shorter times lead to."""
     monkeypatch.setattr(table_fit, "RUN_STEPS", 8)
@@ -116,6 +117,7 @@ def test_a_fit_to_long_runs_keeps_the_energy_of_other_states(flow, monkeypatch):
     np.testing.assert_allclose(*numbers, atol=0.02)
 
 
+@pytest.mark.slow
 def test_runs_alone_ask_for_a_primed_flow():
     """As the page on large systems has it: no other option says so."""
     with pytest.warns(RuntimeWarning):  # wherever the time is up
@@ -138,6 +140,7 @@ def test_a_table_that_overflowed_is_as_bad_as_can_be(flow):
     np.testing.assert_array_equal(runs.residuals(theta), before)
 
 
+@pytest.mark.slow
 def test_long_runs_are_of_lattices_that_keep_their_energy(flow):
     lattice = ring(domain=LatticeStates(0.2))
     with pytest.raises(ValueError, match=r"^`runs` must be a positive integer; got 0"):

@@ -5,7 +5,7 @@ import sys
 import pytest
 from conftest import load_example
 
-from sympflow import Box, EnergySublevel, HamiltonianSystem, systems, train
+from sympflow import Box, EnergySublevel, HamiltonianSystem, systems
 from sympflow.flow.primed import PrimedFlow
 
 
@@ -26,12 +26,6 @@ def test_own_system_in_a_minute(monkeypatch, capsys):
     rows = {line.split()[0]: line.split() for line in out.splitlines() if line.endswith("×")}
     assert {"the", "kahan_li8", "blanes_moan4"} == set(rows)
     assert rows["the"][-1] == "1.00×"
-
-
-def test_a_search_is_refused_for_a_kinetic_energy_that_it_does_not_fit():
-    relativistic = HamiltonianSystem.from_sympy("sqrt(1+p**2)+q**2/2", domain=Box([-1, -1], [1, 1]), y0=[0.5, 0])
-    with pytest.raises(ValueError, match=r"^`restarts` is of the search .*leave it out for a network, or pass"):
-        train(relativistic, restarts=2)
 
 
 def test_an_empty_sublevel_is_named_as_the_cause():

@@ -25,6 +25,7 @@ def test_shares_of_what_a_step_moves_are_the_same_in_all_units():
     assert shares_missed(np.full_like(y, np.nan), labels, unit) == (np.inf, np.inf)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The fit has a larger held-out error")  # than equal steps, which are as bad
 def test_a_flow_that_misses_most_of_a_step_comes_with_a_warning():
     """The two-body problem in a box around its singularity, and a kink that Δt = 10 of three periods steps over."""

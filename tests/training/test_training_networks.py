@@ -192,7 +192,7 @@ def test_data_is_used_and_a_tenth_of_it_held_out():
     arguments |= {"pairs": 2, "points": 300}
     flow = train(OSCILLATOR, data=(t, x, y), **arguments)
     assert flow.figures["one_step_error"] < flow.history[0]["one_step_error"] / 5
-    with pytest.warns(UserWarning, match=r"^`data` are no labels of the system 'harmonic_oscillator'"):
+    with pytest.warns(UserWarning, match=r"^`data` are not labels of the system 'harmonic_oscillator'"):
         other = train(OSCILLATOR, data=(t, torch.tensor(x), -y), **{**arguments, "steps": 2})
     assert flow.unfitted == other.unfitted == ()  # labels at random times leave no gap
     assert other.recipe["stages"][0]["data"] != flow.recipe["stages"][0]["data"]
@@ -290,19 +290,6 @@ def test_labels_are_a_function_of_seed_and_draw():
 
 
 # what train() chooses --------------------------------------------------------------------------------------------
-
-
-def test_what_is_refused():
-    for arguments, message in (
-        ({"optimizer": "lbfgs", "learning_rate": 1e-3}, "`learning_rate` is not an option of the optimizer 'lbfgs'"),
-        ({"optimizer": "gauss-newton", "restarts": 3}, "`restarts` is not an option of the .* kind 'sympflow'"),
-        ({"optimizer": "gauss-newton", "dtype": torch.float32}, "`optimizer` 'gauss-newton' fits flows in float64"),
-        ({"stages": 3}, "`stages` is not an option of flows of kind 'sympflow'"),
-    ):
-        with pytest.raises(TypeError, match=rf"^{message}"):
-            train(HH, **arguments, **QUICK)
-    with pytest.raises(TypeError, match=r"^`pairs` is not an option of flows of kind 'primed'"):
-        train(HH, stages=3, pairs=2)
 
 
 def test_other_systems_get_a_network():
