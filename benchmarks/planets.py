@@ -36,7 +36,7 @@ METHODS = {
     "wisdom_holman, corrector 17": ("wisdom_holman", {"corrector": 17}, ("whfast", {"corrector": 17})),
     "kepler_aba864": ("kepler_aba864", {}, ("saba", {"type": "8_6_4"})),
     "kepler_aba1064": ("kepler_aba1064", {}, ("saba", {"type": "10_6_4"})),
-    "chin4a, splitting 'kepler'": ("chin4a", {"splitting": "kepler"}, ("whckl", {})),
+    "kepler_takahashi_imada, corrector 17": ("kepler_takahashi_imada", {"corrector": 17}, ("whckl", {})),
     "srkn11b": ("srkn11b", {}, ("whfast512", {"corrector": 17})),
 }
 """Ours, with options, and an integrator of REBOUND, of the same scheme where there is one, with attributes."""
