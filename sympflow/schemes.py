@@ -555,9 +555,9 @@ _TABLE = (
         "takahashi_imada",
         2,
         _drift_first((0.5, 0.5), (1.0,)),
-        "M. Takahashi and M. Imada, Monte Carlo calculation of quantum systems, II: higher order correction, J. Phys. Soc. "
-        "Japan 53 (1984) 3765–3769; of order 4 in other coordinates: G. Rowlands, A numerical algorithm for Hamiltonian "
-        "systems, J. Comput. Phys. 97 (1991) 235–239",
+        "M. Takahashi and M. Imada, Monte Carlo calculation of quantum systems, II: higher order correction, J. Phys. "
+        "Soc. Japan 53 (1984) 3765–3769; of order 4 in other coordinates: G. Rowlands, A numerical algorithm for "
+        "Hamiltonian systems, J. Comput. Phys. 97 (1991) 235–239",
         gradients={1: 1.0 / 12.0},
     ),
     _scheme(
