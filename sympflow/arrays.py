@@ -320,6 +320,21 @@ def rows_of_nan(n: int, y: Array) -> Array:
     return np.moveaxis(np.full((*y.shape[:-1], n, y.shape[-1]), np.nan, dtype=y.dtype), -2, 0)
 
 
+def with_rows(y: Array, rows: Any, values: Array) -> Array:
+    """Return y with other rows, given by a slice or their numbers: the same array, or a tensor with its graph."""
+    if is_tensor(y):
+        import torch
+
+        return y.index_copy(0, torch.arange(len(y), device=y.device)[rows], values)
+    y[rows] = values
+    return y
+
+
+def known_finite(y: Array) -> bool:
+    """Return True if an array is finite all over; of tensors that is not looked for."""
+    return not is_tensor(y) and bool(np.isfinite(y).all())
+
+
 def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
     """Return f(x) and its derivative at the tensor x along v, by torch, without the warnings that its set-up gives.
 

@@ -30,6 +30,7 @@ from sympflow.arrays import (
     finite_states,
     full_of_nan,
     is_tensor,
+    known_finite,
     lanes,
     last,
     readable,
@@ -544,13 +545,13 @@ def _check_outcome(outcome: Any, integrator: Integrator, y0: Array) -> None:
             f"`method` {integrator.name!r} must answer with an Outcome that has an integer status, t of shape (n,) and "
             f"y of shape (n, *y0.shape); got {what}. Mend its run(): check_integrator tests it."
         )
-    if outcome.finite or (not is_tensor(outcome.y) and np.isfinite(outcome.y).all()):
+    if outcome.finite or known_finite(outcome.y):
         return
     finite = finite_states(outcome.y)
     bad = ~finite.all(0) & (np.asarray(outcome.status) >= 0)
     if not bad.any():
         return
-    if is_tensor(outcome.y) and lanes(outcome.y):
+    if lanes(outcome.y):
         report_lanes(outcome, finite, Failure.NON_FINITE)
         return
     first = int(np.argmin(finite[(slice(None), *np.argwhere(bad)[0])] if bad.ndim else finite))

@@ -2,7 +2,9 @@
 
 import gc
 import importlib.util
+import json
 import os
+import struct
 from pathlib import Path
 
 import pytest
@@ -83,3 +85,29 @@ class Clock:
 def clock(monkeypatch):
     """A clock that a test of budgets sets, in place of that of the machine."""
     return Clock(monkeypatch)
+
+
+def record(path):
+    """The record in the file of a flow."""
+    content = path.read_bytes()
+    (length,) = struct.unpack("<Q", content[:8])
+    return json.loads(json.loads(content[8 : 8 + length])["__metadata__"]["sympflow"])
+
+
+def tampered(
+    path, change_record=lambda record: None, change_tensors=lambda tensors: None, *, rechecked=True, altered=False
+):
+    """The file with another record or other tensors, and with checksums that fit them unless it is said otherwise."""
+    from safetensors.torch import load_file, save_file
+
+    from sympflow.flow.records import KEY, SUM, text_checksum
+    from sympflow.flow.weights import checksum
+
+    notes, tensors = record(path), load_file(path)
+    change_record(notes)
+    change_tensors(tensors)
+    if "checksum" in notes:
+        notes["checksum"] = checksum(tensors) if rechecked else notes["checksum"]
+    text, kept = json.dumps(notes), json.dumps(record(path), separators=(",", ":"))
+    save_file(tensors, path, {KEY: text, SUM: text_checksum(kept if altered else text)})
+    return path

@@ -23,6 +23,10 @@ def learn(
     noise: Annotated[float | None, typer.Option(help="Standard deviation of the data. Default: estimated.")] = None,
     period: Annotated[float | None, typer.Option(help="Of all q, if these are angles.")] = None,
     damping: Annotated[bool, typer.Option("--damping", help="Learn a rate of friction as well.")] = False,
+    drag: Annotated[bool, typer.Option("--drag", help="Learn quadratic drag in place of that.")] = False,
+    drive: Annotated[
+        str | None, typer.Option(help="Learn a drive as well: its angular frequency, about, or find.")
+    ] = None,
     separable: Annotated[
         bool | None,
         typer.Option("--separable/--not-separable", help="H = T(p) + V(q), or known not to be. Default: by the data."),
@@ -83,7 +87,8 @@ def learn(
             period=period,
             separable=separable,
             mass=_masses(mass),
-            damping=damping,
+            damping="quadratic" if drag else damping,
+            drive=_drive(drive),
             known=_known(known),
             family=family,
             loss=loss,
@@ -134,6 +139,16 @@ def _masses(given: str | None) -> float | list[float] | None:
     except ValueError:
         raise ValueError(f"`--mass` must be a number, or numbers with commas, as 1,2.5; got {given!r}.") from None
     return masses[0] if len(masses) == 1 else masses
+
+
+def _drive(word: str | None) -> bool | float:
+    """The angular frequency of a drive, True for one that is to be found."""
+    if word is None or word == "find":
+        return word is not None
+    try:
+        return float(word)
+    except ValueError:
+        raise ValueError(f"`--drive` must be an angular frequency, or find; got {word!r}.") from None
 
 
 def _known(word: str | None) -> HamiltonianSystem | None:

@@ -55,6 +55,23 @@ class Polynomial(Number):
         return self.terms.get(()) if len(self.terms) == 1 else None
 
 
+class _Body(Recording):
+    """Recorded operations on states; of each number, when its value is known, in cycles."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.known: dict[int, int] = {}
+
+    def record(self, name: str, args: Sequence[Any]) -> Any:
+        value = super().record(name, args)
+        if isinstance(value, Traced) and value.name in FUNCTIONS and value.order not in self.known:
+            self.known[value.order] = max(map(self.depth, value.args)) + FUNCTIONS[value.name].cost
+        return value
+
+    def depth(self, x: Any) -> int:
+        return self.known.get(x.order, ALWAYS) if isinstance(x, Traced) else ALWAYS
+
+
 class Plan(NamedTuple):
     """A way to compute a polynomial: when it is known, in cycles, how many operations it takes, and what writes it."""
 
@@ -77,9 +94,9 @@ class Arrangement:
 
     def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = (), expand: bool = True) -> None:
         self._expand = expand
-        self._table, self._body = Recording(), Recording()
+        self._table, self._body = Recording(), _Body()
         self._constants = [self._table.input(name) for name in constants]
-        self._known: dict[int, int] = {}
+        self._known = self._body.known
         self._nodes: dict[int, Traced] = {}
         self._entries: dict[int, Traced] = {}
         self._from_table: list[Traced] = []
@@ -216,19 +233,12 @@ class Arrangement:
     # the body -----------------------------------------------------------------------------------------------------
 
     def operation(self, name: str, *args: Any) -> Any:
-        """An operation of the body, and when its value is known."""
-        value = self._body.record(name, args)
-        if isinstance(value, Traced) and value.order not in self._known:
-            ready = max(self.depth(a) for a in value.args)
-            self._known[value.order] = ready + FUNCTIONS[value.name].cost
-            for a in value.args:  # of an operation that was simplified into several
-                if isinstance(a, Traced) and a.order not in self._known:
-                    self._known[a.order] = ready
-        return value
+        """An operation of the body."""
+        return self._body.record(name, args)
 
     def depth(self, x: Any) -> int:
         """When a number of the body is known, in cycles; constants always were."""
-        return self._known.get(x.order, ALWAYS) if isinstance(x, Traced) else ALWAYS
+        return self._body.depth(x)
 
     def coefficient(self, c: Any) -> Any:
         """A coefficient as a number of the body."""

@@ -20,20 +20,11 @@ __all__ = ["FUNCTIONS", "Function", "added", "apply", "dot", "fma", "is_zero", "
 
 @dataclass(frozen=True)
 class Function:
-    """A function of real numbers.
+    """A function of real numbers: of arrays by `numpy`, of tensors by its name in torch or a function of these.
 
-    Attributes
-    ----------
-    numpy : callable
-        Of arrays.
-    tensor : str or callable
-        Its name in torch, or the function of tensors.
-    partials : callable, optional
-        Of the value y and the arguments x…: the derivative by each argument, 0.0 where it is none.
-    cost : int
-        When its value is known, in cycles of a typical processor: the same on every machine, so that programs are.
-    infix : str
-        Its sign between two arguments, as a program prints it.
+    ``partials(y, *x)``, with its value y: the derivative by each argument, 0.0 where it is none. `cost` tells when its
+    value is known, in cycles of a typical processor: the same on every machine, so that programs are. `infix` is its
+    sign between two arguments, as a program prints it.
     """
 
     numpy: Callable[..., Any]

@@ -58,13 +58,6 @@ def compiled(text: str, name: str, signature: Any) -> Any:
 
     The machine code is kept in this process, and in a folder for the next one: the first of SYMPFLOW_CACHE_DIR and the
     user's cache directory that can be written. A file there begins with the digest of the rest.
-
-    Parameters
-    ----------
-    text : str
-    name : str
-        Of the function in the text.
-    signature : ctypes function type
     """
     key = hashlib.sha256("\0".join([text, *map(str, host()), llvm.llvm_version_info.__repr__()]).encode()).hexdigest()
     with _LOCK:

@@ -273,12 +273,31 @@ def traced(function: Callable[..., Sequence[Any]], *names: str) -> Program:
 
 
 def _partials(x: Traced) -> Iterator[tuple[Traced, Any]]:
+    base, *rest = x.args
+    if x.name == "pow" and isinstance(base, Traced) and base.name == "sqrt" and isinstance(rest[0], float):
+        yield (
+            base.args[0],
+            0.5 * rest[0] * base ** (rest[0] - 2.0),
+        )  # where that of the root is infinite, it need not be
+        return
     rule = FUNCTIONS[x.name].partials
     if rule is None:
         return
     for a, slope in zip(x.args, rule(x, *x.args), strict=True):
         if isinstance(a, Traced) and not _is(slope, 0.0):
             yield a, slope
+
+
+def _through(slope: Any, partial: Any) -> Any:
+    """The product of two derivatives, 0 where a choice makes one of them 0, even if the other is no number there."""
+    for x, y in ((slope, partial), (partial, slope)):
+        if isinstance(x, Traced) and x.name == "where":
+            condition, a, b = x.args
+            if _is(a, 0.0):
+                return apply("where", condition, 0.0, _through(b, y))
+            if _is(b, 0.0):
+                return apply("where", condition, _through(a, y), 0.0)
+    return slope * partial
 
 
 def gradient(y: Any, x: Sequence[Traced]) -> list[Any]:
@@ -294,7 +313,7 @@ def gradient(y: Any, x: Sequence[Traced]) -> list[Any]:
             continue
         for a, partial in _partials(number):
             if a.order in depends:
-                slopes[a.order] = slopes.get(a.order, 0.0) + slope * partial
+                slopes[a.order] = slopes.get(a.order, 0.0) + _through(slope, partial)
     return [slopes.get(s.order, 0.0) for s in x]
 
 
@@ -306,7 +325,7 @@ def tangent(outputs: Sequence[Any], x: Sequence[Traced], v: Sequence[Any]) -> li
             total: Any = 0.0
             for a, partial in _partials(number):
                 if a.order in dots:
-                    total = total + partial * dots[a.order]
+                    total = total + _through(partial, dots[a.order])
             dots[number.order] = total
     return [dots.get(y.order, 0.0) if isinstance(y, Traced) else 0.0 for y in outputs]
 
@@ -331,7 +350,7 @@ def adjoint(program: Program) -> Program:
         for number in reversed(program.operations):
             if number.order in within and number.order in slopes:
                 for a, partial in _slopes_of(number, within):
-                    slopes[a.order] = slopes.get(a.order, 0.0) + slopes[number.order] * partial
+                    slopes[a.order] = slopes.get(a.order, 0.0) + _through(slopes[number.order], partial)
         found.append(fused(Program([*program.inputs, *cotangents], [slopes.get(x.order, 0.0) for x in program.inputs])))
     return min(found, key=lambda each: 2 * _waiting(each, cotangents) + 3 * len(each))
 
@@ -347,7 +366,7 @@ def _slopes_of(y: Traced, ends: set[int]) -> Iterator[tuple[Traced, Any]]:
             yield number, slope
             continue
         for a, partial in _partials(number):
-            slopes[a.order], known[a.order] = slopes.get(a.order, 0.0) + slope * partial, a
+            slopes[a.order], known[a.order] = slopes.get(a.order, 0.0) + _through(slope, partial), a
 
 
 def _waiting(program: Program, late: Sequence[Traced]) -> int:

@@ -117,26 +117,11 @@ class Certificate:
         ValueError
             If the description is not one of a certificate.
         """
-        names = {f.name for f in fields(cls)}
         if isinstance(description, dict):
             description = {"relative_limit": None, **description}
-        if not isinstance(description, dict) or set(description) != names:
+        if not isinstance(description, dict) or set(description) != {f.name for f in fields(cls)}:
             raise ValueError("`description` is not one of a certificate: compute it again by flow.certificate(system).")
-        values: dict[str, Any] = {}
-        for f in fields(cls):
-            value, kind = description[f.name], str(f.type)
-            if kind == "Quantiles":
-                if not isinstance(value, dict) or set(value) != {q.name for q in fields(Quantiles)}:
-                    raise ValueError(f"`description` has a {f.name} that is not made of quantiles: {value!r}.")
-                value = Quantiles(**{q: _number(q, math.inf if v is None else v) for q, v in value.items()})
-            elif kind == "float | None":
-                value = None if value is None else _number(f.name, value)
-            elif kind == "float":
-                value = _number(f.name, value)
-            elif type(value).__name__ != kind:
-                raise ValueError(f"`description` has a {f.name} that is no {kind}: {value!r}.")
-            values[f.name] = value
-        return cls(**values)
+        return cls(**{f.name: _checked(f.name, str(f.type), description[f.name]) for f in fields(cls)})
 
     def __str__(self) -> str:
         rows = (
@@ -159,6 +144,19 @@ class Certificate:
                 f"estimated bound on |H − H₀| at T, while in Ω: {self.bound(self.t_end):.1e} (δ: the largest found)",
             )
         )
+
+
+def _checked(name: str, kind: str, value: Any) -> Any:
+    """The value of a field of that kind; else it is refused."""
+    if kind == "Quantiles":
+        if not isinstance(value, dict) or set(value) != {q.name for q in fields(Quantiles)}:
+            raise ValueError(f"`description` has a {name} that is not made of quantiles: {value!r}.")
+        return Quantiles(**{q: _number(q, math.inf if v is None else v) for q, v in value.items()})
+    if kind.startswith("float"):
+        return None if value is None and "None" in kind else _number(name, value)
+    if type(value).__name__ != kind:
+        raise ValueError(f"`description` has a {name} that is no {kind}: {value!r}.")
+    return value
 
 
 def _number(name: str, value: Any) -> float:

@@ -154,13 +154,8 @@ class ClockedFlow(SystemFlow):
                 "`system` is not a logarithmic Hamiltonian: make one by sympflow.time_transformed(system)."
             )
 
-    @property
-    def dtype(self) -> torch.dtype:
-        return self.clock.numbers.dtype
-
-    @property
-    def device(self) -> torch.device:
-        return self.clock.numbers.device
+    def _number(self) -> Tensor:
+        return self.clock.numbers
 
     def advance(self, s: Any, B: Any) -> Any:
         """Return by how much the clock puts the time forward in steps s at B: numbers or arrays; s may be negative."""
@@ -191,7 +186,6 @@ class ClockedFlow(SystemFlow):
 
     @classmethod
     def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        """Return a flow that has no system yet: `bind` will give it one."""
         described = plan["clocked"]
         if not isinstance(described, dict) or not isinstance(described.get("scheme"), str):
             raise Refused("its scheme is missing")

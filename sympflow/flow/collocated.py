@@ -23,7 +23,7 @@ from torch import Tensor
 from sympflow.arguments import floats, plain
 from sympflow.arrays import per_state
 from sympflow.flow.flow_map import check_system
-from sympflow.flow.layers import Layer
+from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time
 from sympflow.flow.records import Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
@@ -43,19 +43,10 @@ TOLERANCE = 1e-10
 """Error of ψ̄_Δt that 99 % of the states stay below, in units of their spread, 1 where they have none."""
 
 
-class CollocationLayer(Layer):
+class CollocationLayer(OwnLayer):
     """One step χ_{t/m} of a Gauss method."""
 
     kind = "collocation"
-
-    def __init__(self, flow: CollocatedFlow) -> None:
-        super().__init__()
-        self.ndof = flow.ndof
-        self._of = (flow,)  # in a tuple: a layer does not own its flow
-
-    @property
-    def flow(self) -> CollocatedFlow:
-        return self._of[0]
 
     def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         return self._step(t / self.flow.steps, q, p)
@@ -175,7 +166,6 @@ class CollocatedFlow(SystemFlow):
 
     @classmethod
     def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        """Return a flow that has no system yet: `bind` will give it one."""
         described = plan["collocated"]
         if not isinstance(described, dict):
             raise Refused("its plan of a collocated flow is missing")

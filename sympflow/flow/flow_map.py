@@ -34,6 +34,7 @@ if TYPE_CHECKING:  # a flow needs it only to be compiled
 
 DRAWN, DRAWN_STEPS = 4, 400  # orbits of a figure, and their steps
 MAX_STEPS = 10_000_000  # of one call
+NO_NUMBER = torch.empty(0, dtype=torch.float64)
 MEAN_TIMES = (0.5 - 0.75**0.5 / 3, 0.5 + 0.75**0.5 / 3)  # in Δt, at which 𝓗 is averaged: Gauss's
 
 
@@ -323,15 +324,19 @@ class FlowMap(KnownFlow, Shown, nn.Module):
 
     # its numbers -------------------------------------------------------------------------------------------
 
+    def _number(self) -> Tensor:
+        """One of its numbers."""
+        return next(chain(self.parameters(), self.buffers()), NO_NUMBER)
+
     @property
     def dtype(self) -> torch.dtype:
         """The dtype of its numbers; float64 if it has none."""
-        return next((w.dtype for w in chain(self.parameters(), self.buffers())), torch.float64)
+        return self._number().dtype
 
     @property
     def device(self) -> torch.device:
         """The device of its numbers; the CPU if it has none."""
-        return next((w.device for w in chain(self.parameters(), self.buffers())), torch.device("cpu"))
+        return self._number().device
 
     @property
     def n_parameters(self) -> int:

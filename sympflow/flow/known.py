@@ -12,7 +12,7 @@ import numpy as np
 from sympflow.arrays import is_tensor, values
 from sympflow.flow.records import Provenance
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
-from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, same_system, without_friction
+from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, recognised, without_friction
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
@@ -34,9 +34,7 @@ class Origin:
 
     def is_of(self, system: HamiltonianSystem) -> bool:
         """Return True for that system, which is recognised by its H."""
-        if not same_system(self.fingerprint, system.fingerprint):
-            return False
-        return self.identity is None or self.identity.agrees(system)
+        return recognised(self.fingerprint, self.identity, system)
 
 
 class _Told:
@@ -112,7 +110,7 @@ class KnownFlow:
         small = self.known_by(system)
         if small.ndof != self.kept_ndof:
             return False
-        return same_system(mine, small.fingerprint) and (self.identity is None or self.identity.agrees(small))
+        return recognised(mine, self.identity, small)
 
     def check_ends(self, system: HamiltonianSystem) -> None:
         """Refuse a lattice with ends of a kind at which the numbers of the flow do not hold."""

@@ -72,6 +72,19 @@ class Layer(nn.Module):
         return None
 
 
+class OwnLayer(Layer):
+    """A layer that is made of what its flow knows."""
+
+    def __init__(self, flow: Any) -> None:
+        super().__init__()
+        self.ndof = flow.ndof
+        self._of = (flow,)  # in a tuple: a layer does not own its flow
+
+    @property
+    def flow(self) -> Any:
+        return self._of[0]
+
+
 class Binding:
     """The system whose functions a flow evaluates, shared by its copies; `made` is its use, for messages."""
 

@@ -52,7 +52,9 @@ class MLPFlow(FlowMap):
         super().__init__(ndof, dt)
         dtype, device = checked_dtype(dtype), checked_device(device)
         if hidden is None:
-            hidden = _default_widths(ndof)
+            hidden = matching_widths(ndof, SympFlow(ndof, device="meta").n_parameters)
+        if hidden is None:
+            raise ValueError(f"`hidden` has no default for {ndof} degrees of freedom: give the widths, as by (30, 30).")
         self.hidden, self.activation = hidden_widths(hidden), activation
         self._sigma = activation_named(activation)
         weights = count_weights(2 * ndof, self.hidden) - self.hidden[-1] + 2 * ndof * (self.hidden[-1] + 1)
@@ -161,11 +163,3 @@ def matching_widths(ndof: int, target: int) -> tuple[int, ...] | None:
     one = [(max(1, round((target - 2 * d) / (4 * d + 2))),)]
     candidates: list[tuple[int, ...]] = [*filter(fits, two), *filter(fits, one)]
     return min(candidates, key=lambda widths: (-len(widths), abs(widths[0] - widths[-1])), default=None)
-
-
-def _default_widths(ndof: int) -> tuple[int, ...]:
-    target = SympFlow(ndof, device="meta").n_parameters
-    widths = matching_widths(ndof, target)
-    if widths is None:
-        raise ValueError(f"`hidden` has no default for {ndof} degrees of freedom: give the widths, as by (30, 30).")
-    return widths

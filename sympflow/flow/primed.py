@@ -185,7 +185,6 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     @classmethod
     def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        """Return a flow that has no system yet: `bind` will give it one."""
         return cls(ndof, PrimedShape.from_dict(plan["primed"], ndof), dt, dtype=dtype)
 
     def architecture(self) -> dict[str, Any]:
@@ -198,14 +197,6 @@ class PrimedFlow(PrimedKnown, SystemFlow):
     @property
     def processor(self) -> int:
         return self.shape.processor
-
-    @property
-    def dtype(self) -> torch.dtype:
-        return self._number().dtype
-
-    @property
-    def device(self) -> torch.device:
-        return self._number().device
 
     def _number(self) -> Tensor:
         """One of its parameters, found without the detours of a module's attributes."""

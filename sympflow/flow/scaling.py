@@ -69,13 +69,7 @@ class Scaling(_Units):
         return (*self.q, *self.p)
 
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "q": list(self.q),
-            "p": list(self.p),
-            "t": self.t,
-            "q_center": list(self.q_center),
-            "p_center": list(self.p_center),
-        }
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in self._asdict().items()}
 
     @classmethod
     def from_dict(cls, description: dict[str, Any]) -> Scaling:

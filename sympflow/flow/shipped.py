@@ -17,7 +17,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sympflow.hamiltonian.fingerprint import Identity, same_system, without_friction
+from sympflow.hamiltonian.fingerprint import Identity, recognised, without_friction
 
 if TYPE_CHECKING:
     from sympflow.flow.known import KnownFlow
@@ -110,10 +110,7 @@ class ShippedFlow:
 
     def is_of(self, system: HamiltonianSystem) -> bool:
         """Return True for a flow of that system, in whatever time, which is recognised by its H."""
-        small = self._known_by(system)
-        if not same_system(self.fingerprint, small.fingerprint):
-            return False
-        return self.identity is None or self.identity.agrees(small)
+        return recognised(self.fingerprint, self.identity, self._known_by(system))
 
     def _known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
         """The system by which a flow of this kind knows a system: see `FlowMap.known_by`."""

@@ -23,10 +23,11 @@ from sympflow.arrays import jvp, to_numpy
 from sympflow.flow.coefficients import Column
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.known import UNCOMPENSATED
-from sympflow.flow.layers import Layer
+from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
+from sympflow.flow.tables import Memory
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
@@ -42,25 +43,20 @@ FILTERED = ("oscillator", "hyperbolic")
 """The kinds of modes that filters act on; others pass."""
 
 
-class KeptMaps:
+class KeptMaps(Memory):
     """The maps of fixed numbers, the same objects for the same step, and what they cost; `placement` is asked once."""
 
     def __init__(
         self, make: Callable[[np.ndarray], list[SubFlow]], coefficients: list[SubFlow], dt: float, like: Tensor
     ) -> None:
+        super().__init__(MOST_KEPT)
         self._make, self._dt = make, dt
         self.kernel: SplitFlowKernel | None = None  # the compiled loops that were made of these last
         self._coefficients = coefficients, [m.inverse() for m in reversed(coefficients)]
         self.placement = like.dtype, like.device
-        self._maps: dict[float, list[SubFlow]] = {}
-        self._counts: dict[tuple[int, int, int, str], dict[str, int]] = {}
 
     def maps(self, t: float) -> list[SubFlow]:
-        if t not in self._maps:
-            if len(self._maps) >= MOST_KEPT:
-                self._maps.clear()
-            self._maps[t] = self._make(np.array(t))
-        return self._maps[t]
+        return self.kept(t, lambda: self._make(np.array(t)))
 
     def coefficients(self, back: bool) -> list[SubFlow]:
         """Return the maps at all t, or those of the inverse: see `PartsKernel.step_by_coefficients`."""
@@ -68,26 +64,16 @@ class KeptMaps:
 
     def evaluations(self, *run: Any) -> dict[str, int]:
         """Count slopes of parts, and force gradients, of a run: `FlowMap.evaluations`."""
-        if run not in self._counts:
-            if len(self._counts) >= MOST_KEPT:
-                self._counts.clear()
-            self._counts[run] = map_evaluations(self.maps(self._dt), *run)
-        return dict(self._counts[run])
+        return dict(self.kept(run, lambda: map_evaluations(self.maps(self._dt), *run)))
 
 
-class SplitLayer(Layer):
+class SplitLayer(OwnLayer):
     """The exact flow of a part of H, times functions of t; `index` is its place in the flow."""
 
     def __init__(self, flow: SplitFlow, index: int) -> None:
-        super().__init__()
-        self.ndof, self.index = flow.ndof, index
-        self.part = flow.sequence[index]
+        super().__init__(flow)
+        self.index, self.part = index, flow.sequence[index]
         self.kind = "linear" if self.part == LINEAR else flow.kinds[self.part - 1]  # type: ignore[misc]
-        self._of = (flow,)  # in a tuple: a layer does not own its flow
-
-    @property
-    def flow(self) -> SplitFlow:
-        return self._of[0]
 
     def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         return self._apply_map(self.flow.maps(t)[self.index], q, p)
@@ -237,7 +223,6 @@ class SplitFlow(SystemFlow):
 
     @classmethod
     def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        """Return a flow that has no system yet: `bind` will give it one."""
         shape = _checked_plan(plan["split"])
         return cls(ndof, dt=dt, dtype=dtype, **shape)
 
@@ -246,13 +231,8 @@ class SplitFlow(SystemFlow):
         groups = (self.linear, self.weights, self.filters, self.gradients)
         return [column for group in groups for column in group if isinstance(column, Column)]
 
-    @property
-    def dtype(self) -> torch.dtype:
-        return self._maps.first().dtype
-
-    @property
-    def device(self) -> torch.device:
-        return self._maps.first().device
+    def _number(self) -> Tensor:
+        return self._maps.first()
 
     # the maps -----------------------------------------------------------------------------------------------
 

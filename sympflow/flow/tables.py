@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -116,20 +116,10 @@ class PrimedShape:
         return (*reversed(outer[-1]), *substeps_of(self.kernel, inside, 1), *outer[1])
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {
-            "first": self.first,
-            "maps": self.maps,
-            "degree": self.degree,
-            "palindromic": self.palindromic,
-            "force_gradient": self.force_gradient,
-            "processor": self.processor,
-            "curvature": self.curvature,
-            **({"monomials": [list(m) for m in self.monomials]} if self.monomials else {}),
-            **({"timed": True} if self.timed else {}),
-            **({} if self.gradient_kicks is None else {"gradient_kicks": list(self.gradient_kicks)}),
-            **({} if self.curvature_kicks is None else {"curvature_kicks": list(self.curvature_kicks)}),
-        }
+        """JSON-able, the later entries where they are not what they are by default."""
+        told = asdict(self)
+        later = {f.name: f.default for f in fields(self)[7:]}
+        return {n: list(v) if isinstance(v, tuple) else v for n, v in told.items() if n not in later or v != later[n]}
 
     @classmethod
     def from_dict(cls, plan: Any, ndof: int) -> Self:
@@ -213,10 +203,27 @@ def substeps_of(sequence: Sequence[Kind], columns: Columns, sign: int) -> list[S
     return made
 
 
-class Tables:
+class Memory:
+    """What was made of fixed numbers, each once for its key, up to so many."""
+
+    def __init__(self, most: int) -> None:
+        self._kept: dict[Any, Any] = {}
+        self._most = most
+
+    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what `make` gives, made once for each key."""
+        if key not in self._kept:
+            if len(self._kept) >= self._most:
+                self._kept.clear()
+            self._kept[key] = make()
+        return self._kept[key]
+
+
+class Tables(Memory):
     """The numbers of kicks and drifts of ψ̄_t, K_t and χ_t: at one t as a `Scheme`, at all t as polynomials."""
 
     def __init__(self, substeps: Sequence[Substep], outer: int, dt: float, monomials: Monomials = ()) -> None:
+        super().__init__(MOST_KEPT)
         last = len(substeps) - outer
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.substeps, self.dt, self.processed = substeps, dt, outer > 0
@@ -228,15 +235,6 @@ class Tables:
         self._coefficients = {id(c): c.numbers for c in columns_of(substeps)}
         self._exponents = np.array(exponents, dtype=float)
         self._even = exponents[1:2] != (1,)
-        self._kept: dict[Any, Any] = {}
-
-    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return what `make` gives, made once for each key."""
-        if key not in self._kept:
-            if len(self._kept) > MOST_KEPT:
-                self._kept.clear()
-            self._kept[key] = make()
-        return self._kept[key]
 
     def scheme(self, part: str, t: float | None, back: bool = False) -> Scheme:
         """The part at t ∈ (0, Δt], the default Δt; `back` its inverse."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -75,22 +75,39 @@ def checksum(tensors: Mapping[str, Tensor]) -> str:
     return numbers_checksum({name: value.detach().cpu().numpy() for name, value in tensors.items()})
 
 
-class Contents:
-    """The values of tensors in some modules' dictionaries, edits through `.data` included, read in microseconds."""
+class Kept(Generic[T]):
+    """Something made of tensors in some modules' dictionaries, and made anew when one of them has changed.
+
+    Their values are read from memory in microseconds, edits through `.data` included.
+    """
 
     def __init__(self, tensors: Iterable[Mapping[str, Tensor | None]]) -> None:
         self._tensors = [d for d in tensors if d]
         self._addresses: list[int] = []
         self._views: list[np.ndarray] = []
         self._shared = False  # True where the views are the memory of the tensors, which lie on the CPU
+        self._known: tuple[bytes, T] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_known": None}  # copies and pickles make their own
+
+    def _all(self) -> Iterator[Tensor]:
+        return (w for d in self._tensors for w in d.values() if w is not None)
 
     def first(self) -> Tensor:
         """Return one of the tensors."""
-        return next(w for d in self._tensors for w in d.values() if w is not None)
+        return next(self._all())
 
-    def snapshot(self) -> bytes:
-        """Return the bytes of all numbers."""
-        tensors = [w for d in self._tensors for w in d.values() if w is not None]
+    def current(self, make: Callable[[], T]) -> T:
+        """Return what `make` gave for the weights as they are now."""
+        snapshot = self._snapshot()
+        if self._known is None or self._known[0] != snapshot:
+            self._known = snapshot, make()
+        return self._known[1]
+
+    def _snapshot(self) -> bytes:
+        """The bytes of all numbers."""
+        tensors = list(self._all())
         try:
             addresses = [w.data_ptr() for w in tensors]
         except RuntimeError:  # handed in by functional_call inside torch.func: they have no memory of their own
@@ -100,25 +117,3 @@ class Contents:
             self._views = [np.ascontiguousarray(to_numpy(w)) for w in tensors]
             self._addresses, self._shared = addresses, all(w.device.type == "cpu" for w in tensors)
         return b"".join(self._views)  # type: ignore[arg-type]
-
-
-class Kept(Generic[T]):
-    """Something that is made of the weights, and made anew when one of them has changed."""
-
-    def __init__(self, tensors: Iterable[Mapping[str, Tensor | None]]) -> None:
-        self._contents = Contents(tensors)
-        self._known: tuple[bytes, T] | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_known": None}  # copies and pickles make their own
-
-    def first(self) -> Tensor:
-        """Return one of the tensors."""
-        return self._contents.first()
-
-    def current(self, make: Callable[[], T]) -> T:
-        """Return what `make` gave for the weights as they are now."""
-        snapshot = self._contents.snapshot()
-        if self._known is None or self._known[0] != snapshot:
-            self._known = snapshot, make()
-        return self._known[1]

@@ -18,7 +18,7 @@ from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, named_values, parsed
 from sympflow.hamiltonian.poles import PairsPoles, Poles
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, without_deltas
 
 MOST_AXES = 3
 MOST_NEAR = 300
@@ -32,6 +32,7 @@ SHORTEST, LONGEST, SCANNED = 1e-30, 1e30, 30001
 FAR, REACH = (10.0, 100.0), 2.0
 """Bond lengths at which V must have fallen off faster than bodies grow in number, and which a cut-off must have."""
 MOST_WRITTEN = 45
+MOST_SPELLED_PAIRS = 400
 """Differences of coordinates of two bodies up to which pairs are written out: six bodies in space."""
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
 """Pairs up to which the energy at the end of a run is always looked at, and steps beside which it costs nothing."""
@@ -173,9 +174,13 @@ class PairsHamiltonian(LocalHamiltonian):
         """True of so few bodies that their pairs are written out."""
         return self.n_bodies * (self.n_bodies - 1) // 2 * self.dim <= MOST_WRITTEN
 
-    @cached_property
+    @property
     def written(self) -> SymbolicHamiltonian | None:  # type: ignore[override]
-        if not self.is_few or self.box is not None or self.cutoff is not None:
+        return self.spelled if self.is_few else None
+
+    def in_symbols(self) -> SymbolicHamiltonian | None:
+        pairs = self.n_bodies * (self.n_bodies - 1) // 2
+        if self.box is not None or self.cutoff is not None or pairs > MOST_SPELLED_PAIRS:
             return None
         q, p = (sp.symbols(f"{name}1:{self.ndof + 1}", real=True) for name in "qp")
         masses = np.repeat(self.masses, self.dim).tolist()
@@ -251,7 +256,7 @@ class PairsHamiltonian(LocalHamiltonian):
     @property
     def slopes(self) -> list[sp.Expr]:
         """V, 2V′, 4V″ and 8V‴, derivatives by s."""
-        return [2**k * sp.diff(self.V, self.s, k) if k else self.V for k in range(4)]
+        return [without_deltas(2**k * sp.diff(self.V, self.s, k)) if k else self.V for k in range(4)]
 
     # array functions, positions (..., d) ------------------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ References
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -195,6 +195,8 @@ def _no_force(q: Array, p: Array) -> Array:
 
 class GivenForce:
     """F(q, p) of a user, written with torch functions: see `ExternalForce`."""
+
+    expressions: Sequence[Any] = ()
 
     def __init__(self, force: Force) -> None:
         self.force = force

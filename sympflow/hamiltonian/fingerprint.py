@@ -77,6 +77,11 @@ def check_for_flows(system: Hamiltonian, takes_friction: bool = False, takes_dri
         )
 
 
+def recognised(mine: Sequence[float], identity: Identity | None, system: Any) -> bool:
+    """Return True if a fingerprint, and an identity where there is one, are those of a system."""
+    return same_system(mine, system.fingerprint) and (identity is None or identity.agrees(system))
+
+
 def without_friction(mine: Sequence[float], identity: Identity | None, system: Hamiltonian) -> bool:
     """Return True if a fingerprint and an identity are those of a damped system without its friction."""
     if not system.friction or not same_system(mine, fingerprint(system)[:PROBES]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
@@ -26,6 +26,11 @@ NEWTON, FOUND = 20, 1e-12  # steps at most, and the error of a velocity relative
 
 class ExternalForce(Protocol):
     """F(q, p) in p' = −∂H/∂q + F, that no H has; of a driven system t, a number or (...), follows p."""
+
+    @property
+    def expressions(self) -> Sequence[Any]:
+        """One for each momentum; none of a function."""
+        ...
 
     def __call__(self, q: Array, p: Array, *t: Any) -> Array:
         """F: (..., d), each, to (..., d)."""
@@ -561,6 +566,11 @@ class Hamiltonian:
             return self.local.written
         form = self.form
         return form.written if isinstance(form, TracedHamiltonian) else form
+
+    @property
+    def spelled(self) -> SymbolicHamiltonian | TracedHamiltonian | None:
+        """`form`, or that of a lattice or of pairs with all terms one by one, if they are not too many; else None."""
+        return self.form if self.local is None else self.local.spelled
 
     @cached_property
     def expression(self) -> str | None:

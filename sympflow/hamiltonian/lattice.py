@@ -19,7 +19,7 @@ from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.linear_part import quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, parsed
 from sympflow.hamiltonian.poles import LatticePoles, Poles
-from sympflow.hamiltonian.symbolic import exact
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, exact
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.normal_modes import SpectralPart
@@ -204,6 +204,9 @@ class LatticeHamiltonian(LocalHamiltonian):
             return ""
         nearest = LatticePoles(self).nearest(q)
         return f"{nearest} is nearest to a place where V is infinite: take shorter steps, or another `y0`."
+
+    def in_symbols(self) -> SymbolicHamiltonian:
+        return SymbolicHamiltonian(self.written_out())
 
     def written_out(self) -> sp.Expr:
         """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""

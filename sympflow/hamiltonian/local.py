@@ -25,6 +25,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printab
 
 __all__ = ["LocalHamiltonian", "check_memory", "checked_params", "letters", "named_values", "parsed"]
 
+MOST_SPELLED = 128  # degrees of freedom
 MOST_DENSE = 50_000_000
 """Entries of matrices ∇²V that are made at a time."""
 VECTORS_OF_A_RUN = 12
@@ -131,6 +132,15 @@ class LocalHamiltonian(Definition, ABC):
     def terms(self) -> dict[str, str]:
         """The terms by name, as texts, for messages; {} where there are no pieces."""
         return {}
+
+    @cached_property
+    def spelled(self) -> SymbolicHamiltonian | None:
+        """H in symbols, all terms one by one, for loops that are made of these; None where there are too many."""
+        return None if self.timed or self.arrays_only or self.ndof > MOST_SPELLED else self.in_symbols()
+
+    def in_symbols(self) -> SymbolicHamiltonian | None:
+        """H in symbols; None where that is not known."""
+        return None
 
     def written_out(self) -> sp.Expr | None:
         """H by its coordinates one by one, in q1 … qd, p1 … pd, with the values of the parameters."""

@@ -479,6 +479,8 @@ def infinite_between(
                 middle = (low + high) / 2
                 low, high = (middle, high) if number(*at(middle)) == first else (low, middle)
             for side in (-1, 1):
+                if (low if side < 0 else 1 - high) == 0:  # the way begins or ends there
+                    continue
                 values = [function(*at(low + side * mpmath.mpf(d))) for d in BESIDE]
                 if any(mpmath.im(value) != 0 or not mpmath.isfinite(value) for value in values):
                     return True

@@ -242,7 +242,7 @@ class SymbolicHamiltonian(Definition):
     def timed(self) -> bool:  # type: ignore[override]
         return self.time is not None
 
-    @property
+    @cached_property
     def kinetic_timed(self) -> bool:  # type: ignore[override]
         """True if T depends on the time."""
         return self.T is not None and self.time in self.T.free_symbols

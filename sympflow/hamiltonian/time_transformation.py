@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,6 +17,9 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.scene import Scene
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
+
+if TYPE_CHECKING:
+    from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 LARGEST_SHIFT = 1e100
 _ENERGIES: WeakKeyDictionary[HamiltonianSystem, tuple[bytes, float]] = WeakKeyDictionary()
@@ -85,7 +88,7 @@ def time_transformed(
             "method such as 'gauss_legendre4'."
         )
     c = default_shift(system) if shift is None else checked_shift(shift)
-    if system.written is not None:
+    if _symbols(system) is not None:
         transformed = HamiltonianSystem.from_sympy(_expression(system, c), name=f"log_{system.name}", energy_scale=1.0)
         transformed._params = Parameters({**system.params, "shift": c})
     else:
@@ -153,12 +156,17 @@ def projected(x: Array) -> Array:
     return concatenate([x[..., :d], x[..., d + 1 : -1]])
 
 
+def _symbols(system: HamiltonianSystem) -> SymbolicHamiltonian | None:
+    """H in symbols, of a lattice or pairs with all terms one by one."""
+    return system.written if system.local is None else system.local.spelled
+
+
 def _expression(system: HamiltonianSystem, c: float) -> Any:
     import sympy as sp
 
     from sympflow.hamiltonian.symbolic import exact
 
-    symbols = system.written
+    symbols = _symbols(system)
     assert symbols is not None
     B = sp.Symbol(f"p{symbols.ndof + 1}", real=True)
     return sp.log(symbols.T + B) - sp.log(exact(c) - symbols.V)

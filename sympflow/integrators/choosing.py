@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import as_float, check_t_span
-from sympflow.arrays import Array, is_tensor, readable, to_numpy
+from sympflow.arrays import Array, readable, to_numpy
 from sympflow.hamiltonian.scales import default_step, known_scale, smallest_size, weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
@@ -65,7 +65,7 @@ def _candidates(
         return
     if flows and "dt" not in options and _flow_holds(system, y0, tol):
         yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
-    if plain and not is_tensor(y0) and y0.dtype == np.float64 and _falls_to_the_origin(system, y0):
+    if plain and y0.dtype == np.float64 and _falls_to_the_origin(system, y0):
         yield "log_kahan_li8", "V falls without bound at q = 0, where its steps become shorter"
     if system.local is not None and system.local.frame is not None and system.local.frame.crossing() is None:
         yield "wisdom_holman", "planets move about a star"

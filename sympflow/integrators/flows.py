@@ -163,7 +163,7 @@ class FlowIntegrator(FixedStep):
         import torch
 
         flow = self.flow_for(system)
-        if not is_tensor(y) and y.dtype == np.float64 and flow.dtype == torch.float64 and flow.device.type == "cpu":
+        if y.dtype == np.float64 and flow.dtype == torch.float64 and flow.device.type == "cpu":
             return flow
         tensor = y if is_tensor(y) else torch.from_numpy(np.empty(0, y.dtype))
         if tensor.dtype == flow.dtype and tensor.device == flow.device:
@@ -354,7 +354,7 @@ class SympFlowIntegrator(FlowIntegrator):
         """Return the integrator that runs: with `tol`, over a `length` that is worth it, a flow in another time."""
         if self.flow is not None:
             return self._given_in_another_time(system)
-        if self.tol is None or self.compensated or is_tensor(y0) or y0.dtype != np.float64:
+        if self.tol is None or self.compensated or y0.dtype != np.float64:
             return self
         name, tol = self.name, self.tol
         other = known(("in another time", name, kind_of(system), tol), lambda: _in_another_time(system, name, tol))

@@ -19,7 +19,7 @@ from sympflow.arrays import (
     Array,
     concatenate,
     finite_states,
-    is_tensor,
+    known_finite,
     lanes,
     like,
     readable,
@@ -177,13 +177,13 @@ class GridRun(Run):
         """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there."""
         grid, reason = self.grid, self.integrator.breakdown
         done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
-        outcome.finite = done and (outcome.finite or _all_finite(outcome.y))
+        outcome.finite = done and (outcome.finite or known_finite(outcome.y))
         if outcome.finite:
             if finite.ndim:
                 outcome.status = np.zeros(finite.shape, dtype=int)
             return
         ok = finite_states(outcome.y)  # (n, ...): shorter steps may overflow too
-        if is_tensor(outcome.y) and lanes(outcome.y):
+        if lanes(outcome.y):
             if not ok.all():
                 report_lanes(outcome, ok, reason)
         elif finite.ndim:
@@ -234,11 +234,6 @@ def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
         f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.17g}. {remedy}, or pass the "
         "states as a batch, whose trajectories are told apart."
     )
-
-
-def _all_finite(y: Array) -> bool:
-    """True if an array is finite all over; of tensors that is found out elsewhere."""
-    return not is_tensor(y) and bool(np.isfinite(y).all())
 
 
 class GridSolution(DenseOutput):
@@ -330,7 +325,7 @@ class MemoryRun(GridRun):
         first = first_window(self.stepper, problem, last, len(save))
         if not first:
             self.saved, finite = self.stepper.rollout(problem.y0, self.grid.h, last, save, problem.t0)
-            self.checkpoint = RunCheckpoint(last), finite
+            self.checkpoint = self.checkpoint[0], finite
             return
         pace, most = Pace(first), max(2, MOST_SAVED // math.prod(problem.y0.shape))
         self.saved = rows_of_nan(len(save), problem.y0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import check_not_followed
-from sympflow.arrays import Array, is_tensor, last, moveaxis, stack
+from sympflow.arrays import Array, beside, is_tensor, last, like, moveaxis, stack
 
 Time = Any
 """A number, or a tensor that carries a gradient."""
@@ -89,23 +89,14 @@ class Piecewise(DenseOutput):
         """Beginnings, lengths and coefficients of each power of all steps: (m,), (m,), each (m, ..., 2d)."""
         begin, length = zip(*((step.begin, step.end - step.begin) for step in self.steps), strict=True)
         coefficients = [stack(c, axis=0) for c in zip(*(step.coefficients for step in self.steps), strict=True)]
-        if is_tensor(begin[0]):
-            return stack(begin, axis=0), stack(length, axis=0), coefficients
-        return np.array(begin), np.array(length), coefficients
+        return stack(begin, axis=0), stack(length, axis=0), coefficients
 
     def states(self, times: np.ndarray) -> Array:
         if not self.steps:
             return stack([self.y0] * len(times), axis=0) if times.size else self.y0[None][:0]
         begin, length, coefficients = self._stacked
         k: Any = np.minimum(np.searchsorted(self.sign * self._ends, self.sign * times), len(self.steps) - 1)
-        x: Any
-        if is_tensor(self.y0):
-            import torch
-
-            k = torch.as_tensor(k, device=self.y0.device)
-            x = ((torch.as_tensor(times) - torch.as_tensor(begin)[k]) / torch.as_tensor(length)[k]).to(self.y0)
-        else:
-            x = ((times - begin[k]) / length[k]).astype(self.y0.dtype)
+        x = like((beside(times, begin) - begin[k]) / length[k], self.y0)
         return _horner([c[k] for c in coefficients], x.reshape(-1, *[1] * self.y0.ndim))
 
 

@@ -6,7 +6,7 @@ import difflib
 import re
 import sys
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from sympflow.arrays import Array
@@ -205,7 +205,16 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
             f"`{unknown[0]}` is not an option of method {cls.name!r}, which takes {', '.join(known) or 'none'}: "
             f"{_INSTEAD.get(unknown[0], 'remove it or choose another method')}."
         )
-    return cls(**options) if own else _made(method, lambda: cls(**options))
+    if not own:
+        return _made(method, lambda: cls(**options))
+    plain = all(type(value) in (bool, int, float, str) for value in options.values())
+    return _configured(cls, **options) if plain else cls(**options)  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=256, typed=True)
+def _configured(cls: type[Integrator], **options: Any) -> Integrator:
+    """A built-in method with plain options, made once."""
+    return cls(**options)
 
 
 def _made(method: Any, make: Callable[[], T]) -> T:

@@ -15,8 +15,10 @@ from sympflow.arrays import (
     full_of_nan,
     is_tensor,
     library_name,
+    like,
     stack,
     transformed,
+    with_rows,
 )
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
@@ -79,7 +81,7 @@ class Stepper:
         self.saves_finite = kernel is not None and kernel.saves_finite
         self.remark = self.why = ""
         y0, untraced = problem.y0, None if kernel is not None or problem.system is None else problem.system.untraced
-        if untraced and problem.backend == "auto" and not is_tensor(y0) and y0.dtype == np.float64:
+        if untraced and problem.backend == "auto" and y0.dtype == np.float64:
             name = "potential" if problem.system.separable else "hamiltonian"
             self.why = f": `{name}` could not be traced, for {untraced}"
         if told and problem.system.symbols is not None:
@@ -103,7 +105,7 @@ class Stepper:
         if self.kernel is None:
             return self.arrays.takes_carry
         y0 = self.problem.y0  # where torch follows the run, it cannot from piece to piece
-        return not is_tensor(y0) or not differentiable(y0, *self.followed)
+        return not differentiable(y0, *self.followed)
 
     @property
     def followed(self) -> Sequence[Any]:
@@ -189,7 +191,7 @@ def compiled_loops(
     if reason is None:
         try:
             loops = make()
-            if is_tensor(y0) and differentiable(y0):
+            if differentiable(y0):
                 loops.check_reverse()
             return loops
         except ValueError as error:
@@ -292,20 +294,11 @@ def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, rem
     extra = remainder.nonzero()[0]
     if not extra.size:
         return y
-    h = remainder[extra]
-    first, last = int(extra[0]), int(extra[-1])
-    together = last - first == len(extra) - 1  # nearly always, and a slice is copied ten times sooner
-    rows: Any = slice(first, last + 1) if together and not is_tensor(y) else extra
+    h, t = remainder[extra], grid.t0 + count[extra] * grid.h
+    first, end = int(extra[0]), int(extra[-1]) + 1
+    rows: Any = slice(first, end) if end - first == len(extra) else extra  # nearly always, and sooner copied
     states = y[rows]
-    lengths, t = h, grid.t0 + count[extra] * grid.h
     if y.ndim != 2:
-        lengths, t = (np.broadcast_to(x.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy() for x in (h, t))
-    if not is_tensor(y):
-        with np.errstate(all="ignore"):
-            y[rows] = checked_state(stepper.shorter(states, lengths.astype(y.dtype), t), states)
-        return y
-    import torch
-
-    h_extra = torch.as_tensor(lengths, dtype=y.dtype, device=y.device)
-    advanced = checked_state(stepper.shorter(states, h_extra, t), states)
-    return y.index_copy(0, torch.as_tensor(extra, device=y.device), advanced)
+        h, t = (np.broadcast_to(x.reshape(-1, *[1] * (y.ndim - 2)), states.shape[:-1]).copy() for x in (h, t))
+    with np.errstate(all="ignore"):
+        return with_rows(y, rows, checked_state(stepper.shorter(states, like(h, states), t), states))

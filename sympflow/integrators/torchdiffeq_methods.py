@@ -118,8 +118,8 @@ class Watched(ByVectorField):
         trace.most_steps = self.most_steps if most_steps is None else most_steps
         if t_span[0] == t_span[1]:
             return trace, failure
-        y = y0 if is_tensor(y0) else torch.from_numpy(np.ascontiguousarray(y0))
-        with torch.set_grad_enabled(is_tensor(y0) and torch.is_grad_enabled()), np.errstate(all="ignore"):
+        y: Any = y0 if trace.tensor else torch.from_numpy(np.ascontiguousarray(y0))
+        with torch.set_grad_enabled(trace.tensor and torch.is_grad_enabled()), np.errstate(all="ignore"):
             try:
                 self.integrate(trace, y, abs(t_span[1] - t_span[0]))
             except _EndedError:

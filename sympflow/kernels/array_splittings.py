@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -144,24 +145,23 @@ def function_code(
 ) -> ArrayCode:
     """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
     forces = Functions(gradient, hessian_vector if level else None, inverse_mass, driven)
-    sizes: Any = Sizes(ndof, (Letter("time"),) if driven else ())
-    clock: Any = Clock() if driven else None
-    return ArrayCode(Splitting(sizes, level, monomials, compensated, friction, clock), forces)
+    none: Any = None
+    return ArrayCode(FunctionSplitting(none, level, monomials, compensated, friction, ndof=ndof, timed=driven), forces)
 
 
-class Sizes(NamedTuple):
-    """In place of the symbols of a system that has none."""
+@dataclass(frozen=True)
+class FunctionSplitting(Splitting):
+    """The kicks and drifts of a system by functions, which has no symbols: of a driven one the letter is the time."""
 
-    ndof: int
-    parameters: tuple[Letter, ...]
-    values: tuple[()] = ()
-    samples: tuple[()] = ()
+    ndof: int = 1
+    timed: bool = False
+    own = 0
 
+    @property
+    def parameters(self) -> Sequence[Any]:
+        return [Letter("time")] if self.timed else []
 
-class Clock:
-    """In place of the driving of a system that has no symbols: its letter is the time."""
-
-    def values_at(self, time: Value, length: Value, fixed: Sequence[Value]) -> list[Value]:
+    def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
         return [time]
 
 
@@ -196,7 +196,7 @@ class ArrayCode(SplittingCode):
     def __init__(self, splitting: Splitting, forces: Forces) -> None:
         super().__init__(splitting, chunked=False)
         self._forces, self.data, self.lanes = forces, forces.data, forces.lanes
-        self.room = ARRAYS * splitting.symbols.ndof
+        self.room = ARRAYS * splitting.ndof
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ArrayCode, (self._splitting, self._forces)
@@ -247,7 +247,7 @@ class ArrayCode(SplittingCode):
 
     def _store_polynomial(self, room: Room, out: Value, kicks: Sequence[Any]) -> None:
         """Σ e ∇q^m."""
-        splitting, d = self._splitting, self._splitting.symbols.ndof
+        splitting, d = self._splitting, self._splitting.ndof
 
         def slopes(*numbers: Any) -> list[Any]:
             total: Any = 0.0
@@ -269,7 +269,7 @@ class ArrayCode(SplittingCode):
         spread, velocity = (room.part(d * i, room.work) for i in range(2))
         moved = p
         if splitting.friction is not None:
-            n = splitting.symbols.ndof**splitting.friction
+            n = splitting.ndof**splitting.friction
             first = 1 + len(splitting.kick_numbers)
             mean, decay = given[first : first + n], given[first + n : first + 2 * n]
             for i, k in self._each(room, d, n):
@@ -306,7 +306,7 @@ class ArrayCode(SplittingCode):
         room.store(total, i, x)
 
     def _letters(self, given: Sequence[Any]) -> Sequence[Any]:
-        return given[len(given) - len(self._splitting.symbols.parameters) :]
+        return given[len(given) - len(self._splitting.parameters) :]
 
     def _ndof(self, room: Room) -> Value:
         return room.code.op("sdiv", INT, room.size, room.code.constant(2 * (1 + self._splitting.compensated), INT))

@@ -60,14 +60,14 @@ class Field:
     """
 
     def __init__(self, system: HamiltonianSystem) -> None:
-        symbols, force = system.form, system.external_force
+        symbols, force = system.spelled, system.external_force
         assert symbols is not None
-        forces = getattr(force, "expressions", None)
-        if force is not None and (forces is None or system.symbols is None):
+        forces = () if force is None else force.expressions
+        if force is not None and not (forces and system.symbols):
             raise ValueError("`system` has a force by a function, which is not compiled: use backend='array'.")
         self.large = is_large(symbols) and force is None
         symbols = symbols if is_large(symbols) else symbols.parametric
-        self.lettered = lettered(symbols, [symbols.H, *(forces or [])])
+        self.lettered = lettered(symbols, [symbols.H, *forces])
         self.ndof = system.ndof
         self._damping = system.friction.matrix(self.ndof) if system.friction else None
         self.rates = [] if self._damping is None else self._damping[self._damped].tolist()
@@ -138,12 +138,10 @@ class Field:
             code.store(code.load(g, m + d), out, m)
             force = -code.load(g, m)
             if self._damping is not None:
-                damping = data[-1]
-
-                def damped(j: Value, values: list[Value], m: Value = m) -> list[Value]:
-                    return [values[0] - code.load(damping, m * d + j) * code.load(y, j + d)]
-
-                (force,) = code.loop(d, [force], damped)
+                moved = code.variable(force)
+                with code.over(d) as j:
+                    moved.value = moved.value - code.load(data[-1], m * d + j) * code.load(y, j + d)
+                force = moved.value
             code.store(force, out, m + d)
 
 

@@ -91,13 +91,11 @@ def _dot(x: Value, y: Value, n: Value) -> Value:
         code = x.code
         total = code.constant(0.0)
         for type, begin, count in _pieces(code, n):
-
-            def more(i: Value, sums: Sequence[Value], type: Type = type, begin: Value = begin) -> list[Value]:
+            sums = code.variable(code.constant(0.0, type))
+            with code.over(count) as i:
                 at = begin + i * type.width
-                return [fma(code.load(x, at, type), code.load(y, at, type), sums[0])]
-
-            (sums,) = code.loop(count, [code.constant(0.0, type)], more)
-            total = total + code.total(sums)
+                sums.value = fma(code.load(x, at, type), code.load(y, at, type), sums.value)
+            total = total + code.total(sums.value)
         return total
 
     return x.code.outlined("dot", [x, y, n], body, DOUBLE)
@@ -160,12 +158,11 @@ def _folded(code: Code) -> None:
             _fold(triangle, memory, chunk, k + 1, length, False)
     last = code.at(R, (n_blocks - 1) * ((k + 1) * (k + 1)))
     with code.over(k) as i:
-
-        def more(j: Value, square: Sequence[Value]) -> list[Value]:
+        square = code.variable(code.constant(0.0))
+        with code.over(i + 1) as j:
             x = code.load(last, j * (k + 1) + i)
-            return [fma(x, x, square[0])]
-
-        code.store(apply("sqrt", code.loop(i + 1, [code.constant(0.0)], more)[0]), norms, i)
+            square.value = fma(x, x, square.value)
+        code.store(apply("sqrt", square.value), norms, i)
 
 
 def _damped(code: Code) -> None:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.compiler.arrange import ALWAYS, Arrangement
-from sympflow.compiler.control import INT, Code, Sweep, Type, Value
+from sympflow.compiler.control import INT, Sweep, Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, is_zero, times
 from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, Traced, derivatives, gradient, reached, tangent, traced
@@ -28,8 +28,8 @@ from sympflow.hamiltonian.lattice import LatticeHamiltonian
 from sympflow.hamiltonian.local import LocalHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import aligned, zeros
-from sympflow.kernels.runs import Memory, Numbers, Room
-from sympflow.kernels.teams import Member, SharedRollouts, meet
+from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, POLYNOMIAL
 
 __all__ = ["LatticeCode", "lattice_code"]
@@ -398,29 +398,15 @@ class LatticeStages:
                 scene.sweep([self.passes[name] for name in names])
 
 
-class LatticeInMemory(Memory):
+class LatticeInMemory(SharedMemory):
     """A state as vectors of the sites in slabs; each thread has its own piece."""
 
-    at_once = 8
-
-    def __init__(self, stages: LatticeStages, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
-        super().__init__(code, width, arguments, before)
-        self._stages, self._context = stages, arguments[3]
+    def __init__(self, stages: LatticeStages, *arguments: Any, **options: Any) -> None:
+        super().__init__(len(stages.sets), *arguments, **options)
+        self._stages = stages
 
     def block(self, every: int) -> Value:
         return self.code.load(self._context, CONTEXT.index("longest"), INT)
-
-    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
-        with self.code.over(self.code.op("sdiv", INT, self.n_values, self.code.constant(8, INT))) as i:
-            self.code.store(self.code.constant(0.0, Type("double", 8)), self._running.state, i * 8)
-        n = len(self._stages.vectors) if given is None else 2 * self._stages.fields
-        self._each(self._running, rows, begin, n, True)
-
-    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        self._each(self._end, out, begin * stride + at, 2 * self._stages.fields, False)
-
-    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
-        self._each(self._running, running, begin, len(self._stages.vectors), False)
 
     def finite(self) -> Value:
         """True where the pieces of all threads are finite."""
@@ -435,8 +421,8 @@ class LatticeInMemory(Memory):
             scene.meet()
         return good.value
 
-    def _each(self, room: Room, rows: Value, row: Value, n: int, loads: bool) -> None:
-        """Take vectors of a state from a row, or write them there."""
+    def copied(self, room: Room, rows: Value, row: Value, sets: int, loads: bool) -> None:
+        n = sets * self._stages.fields
         scene, code, width = _Scene(self._stages, room.state, self._context), self.code, self._stages.form.width
         at, starts, sizes = scene.numbers, scene.address("starts"), scene.address("sizes")
         rows = code.at(rows, row * (at["sites"] * n))

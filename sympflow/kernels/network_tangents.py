@@ -84,16 +84,9 @@ class NetworkTangents:
     ) -> np.ndarray:
         """J (n, 2d, N), the derivatives of 2d functions of ψ̄ and d/dt ψ̄ by the parameters.
 
-        The next call for as many points overwrites it: it is tens of megabytes.
-
-        Parameters
-        ----------
-        by_state : ndarray, shape (N, 2d, 2d)
-            The derivatives of the functions by ψ̄_t(x).
-        by_velocity : ndarray, shape (2d,), optional
-            Those of each function by its component of d/dt ψ̄_t(x), if they depend on that.
-        by_start : ndarray, shape (2d, 2d, N), optional
-            Filled with the derivatives of the functions by x, without those of constants.
+        `by_state` (N, 2d, 2d) are the derivatives of the functions by ψ̄_t(x), `by_velocity` (2d,) those of each by its
+        component of d/dt ψ̄_t(x), if they depend on that; `by_start` (2d, 2d, N) is filled with those by x, without
+        those of constants. The next call for as many points overwrites J: it is tens of megabytes.
         """
         velocity, m, N = by_velocity is not None, 2 * self.ndof, len(t)
         key, shape = (velocity, N), (len(parameters), m, max(N, LANES))
@@ -433,29 +426,25 @@ class _Points:
                     place, number = code.load(places, parameter, INT), i * n_own + parameter
                     unit = code.splat(sign * code.load(units, number), LANES)
                     with code.over(2 * d) as row:
-
-                        def more(j: Value, total: Sequence[Value]) -> list[Value]:
+                        total = code.variable(zero)
+                        with code.over(d) as j:
                             at, slope = row * (2 * d) + old + j, _flat(G[j * size + place])
-                            found = fma(P[at], slope[0], total[0])
-                            return [fma(M[at], slope[1], found) if self.velocity else found]
-
-                        (total,) = code.loop(d, [zero], more)
-                        code.store(unit * total, J, (number * (2 * d) + row) * self.n_points + begin)
+                            found = fma(P[at], slope[0], total.value)
+                            total.value = fma(M[at], slope[1], found) if self.velocity else found
+                        code.store(unit * total.value, J, (number * (2 * d) + row) * self.n_points + begin)
                 change = code.splat(sign, LANES)
                 with code.over(2 * d) as row, code.over(d) as m:
-
-                    def back(j: Value, totals: Sequence[Value]) -> list[Value]:
+                    of_state, of_velocity = code.variable(zero), code.variable(zero)
+                    with code.over(d) as j:
                         at, slope = row * (2 * d) + old + j, _flat(H[j * d + m])
-                        found = [fma(P[at], slope[0], totals[0])]
+                        of_state.value = fma(P[at], slope[0], of_state.value)
                         if self.velocity:
-                            found = [fma(M[at], slope[1], found[0]), fma(M[at], slope[0], totals[1])]
-                        return found
-
+                            of_state.value = fma(M[at], slope[1], of_state.value)
+                            of_velocity.value = fma(M[at], slope[0], of_velocity.value)
                     at = row * (2 * d) + new + m
-                    totals = code.loop(d, [zero, zero][: 1 + self.velocity], back)
-                    P.add(at, (change, totals[0]))
+                    P.add(at, (change, of_state.value))
                     if self.velocity:
-                        M.add(at, (change, totals[1]))
+                        M.add(at, (change, of_velocity.value))
             with code.over(starts) as _, code.over(4 * d * d) as m:
                 code.store(P[m], by_start, m * self.n_points + begin)
 

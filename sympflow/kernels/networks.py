@@ -42,17 +42,8 @@ STEP = 1000  # about how many nanoseconds one takes
 class NetworkLayer:
     """The weights of a kick or a drift, whose potential is V(t, x) = w · σ(… σ(K x + k t + b_1) …).
 
-    Attributes
-    ----------
-    is_kick : bool
-    activation : str
-        The name of σ.
-    K, k : ndarrays of shape (h_1, d) and (h_1,)
-    biases : sequence of ndarrays of shape (h_l,)
-    weights : sequence of ndarrays of shape (h_{l+1}, h_l)
-    w : ndarray of shape (h_n,)
-    slopes : callable, optional
-        Where the loops do not know σ by its name: a function of a number a that returns σ(a) and σ'(a).
+    K is (h_1, d), k (h_1,), the biases (h_l,), the weights (h_{l+1}, h_l), w (h_n,). Where the loops do not know σ by
+    its name, `slopes` is a function of a number a that returns σ(a) and σ'(a).
     """
 
     is_kick: bool
@@ -313,20 +304,20 @@ def _slopes(layer: NetworkLayer) -> tuple[Callable[[Any], Any] | None, int]:
     function: Any = layer.slopes
     try:
         return traced(getattr(function, "py_func", function), "a"), 0
-    except (TypeError, ValueError, AttributeError):
-        return None, _by_numba(function).address
+    except (TypeError, ValueError, AttributeError) as reason:
+        return None, _by_numba(function, str(reason)).address
 
 
 @cache
-def _by_numba(function: Any) -> Any:
-    """A function (n, a, values, slopes) of addresses."""
+def _by_numba(function: Any, reason: str) -> Any:
+    """A function (n, a, values, slopes) of addresses, of one that cannot be traced for a reason."""
     try:
         from numba import carray, cfunc, njit, types
         from numba.extending import is_jitted
     except ImportError as error:
         raise ValueError(
-            "`compiled`, with which the activation of the flow was registered, has branches or calls functions, which "
-            f"Numba compiles: {needed('numba', 'numba')}, or write it by operators."
+            "`compiled`, with which the activation of the flow was registered, cannot be traced, so that Numba must "
+            f"compile it ({reason.rstrip('.')}): {needed('numba', 'numba')}, or write it by operators."
         ) from error
 
     compiled = function if is_jitted(function) else njit(error_model="numpy")(function)

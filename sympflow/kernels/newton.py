@@ -52,7 +52,7 @@ _KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneSte
 
 
 def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
-    written = system.written if system.form is None else system.form
+    written = system.spelled
     if written is None:
         raise ValueError(
             "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
@@ -331,11 +331,10 @@ class _InMemory(NewtonCode):
         h = code.load(numbers)
         with code.over(self.stages) as i:
             with code.over(n) as m:
-
-                def moved(j: Value, values: list[Value], i: Value = i, m: Value = m) -> list[Value]:
-                    return [values[0] + code.load(A, i * self.stages + j) * code.load(K, j * n + m)]
-
-                code.store(code.loop(self.stages, [code.load(state, m)], moved)[0], Y, m)
+                x = code.variable(code.load(state, m))
+                with code.over(self.stages) as j:
+                    x.value = x.value + code.load(A, i * self.stages + j) * code.load(K, j * n + m)
+                code.store(x.value, Y, m)
             if self._damped:
                 grown, shrunk = self._growths(code, numbers, i)
                 with code.over(d) as m:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -19,15 +19,15 @@ import sympy as sp
 
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
-from sympflow.compiler.functions import added, apply
+from sympflow.compiler.functions import added, apply, fma, summed
 from sympflow.compiler.machine import address, host
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
-from sympflow.kernels.runs import Memory, Numbers, Room, finished
+from sympflow.kernels.runs import Numbers, Room, finished
 from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
-from sympflow.kernels.teams import Member, SharedRollouts, meet
+from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
 
 if TYPE_CHECKING:
@@ -103,9 +103,7 @@ class PairLaw:
                 x - side * code.apply("floor", (code.fma(x, over, code.operand(0.5, x.type)),))
                 for x, side, over in zip(d, box, inverse, strict=True)
             ]
-        s = softening
-        for x in d:
-            s = code.fma(x, x, s)
+        s = summed(softening, d, d)
         if self.cut:
             inside = s < end if inside is None else inside & (s < end)
         g = self.program.body(s, *columns, *rest)
@@ -113,29 +111,20 @@ class PairLaw:
             g = [code.apply("where", (inside, code.operand(x, s.type), 0.0)) for x in g]
         return Pair(d, u, g)
 
-    def parts(self, kind: str, pair: Pair) -> list[tuple[Value, list[Value]]]:
-        """Factors of vectors, whose sum is the part of the pair in the sum of its first body."""
-        d, u, g = pair
-        if kind == "gradient":
-            return [(g[0], d)]
-        e = dot(d, u)
-        if kind == "hessian_vector":
-            return [(g[1] * e, d), (g[0], u)]
-        return [(0.5 * (g[1] * e * e + g[0] * dot(u, u)), d), (g[0] * e, u)]
+
+def parts(kind: str, d: Sequence[Any], u: Sequence[Any], g: Sequence[Any]) -> list[tuple[Any, Sequence[Any]]]:
+    """Factors of vectors, whose sum is the part of a pair in the sum of its first body: see `Pair`."""
+    if kind == "gradient":
+        return [(g[0], d)]
+    e = summed(0.0, d, u)
+    if kind == "hessian_vector":
+        return [(g[1] * e, d), (g[0], u)]
+    return [(0.5 * fma(g[1] * e, e, g[0] * summed(0.0, u, u)), d), (g[0] * e, u)]
 
 
-def summed(total: Value, parts: Sequence[tuple[Value, list[Value]]], axis: int, sign: float = 1.0) -> Value:
+def with_parts(total: Any, parts: Sequence[tuple[Any, Sequence[Any]]], axis: int, sign: float = 1.0) -> Any:
     """A sum with the part of a pair along an axis."""
-    for factor, x in parts:
-        total = total.code.fma(factor if sign > 0 else -factor, x[axis], total)
-    return total
-
-
-def dot(x: Sequence[Value], y: Sequence[Value]) -> Value:
-    total = x[0] * y[0]
-    for a, b in zip(x[1:], y[1:], strict=True):
-        total = total.code.fma(a, b, total)
-    return total
+    return summed(total, (factor if sign > 0 else -factor for factor, _ in parts), (x[axis] for _, x in parts))
 
 
 # a few bodies: their pairs written out ------------------------------------------------------------------------------
@@ -240,14 +229,14 @@ class FewShape(Shape):
 
     def _moved(self, momenta: list[Any]) -> list[Any]:
         """Momenta, numbers of the body, after the kick."""
-        made, op = self.made, self.made.operation
+        made = self.made
         b, *more = (self.number[name] for name in self.splitting.kick_numbers)
         if self.terms == 1:
             return self._sum("gradient", [], momenta, -b)
         nothing: list[Any] = [0.0] * self.d
 
         def moved(by: Any, x: Sequence[Any]) -> list[Any]:
-            return [op("fma", made.written(by), a, p) for a, p in zip(x, momenta, strict=True)]
+            return [fma(made.written(by), a, p) for a, p in zip(x, momenta, strict=True)]
 
         slope = self._sum("gradient", [], nothing)
         momenta = moved(-b, slope)
@@ -264,28 +253,13 @@ class FewShape(Shape):
 
     def _sum(self, kind: str, v: Sequence[Any], start: Sequence[Any], factor: Any = None) -> list[Any]:
         """A sum over all pairs of numbers of the body, behind others, of a kind of `KINDS` along v."""
-        op, dim, total = self.made.operation, self._local.dim, list(start)
+        dim, total = self._local.dim, list(start)
         for (i, j), (d, s) in self._pairs.items():
             g = [self._slope(i, j, s, k, factor) for k in KINDS[kind]]
-            u = [op("sub", v[dim * i + k], v[dim * j + k]) for k in range(dim if v else 0)]
-            parts = [(g[0], d)]
-            if kind == "hessian_vector":
-                parts = [(op("mul", g[1], self._dot(d, u)), d), (g[0], u)]
-            elif kind == "bend":
-                e = self._dot(d, u)
-                square = op("fma", op("mul", g[1], e), e, op("mul", g[0], self._dot(u, u)))
-                parts = [(op("mul", 0.5, square), d), (op("mul", g[0], e), u)]
-            for x, vector in parts:
-                for k in range(dim):
-                    total[dim * i + k] = op("fma", x, vector[k], total[dim * i + k])
-                    total[dim * j + k] = op("fma", op("neg", x), vector[k], total[dim * j + k])
-        return total
-
-    def _dot(self, x: Sequence[Any], y: Sequence[Any]) -> Any:
-        op = self.made.operation
-        total = op("mul", x[0], y[0])
-        for a, b in zip(x[1:], y[1:], strict=True):
-            total = op("fma", a, b, total)
+            of_pair = parts(kind, d, [v[dim * i + k] - v[dim * j + k] for k in range(dim if v else 0)], g)
+            for k in range(dim):
+                total[dim * i + k] = with_parts(total[dim * i + k], of_pair, k)
+                total[dim * j + k] = with_parts(total[dim * j + k], of_pair, k, -1.0)
         return total
 
     @cached_property
@@ -300,10 +274,7 @@ class FewShape(Shape):
                     for k, x in enumerate(map(made.letter, d)):
                         image = apply("floor", self.number[f"over_box_{k}"] * x + 0.5)
                         d[k] = made.written(x - self.number[f"box_{k}"] * image)
-                s = made.written(self.number["softening"])
-                for x in d:
-                    s = made.operation("fma", x, x, s)
-                pairs[i, j] = d, s
+                pairs[i, j] = d, summed(made.written(self.number["softening"]), d, d)
         return pairs
 
     def _slope(self, i: int, j: int, s: Any, kind: int, factor: Any) -> Any:
@@ -317,7 +288,7 @@ class FewShape(Shape):
         slope = made.written(slope if factor is None else factor * slope)
         if local.cutoff is None:
             return slope
-        return made.operation("where", made.operation("lt", s, made.written(self.number["end"])), slope, 0.0)
+        return apply("where", s < made.written(self.number["end"]), slope, 0.0)
 
 
 # more bodies than a few: states in memory ---------------------------------------------------------------------------
@@ -338,44 +309,28 @@ def place(context: Value, name: str) -> Value:
     return context.code.address(field(context, name))
 
 
-class BodiesInMemory(Memory):
+class BodiesInMemory(SharedMemory):
     """A state as arrays (sets, dim, size) of q, p and, compensated, their errors."""
 
-    def __init__(self, dim: int, sets: int, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
-        super().__init__(code, width, arguments, before)
-        self._dim, self._sets, self._context = dim, sets, arguments[3]
+    def __init__(self, dim: int, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._dim = dim
 
     def block(self, every: int) -> Value:
         return field(self._context, "block")
 
-    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
-        state, code = self._running.state, self.code
-        with code.over(self.n_values) as i:
-            code.store(code.constant(0.0), state, i)
-        sets = self._sets if given is None else 2
-        for at, place, row in self._numbers(sets, rows, begin):
-            code.store(code.load(row, place), state, at)
-
-    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
-        self._written(self._end, 2, out, begin * stride + at)
-
-    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
-        self._written(self._running, self._sets, running, begin)
-
-    def _written(self, room: Room, sets: int, out: Value, row: Value) -> None:
-        """Write a state to a row, which one thread does."""
-        with self.code.given(self.code.apply("eq", (field(self._context, "member"), 0))):
-            for at, place, to in self._numbers(sets, out, row):
-                self.code.store(self.code.load(room.state, at), to, place)
-
-    def _numbers(self, sets: int, rows: Value, row: Value) -> Iterator[tuple[Value, Value, Value]]:
-        """The place of each number in a state and in a row; the code that is written next is that of all numbers."""
+    def copied(self, room: Room, rows: Value, row: Value, sets: int, loads: bool) -> None:
         code, n, size = self.code, field(self._context, "bodies"), field(self._context, "size")
         start = code.at(rows, row * (n * (sets * self._dim)))
+        writes = code.apply("eq", (field(self._context, "member"), 0))  # which one thread does
         for s in range(sets):
-            with code.over(n) as i:
+            with code.over(n) as i, nullcontext() if loads else code.given(writes):
                 for k in range(self._dim):
-                    yield size * (s * self._dim + k) + i, (n * s + i) * self._dim + k, start
+                    at, place = size * (s * self._dim + k) + i, (n * s + i) * self._dim + k
+                    if loads:
+                        code.store(code.load(start, place), room.state, at)
+                    else:
+                        code.store(code.load(room.state, at), start, place)
 
 
 class PairStages:
@@ -572,11 +527,11 @@ class PairStages:
                         [*mine[moved:], *other[moved:]],
                         (bounds[0] < number) & (number < bounds[1]),
                     )
-                    parts = law.parts(kind, pair)
+                    of_pair = parts(kind, *pair)
                     for axis in range(dim):
                         at = size * axis + j
-                        code.store(summed(code.load(F, at, _LANES), parts, axis, -1.0), F, at)
-                    return [summed(total, parts, axis) for axis, total in enumerate(sums)]
+                        code.store(with_parts(code.load(F, at, _LANES), of_pair, axis, -1.0), F, at)
+                    return [with_parts(total, of_pair, axis) for axis, total in enumerate(sums)]
 
                 count = ((last + (LANES - 1)) >> SHIFT) - (first >> SHIFT)
                 for variable, total in zip(totals, code.loop(count, [x.value for x in totals], block), strict=True):
@@ -703,10 +658,10 @@ class PairForces:
         states = _States(self._law, code)
         with states.groups():
             for i, j, pair in states.pairs():
-                states.add(F, (i, j), self._law.parts("gradient", pair), -1.0)
+                states.add(F, (i, j), parts("gradient", *pair), -1.0)
             if self._has_gradient:
                 for i, j, pair in states.pairs(F):
-                    states.add(G, (i, j), self._law.parts("hessian_vector", pair), 1.0)
+                    states.add(G, (i, j), parts("hessian_vector", *pair), 1.0)
         return finished(code, [INT, INT, *[POINTER] * 5])
 
     @cached_property
@@ -715,14 +670,14 @@ class PairForces:
         types = [INT, INT, *[POINTER] * 7, INT]
         code = Module(host().fused).function("products", types)
         *_, F, v, DF, DG, K = code.arguments
-        law, states = self._law, _States(self._law, code)
+        states = _States(self._law, code)
         with states.groups(), states.some(K) as (first, count):
             for i, j, (d, a, g) in states.pairs(F):
-                da = dot(d, a)
+                da = summed(0.0, d, a)
                 with code.over(count) as k:
                     m = first + k
                     u = [x - y for x, y in zip(states.vector(v, i, m), states.vector(v, j, m), strict=True)]
-                    along, across = dot(d, u), dot(a, u)
+                    along, across = summed(0.0, d, u), summed(0.0, a, u)
                     states.add(DF, (i, j), [(g[1] * along, d), (g[0], u)], -1.0, m)
                     if self._has_gradient:
                         straight = g[2] * da * along + g[1] * across
@@ -732,7 +687,7 @@ class PairForces:
                     with code.over(count) as k:
                         m = first + k
                         u = states.between(DF, i, j, m)
-                        states.add(DG, (i, j), law.parts("hessian_vector", Pair(d, u, g)), 1.0, m)
+                        states.add(DG, (i, j), parts("hessian_vector", d, u, g), 1.0, m)
         return finished(code, types)
 
 
@@ -778,12 +733,12 @@ class _States:
         return [self._code.load(x, self._place(i, k, m), _LANES) for k in range(self._dim)]
 
     def add(
-        self, x: Value, ends: tuple[Value, Value], parts: Sequence[Any], sign: float, m: Value | None = None
+        self, x: Value, ends: tuple[Value, Value], of_pair: Sequence[Any], sign: float, m: Value | None = None
     ) -> None:
         """Add the part of a pair to that of its first body, and take it from the second; with a sign of −1 reversed."""
         for body, part in zip(ends, (sign, -sign), strict=True):
             for axis, value in enumerate(self.vector(x, body, m)):
-                self._code.store(summed(value, parts, axis, part), x, self._place(body, axis, m))
+                self._code.store(with_parts(value, of_pair, axis, part), x, self._place(body, axis, m))
 
     def _place(self, i: Value, axis: int, m: Value | None) -> Value:
         row = i * self._dim + axis

@@ -26,7 +26,7 @@ from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_state
 from sympflow.kernels.rollouts import Columns, Rollouts
 from sympflow.kernels.runs import Numbers
 from sympflow.kernels.stage_times import SymbolicLetters
-from sympflow.kernels.terms import MOST_IN_REGISTERS, MOST_WRITTEN_OUT, written_out
+from sympflow.kernels.terms import MOST_IN_REGISTERS, written_out
 from sympflow.kernels.threads import given
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
@@ -38,6 +38,7 @@ TURN_WIDTH = 6  # numbers that turn a frequency
 TIME_WIDTH = 3  # numbers of a column for its time
 EARLY = -4  # when momenta are known before the positions, in cycles
 MOST_OPERATIONS = 300  # of all kinds of columns
+MOST_WRITTEN_OUT = 1000  # operations of the gradients of all parts
 SAME_TIME = 1e-12  # of a step: rounding of sums of weights
 KNOWN_TABLES = 64  # run tables that are kept: those of the steps in use
 

@@ -65,15 +65,9 @@ class Task(NamedTuple):
 class Run(NamedTuple):
     """The outcome of a run of compiled steps.
 
-    Attributes
-    ----------
-    states : ndarray of shape (n, 2d), or (N, n, 2d) of a batch
-        The states after the steps that were to be saved; NaN after the last finite one.
-    n_finite : int, or ndarray of int64 of shape (N,)
-        Index of the last step that ends in a finite state and, of an implicit method, was solved; the number of steps
-        if all do. A run stops there.
-    iterations : int
-        Newton's iterations of all trajectories together; 0 of an explicit method.
+    `states` (n, 2d), or (N, n, 2d) of a batch, are those after the steps that were to be saved; NaN after the last
+    finite one. `n_finite`, or (N,), is the last step that ends in a finite state and, of an implicit method, was
+    solved; the number of steps if all do. A run stops there. `iterations` are Newton's, of all trajectories together.
     """
 
     states: np.ndarray
@@ -84,21 +78,10 @@ class Run(NamedTuple):
 class Batch(NamedTuple):
     """Rows of a run for compiled code: what it is given and what it fills.
 
-    Attributes
-    ----------
-    y0 : ndarray of shape (N, 2d), or (N, 2d + n) with values of its own behind each state
-    n_steps : int
-    save : ndarray of int64
-    out : ndarray of shape (N, n, 2d)
-    n_finite : ndarray of int64 of shape (N,)
-    first : int
-        Steps that were made before: the run goes on from `running`.
-    running : ndarray of shape (N, K), or (N, 0) where the end of the run is not needed
-    counts : ndarray of shape (N,), or (0,) of stages that count nothing
-    stop : ndarray of int64 of shape (1,)
-        The run ends soon once it is not 0.
-    kept : ndarray, optional
-        Room for the states before all stages: see `sympflow.kernels.runs.run_function`.
+    `y0` is (N, 2d), or (N, 2d + n) with values of its own behind each state. The run goes on from `running` (N, K), (N,
+    0) where its end is not needed, after `first` steps, and ends soon once ``stop[0]`` is not 0. It fills `out` (N, n,
+    2d), `n_finite` (N,) and `counts` (N,), (0,) of stages that count nothing. `kept` is room for the states before all
+    stages: see `sympflow.kernels.runs.run_function`.
     """
 
     y0: np.ndarray

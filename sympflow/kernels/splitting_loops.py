@@ -52,27 +52,11 @@ LANES_OF_SUMS, LANES = 16.0, 2.0
 class SplittingLoops:
     """Compiled loops that run any `Scheme` on one system; states are [q, p], float64.
 
-    Force gradients and compensated sums are compiled when first used.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-        Separable, and symbolic or given by Numba functions.
-
-    Attributes
-    ----------
-    values : tuple of float
-        Of what depends on parameters of H alone: arguments of the loops, so that systems which differ in them share
-        these. With friction, and in kicks with force gradients, the values are part of the code, unless H depends on t
-        or each trajectory of a batch has its own.
-    work : int
-        About how many nanoseconds a kick takes.
-    abreast : float
-        By how much less it takes in a batch, whose lanes run side by side.
-    driven : bool
-        True if H depends on t.
-    tensors : sequence of Tensor
-        Weights that torch follows, whose numbers are read in each run.
+    The system is separable, and symbolic or given by functions that are traced or Numba's. Of what depends on
+    parameters of H alone `values` are arguments of the loops, so that systems which differ in them share these; with
+    friction, and in kicks with force gradients, they are part of the code, unless H depends on t or each trajectory of
+    a batch has its own. A kick takes about `work` nanoseconds, by `abreast` less in a batch, whose lanes run side by
+    side.
     """
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:

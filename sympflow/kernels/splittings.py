@@ -65,6 +65,29 @@ class Splitting:
         return *of_system, self.level, self.monomials, self.compensated, self.friction, driving, self.ranges
 
     @property
+    def ndof(self) -> int:
+        return self.symbols.ndof
+
+    @property
+    def parameters(self) -> Sequence[Any]:
+        """Letters whose values are numbers of a table, or made of the time."""
+        return self.symbols.parameters
+
+    @property
+    def own(self) -> int:
+        """How many of them each trajectory may have of its own."""
+        return len(self.symbols.values if self.timed else self.parameters)
+
+    @property
+    def timed(self) -> bool:
+        return self.driving is not None
+
+    def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
+        """The letters at a time, of a driven system: see `Driving`."""
+        assert self.driving is not None
+        return self.driving.values_at(time, length, fixed)
+
+    @property
     def polynomial(self) -> bool:
         """True if stages are sums and products alone."""
         symbols = self.symbols
@@ -78,10 +101,10 @@ class Splitting:
     @property
     def numbers(self) -> list[str]:
         """The names of the numbers of a column that are given, in the order of a table's rows."""
-        d = self.symbols.ndof
+        d = self.ndof
         damped = 0 if self.friction is None else d**self.friction
         of_friction = [f"{name}_{i}" for name in ("mean", "decay") for i in range(damped)]
-        return ["a", *self.kick_numbers, *of_friction, *(s.name for s in self.symbols.parameters)]
+        return ["a", *self.kick_numbers, *of_friction, *(s.name for s in self.parameters)]
 
     @property
     def terms(self) -> list[int]:
@@ -360,12 +383,11 @@ class SplittingCode(SplittingRollouts):
     def __init__(self, splitting: Splitting, chunked: bool | None = None) -> None:
         self._splitting = splitting
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
-        symbols = splitting.symbols
-        super().__init__(2 * symbols.ndof * (1 + splitting.compensated), 2 * symbols.ndof)
-        self.timed = splitting.driving is not None
+        super().__init__(2 * splitting.ndof * (1 + splitting.compensated), 2 * splitting.ndof)
+        self.timed = splitting.timed
         self.chunked = self.timed or not splitting.polynomial if chunked is None else chunked
         self.lanes = 8 if self.chunked else 16  # chunks need not wait for each other, registers side by side do
-        self._own = len(symbols.values if self.timed else symbols.parameters)
+        self._own = splitting.own
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SplittingCode, (self._splitting,)
@@ -378,7 +400,7 @@ class SplittingCode(SplittingRollouts):
     def size(self) -> int:
         """Numbers of a column that the code reads."""
         if self.timed:
-            letters = len(self._splitting.symbols.parameters) - self._own
+            letters = len(self._splitting.parameters) - self._own
             return len(self._splitting.numbers) - letters + CLOCK
         return max(len(kind.table.outputs) for kind in self._kinds)
 
@@ -425,10 +447,9 @@ class SplittingCode(SplittingRollouts):
 
     def _lettered(self, time: Any, given: Sequence[Any]) -> list[Any]:
         """The numbers of a column of a driven system, of those that are given, with its letters at a time."""
-        driving, clock = self._splitting.driving, self._clock
-        assert driving is not None
+        clock = self._clock
         fixed = given[clock.stop :]
-        return [*given[: clock.start], *fixed, *driving.values_at(time, given[0], fixed)]
+        return [*given[: clock.start], *fixed, *self._splitting.values_at(time, given[0], fixed)]
 
     # the reverse --------------------------------------------------------------------------------------------------
 
@@ -446,7 +467,7 @@ class SplittingCode(SplittingRollouts):
         return [adjoint(traced(lambda *x, of=kind: stage(of, x), *names[0], *names[1], "time")) for kind in self._kinds]
 
     def check_reverse(self) -> None:
-        if self._splitting.symbols.samples or not all(isinstance(kind, Stage) for kind in self._kinds):
+        if not all(isinstance(kind, Stage) for kind in self._kinds) or self._splitting.symbols.samples:
             super().check_reverse()
         self._adjoints  # noqa: B018
 

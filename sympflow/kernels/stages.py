@@ -31,18 +31,10 @@ __all__ = [
 class StageTable:
     """The numbers of m stages, for fixed steps (m,) or as coefficients of polynomials in a variable (m, K).
 
-    Attributes
-    ----------
-    level : int
-        The terms of kicks: see `sympflow.schemes.Scheme.level`.
-    numbers : ndarray of shape (n, m) or (n, m, K)
-        a of the drifts, then of the kicks b and e of each monomial, or b, g and c.
-    times : ndarray of shape (m,) or (m, K), optional
-        When each kick is, counted from the beginning of the step; the default is the sum of the drifts before it.
-    direction : float
-        Steps by which the time moves on with a step of the table: −1 of an inverse.
-    more : ndarray of shape (n, m), optional
-        Further rows: those of friction.
+    `numbers` (n, m) or (n, m, K) are a of the drifts, then of the kicks b and e of each monomial, or b, g and c; `more`
+    are further rows, those of friction. `times` are those of the kicks, counted from the beginning of the step; the
+    default is the sum of the drifts before. The time moves on by `direction` steps with a step of the table: −1 of an
+    inverse.
     """
 
     level: int

@@ -111,28 +111,12 @@ class TableLoops:
 class LabelErrors:
     """Weighted errors of labels after a step, and their derivatives by parameters on which its numbers depend affinely.
 
-    Errors are in the order of the label times, of the components, of the states.
-
-    Parameters
-    ----------
-    loops : TableLoops
-    x : (2d, N)
-        States at the start.
-    t0 : (N,) or None
-        Their times, of a driven system.
-    y : (R, J N)
-        Where they go, times first: of a driven system with its work, or without.
-    scale : (R, J N)
-        Weights of the errors of the first components.
-    slope : (R', J N)
-        Weights of one more error, a sum over the components; none with R' = 0.
-    design : (J, n, f)
-        The derivatives of the numbers, in the order of the stages, by the parameters.
-
-    Attributes
-    ----------
-    matrices : (J, k, f)
-        The derivatives by the parameters, at each time, of k numbers to which all others are in proportion.
+    States x (2d, N) start, of a driven system at times t0 (N,), and go to y (R, J N), times first: of a driven system
+    with its work, or without. `scale` (R, J N) are weights of the errors of the first components, `slope` (R', J N)
+    those of one more error, a sum over the components; `design` (J, n, f) the derivatives of the numbers, in the order
+    of the stages, by the parameters. Errors are in the order of the label times, of the components, of the states.
+    `matrices` (J, k, f) are the derivatives by the parameters, at each time, of k numbers to which all others are in
+    proportion.
     """
 
     def __init__(
@@ -364,8 +348,9 @@ class _Errors:
                 error = self.error(row) * self.weight(self.scale, row)
                 code.store(error, self.r, (j * n_errors + row) * n + start)
             with code.over(n_errors - self.n_rows):
-                (total,) = code.loop(self.n_slopes, [self.zero], self.summed)
-                code.store(total, self.r, (j * n_errors + self.n_rows) * n + start)
+                code.store(
+                    code.fold(self.n_slopes, self.zero, self.summed), self.r, (j * n_errors + self.n_rows) * n + start
+                )
             if self.linearized:
                 with code.over(n_errors) as row:
                     self.back(row)
@@ -404,8 +389,8 @@ class _Errors:
     def error(self, row: Value) -> Value:
         return self.W[self.place(row)] - self.weight(self.Y, row)
 
-    def summed(self, k: Value, total: Sequence[Value]) -> list[Value]:
-        return [fma(self.error(k), self.weight(self.slope, k), total[0])]
+    def summed(self, k: Value, total: Value) -> Value:
+        return fma(self.error(k), self.weight(self.slope, k), total)
 
     # the way there ----------------------------------------------------------------------------------------------------
 
@@ -493,10 +478,8 @@ class _Errors:
         code = self.code
         with code.over(self.n_parameters) as f:
             begin, end = (code.load(self.places, f + i, INT) for i in range(2))
-
-            def more(k: Value, total: Sequence[Value]) -> list[Value]:
+            total = code.variable(self.zero)
+            with code.over(end - begin) as k:
                 number = code.load(self.places, self.n_parameters + 1 + begin + k, INT)
-                return [fma(code.splat(code.load(self.design, begin + k), LANES), self.B[number], total[0])]
-
-            (total,) = code.loop(end - begin, [self.zero], more)
-            code.store(total, self.J, f * stride + place)
+                total.value = fma(code.splat(code.load(self.design, begin + k), LANES), self.B[number], total.value)
+            code.store(total.value, self.J, f * stride + place)

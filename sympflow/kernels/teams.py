@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler.control import INT, Type, Value
+from sympflow.compiler.control import INT, Code, Type, Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import BLOCK
+from sympflow.kernels.runs import BLOCK, Memory, Room
 from sympflow.kernels.stages import evaluated
 from sympflow.kernels.threads import NEVER, threads_for
 
-__all__ = ["Member", "SharedRollouts", "Team", "meet"]
+__all__ = ["Member", "SharedMemory", "SharedRollouts", "Team", "meet"]
 
 ARRIVED, TURN = 0, 8
 """Places in `meeting` (16,), in lines of the cache of their own: threads that are here, and times that all were."""
@@ -109,6 +109,31 @@ class Member:
     room: np.ndarray
     context: np.ndarray
     others: Any = ()
+
+
+class SharedMemory(Memory):
+    """A state in memory as so many sets of numbers, positions, momenta and their errors, which threads share."""
+
+    at_once = 8
+
+    def __init__(self, sets: int, code: Code, width: int, arguments: Sequence[Value], before: bool) -> None:
+        super().__init__(code, width, arguments, before)
+        self._sets, self._context = sets, arguments[3]
+
+    @abstractmethod
+    def copied(self, room: Room, rows: Value, row: Value, sets: int, loads: bool) -> None:
+        """Take sets of a state from a row, or write them there."""
+
+    def open(self, rows: Value, begin: Value, n_rows: Value, given: int | None = None, own: int = 0) -> None:
+        with self._blocks() as (i, type):
+            self.code.store(self.code.constant(0.0, type), self._running.state, i)
+        self.copied(self._running, rows, begin, self._sets if given is None else 2, True)
+
+    def store(self, out: Value, begin: Value, n_rows: Value, stride: Value, at: Value) -> None:
+        self.copied(self._end, out, begin * stride + at, 2, False)
+
+    def keep(self, running: Value, begin: Value, n_rows: Value) -> None:
+        self.copied(self._running, running, begin, self._sets, False)
 
 
 class SharedRollouts(SplittingRollouts):

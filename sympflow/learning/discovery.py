@@ -18,12 +18,12 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import plain
+from sympflow.arguments import MAX_ASKED_VALUES, plain, real_number
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning import diagnosis
-from sympflow.learning.fitting import STEP_ERROR, limit_of
+from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.regression import Regression
 from sympflow.learning.shooting import Fit, Method, Problem, chosen_method, minimized
@@ -73,6 +73,8 @@ COMPARED = 2000
 """States over which terms are compared, and of a flow's Hamiltonian."""
 STARTS = 4
 """Regressions from which the search begins at most."""
+HIGHEST = 30
+"""Degree of polynomials, at most."""
 OF_A_FLOW = 5.0
 """Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are no noise."""
 
@@ -291,10 +293,15 @@ def discover(
     trajectories.check_moving()
     period = reading.get("period")
     trajectories.check_angles(None if period is None else np.isinf(periods_of(period, trajectories.ndof)))
-    if not 0 <= held_out < 1:
+    if not (real_number(held_out) and 0 <= held_out < 1):
         raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
-    if piece is not None and not piece > 0:
+    if piece is not None and not (real_number(piece) and piece > 0):
         raise ValueError(f"`piece` must be a positive time; got {piece!r}: leave it out for about one period.")
+    if progress is not None and not callable(progress):
+        raise TypeError(f"`progress` must be a function of a line of text; got {progress!r}: leave it out.")
+    if plain(degree) in range(HIGHEST + 1, MAX_ASKED_VALUES):
+        raise ValueError(f"`degree` must be at most {HIGHEST}; got {degree!r}: give other `terms`.")
+    degree, most_terms, seed = plain(degree), plain(most_terms), plain(seed)
     for argument, value, least in (("degree", degree, 1), ("most_terms", most_terms, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"`{argument}` must be an integer, {least} or more; got {value!r}.")
@@ -344,7 +351,7 @@ class _Search:
         self.doubt: Reading | None = None
         self.tube: Domain | None = None
         self.data, self.say, self.most_terms, self.huber = data, say, most_terms, huber
-        self.known = _noise(noise, 2 * data.ndof)
+        self.known = noise_of(noise, data.ndof)
         n = len(data.runs)
         drawn = np.random.default_rng(seed).permutation(n).tolist()
         count = min(round(held_out * n), n - 1) if n > 4 else 0
@@ -748,17 +755,6 @@ class _Search:
 def _residual(cost: float, freedom: int) -> float:
     """The root mean square of the residuals over the noise."""
     return math.sqrt(cost / max(freedom, 1))
-
-
-def _noise(noise: Any, width: int) -> np.ndarray | None:
-    if noise is None:
-        return None
-    sigma = np.asarray(noise, dtype=float)
-    if sigma.shape not in ((), (width,)) or not (np.isfinite(sigma).all() and (sigma >= 0).all()):
-        raise ValueError(
-            f"`noise` must be a number, at least 0, or one for each of {width} coordinates; got {noise!r}."
-        )
-    return np.broadcast_to(sigma, (width,)).copy()
 
 
 def _in_product(f: sp.Expr) -> str:

@@ -43,45 +43,21 @@ MOST_TERMS = 400
 
 
 @dataclass(frozen=True)
-class Said:
-    """Knowledge of H.
+class Constraints:
+    """Knowledge of H."""
 
-    Attributes
-    ----------
-    scales : ndarray of shape (2d,)
-        The spread of each coordinate in the data.
-    separable : bool or None
-        None for not known.
-    inverse_mass : ndarray of shape (d, d) or None
-    force : callable or None
-        Friction or drag whose factors are to be learned, as `models.friction`.
-    periods : ndarray of shape (2d,)
-        Of the coordinates that are angles, infinite for the others.
-    known : tuple of Formula
-        Parts of H.
-    momenta : ndarray of shape (d, d) or None
-        The covariance of the momenta along a trajectory, in their mean; None where it is not known.
-    flow_scaling : Scaling or None
-        The units of a flow that is fitted itself, and its Δt; None for none.
-    velocities : bool
-        True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or M₁₁ in the middle of the data.
-    middle : ndarray of shape (d,) or None
-        The mean of q.
-    frequency : float or None
-        ω of a drive, about.
-    """
-
-    scales: np.ndarray
-    separable: bool | None
-    inverse_mass: np.ndarray | None
-    force: Force | None
-    periods: np.ndarray
-    known: tuple[Formula, ...] = ()
+    scales: np.ndarray  # (2d,): The spread of each coordinate in the data
+    separable: bool | None  # None for not known
+    inverse_mass: np.ndarray | None  # (d, d)
+    force: Force | None  # Friction or drag whose factors are to be learned, as `models.friction`
+    periods: np.ndarray  # (2d,): Of the coordinates that are angles, infinite for the others
+    known: tuple[Formula, ...] = ()  # Parts of H
+    # (d, d): The covariance of the momenta along a trajectory, in their mean; None where it is not known
     momenta: np.ndarray | None = None
-    flow_scaling: Scaling | None = None
-    velocities: bool = False
-    middle: np.ndarray | None = None
-    frequency: float | None = None
+    flow_scaling: Scaling | None = None  # The units of a flow that is fitted itself, and its Δt; None for none
+    velocities: bool = False  # True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or M₁₁ in the middle of the data
+    middle: np.ndarray | None = None  # (d,): The mean of q
+    frequency: float | None = None  # ω of a drive, about
 
     @property
     def ndof(self) -> int:
@@ -152,61 +128,61 @@ def _few(degrees: Sequence[int], of: str, scales: np.ndarray) -> Iterator[tuple[
             yield degree, Polynomial.up_to(degree, of, scales)
 
 
-def _polynomials(said: Said) -> Iterator[Candidate]:
-    for degree, V in _few(DEGREES, "q", said.scales[: said.ndof]):
-        yield Candidate(f"{T}, V a polynomial of degree {degree}", said.separated(V))
+def _polynomials(constraints: Constraints) -> Iterator[Candidate]:
+    for degree, V in _few(DEGREES, "q", constraints.scales[: constraints.ndof]):
+        yield Candidate(f"{T}, V a polynomial of degree {degree}", constraints.separated(V))
 
 
-def _whole_polynomials(said: Said) -> Iterator[Candidate]:
-    for degree, H in _few(DEGREES, "y", said.scales):
-        yield Candidate(f"H(q, p) a polynomial of degree {degree}", said.whole(H))
+def _whole_polynomials(constraints: Constraints) -> Iterator[Candidate]:
+    for degree, H in _few(DEGREES, "y", constraints.scales):
+        yield Candidate(f"H(q, p) a polynomial of degree {degree}", constraints.whole(H))
 
 
-def _waves(said: Said) -> Iterator[Candidate]:
-    q = slice(0, said.ndof)
-    for harmonics in HARMONICS if said.angles else ():
-        V = Waves.up_to(harmonics, max(harmonics, 2), "q", said.scales[q], said.periods[q])
+def _waves(constraints: Constraints) -> Iterator[Candidate]:
+    q = slice(0, constraints.ndof)
+    for harmonics in HARMONICS if constraints.angles else ():
+        V = Waves.up_to(harmonics, max(harmonics, 2), "q", constraints.scales[q], constraints.periods[q])
         if V.n <= MOST_TERMS:
-            yield Candidate(f"{T}, V a Fourier series of {harmonics} harmonics", said.separated(V))
+            yield Candidate(f"{T}, V a Fourier series of {harmonics} harmonics", constraints.separated(V))
 
 
-def _whole_waves(said: Said) -> Iterator[Candidate]:
-    for harmonics in HARMONICS[1:] if said.angles else ():
-        H = Waves.up_to(harmonics, 2, "y", said.scales, said.periods)
+def _whole_waves(constraints: Constraints) -> Iterator[Candidate]:
+    for harmonics in HARMONICS[1:] if constraints.angles else ():
+        H = Waves.up_to(harmonics, 2, "y", constraints.scales, constraints.periods)
         if H.n <= MOST_TERMS:
-            yield Candidate(f"H(q, p) quadratic in p, a Fourier series of {harmonics} harmonics", said.whole(H))
+            yield Candidate(f"H(q, p) quadratic in p, a Fourier series of {harmonics} harmonics", constraints.whole(H))
 
 
-def _inertia(said: Said) -> Iterator[Candidate]:
-    q = slice(0, said.ndof)
-    scales, periods = said.scales[q], said.periods[q]
-    for order in () if said.kinetic_is_known else ORDERS:
+def _inertia(constraints: Constraints) -> Iterator[Candidate]:
+    q = slice(0, constraints.ndof)
+    scales, periods = constraints.scales[q], constraints.periods[q]
+    for order in () if constraints.kinetic_is_known else ORDERS:
         V = Waves.up_to(order, max(order, 2), "q", scales, periods)
         M = Waves.up_to(order, order, "q", scales, periods, constant=True)
-        part = Inertia(M, unit=said.middle if said.velocities else None)
+        part = Inertia(M, unit=constraints.middle if constraints.velocities else None)
         if V.n + part.n <= MOST_TERMS:
-            yield Candidate(f"H = ½ pᵀM(q)⁻¹p + V(q), M and V series of order {order}", said.whole(part, V))
+            yield Candidate(f"H = ½ pᵀM(q)⁻¹p + V(q), M and V series of order {order}", constraints.whole(part, V))
 
 
-def _magnetic(said: Said) -> Iterator[Candidate]:
-    d = said.ndof
+def _magnetic(constraints: Constraints) -> Iterator[Candidate]:
+    d = constraints.ndof
     exponents = [np.eye(2 * d, dtype=int)[[i, d + j]].sum(axis=0) for i, j in combinations(range(d), 2)]
-    for degree, V in _few(DEGREES, "q", said.scales[:d]) if exponents else ():
-        turn = Polynomial("y", exponents, said.scales)
+    for degree, V in _few(DEGREES, "q", constraints.scales[:d]) if exponents else ():
+        turn = Polynomial("y", exponents, constraints.scales)
         yield Candidate(
-            f"H = ½ pᵀM⁻¹p + Σ b_ij q_i p_j + V, V a polynomial of degree {degree}", said.separated(turn, V)
+            f"H = ½ pᵀM⁻¹p + Σ b_ij q_i p_j + V, V a polynomial of degree {degree}", constraints.separated(turn, V)
         )
 
 
-def _central(said: Said) -> Iterator[Candidate]:
-    d, size = said.ndof, 2 * float(np.mean(said.scales[: said.ndof]))
-    if said.angles or d not in (2, 3):
+def _central(constraints: Constraints) -> Iterator[Candidate]:
+    d, size = constraints.ndof, 2 * float(np.mean(constraints.scales[: constraints.ndof]))
+    if constraints.angles or d not in (2, 3):
         return
     bodies = np.arange(d)[None]
     for powers in POWERS:
         yield Candidate(
             f"{T}, V of the distance from the origin, {_of_powers(powers)}",
-            said.separated(Distances.between(bodies, powers, size, central=True)),
+            constraints.separated(Distances.between(bodies, powers, size, central=True)),
         )
 
 
@@ -214,9 +190,9 @@ def _of_powers(powers: Sequence[int]) -> str:
     return "1/r" if powers == (-1,) else "powers of r from −2 to 2 and log r"
 
 
-def _pairs(said: Said) -> Iterator[Candidate]:
-    d = said.ndof
-    size = 2 * float(np.mean(said.scales[:d]))
+def _pairs(constraints: Constraints) -> Iterator[Candidate]:
+    d = constraints.ndof
+    size = 2 * float(np.mean(constraints.scales[:d]))
     for dim in (2, 3):
         if d % dim or d < 2 * dim:
             continue
@@ -226,31 +202,39 @@ def _pairs(said: Said) -> Iterator[Candidate]:
         }
         for central, powers in product((False, True), POWERS):
             for order, bodies in orders.items():
-                if not central and not said.at_rest(bodies):
+                if not central and not constraints.at_rest(bodies):
                     continue
                 name = f"{T}, V of the distances of {len(bodies)} bodies in {dim} dimensions"
                 name += f"{' and from the origin' * central}, {order}, {_of_powers(powers)}"
-                yield Candidate(name, said.separated(Distances.between(bodies, powers, size, central)))
+                yield Candidate(name, constraints.separated(Distances.between(bodies, powers, size, central)))
 
 
-def _networks(said: Said) -> Iterator[Candidate]:
-    q = slice(0, said.ndof)
+def _networks(constraints: Constraints) -> Iterator[Candidate]:
+    q = slice(0, constraints.ndof)
     for width in WIDTHS:
-        network = Network("q", width, said.scales[q], said.periods[q])
+        network = Network("q", width, constraints.scales[q], constraints.periods[q])
         name = f"{T}, V a network of {width} neurons"
-        yield Candidate(name, said.separated(_quadratic("q", said.scales[q], said.periods[q]), network))
+        yield Candidate(
+            name, constraints.separated(_quadratic("q", constraints.scales[q], constraints.periods[q]), network)
+        )
 
 
-def _whole_networks(said: Said) -> Iterator[Candidate]:
+def _whole_networks(constraints: Constraints) -> Iterator[Candidate]:
     for width in WHOLE_WIDTHS:
-        network = Network("y", width, said.scales, said.periods)
+        network = Network("y", width, constraints.scales, constraints.periods)
         name = f"H(q, p) a network of {width} neurons"
-        yield Candidate(name, said.whole(_quadratic("y", said.scales, said.periods), network))
+        yield Candidate(name, constraints.whole(_quadratic("y", constraints.scales, constraints.periods), network))
 
 
-def _flows(said: Said) -> Iterator[Candidate]:
-    scaling = said.flow_scaling
-    told = said.force or said.frequency or said.known or said.inverse_mass is not None or said.angles
+def _flows(constraints: Constraints) -> Iterator[Candidate]:
+    scaling = constraints.flow_scaling
+    told = (
+        constraints.force
+        or constraints.frequency
+        or constraints.known
+        or constraints.inverse_mass is not None
+        or constraints.angles
+    )
     if scaling is None or told:
         return
     for pairs, width, palindromic in FLOW_SIZES:
@@ -267,29 +251,19 @@ def _quadratic(of: str, scales: np.ndarray, periods: np.ndarray) -> Polynomial:
 
 @dataclass(frozen=True)
 class Family:
-    """Models of one kind.
+    """Models of one kind."""
 
-    Attributes
-    ----------
-    separable : bool
-        True of the form T(p) + V(q).
-    models : callable
-        models(said): candidates from simple to rich, none where the family does not apply.
-    linear : bool
-        True of models that are linear in their numbers, and soon fitted. Before those that are not, the data are asked
-        whether any H explains them.
-    observed : str
-        What its numbers can be told by: "qp" for states, "qv" for velocities, "both".
-    """
-
-    separable: bool
-    models: Callable[[Said], Iterator[Candidate]]
+    separable: bool  # True of the form T(p) + V(q)
+    # models(constraints): candidates from simple to rich, none where the family does not apply
+    models: Callable[[Constraints], Iterator[Candidate]]
+    # True of models that are linear in their numbers, and soon fitted. Before those that are not, the data are asked
+    # whether any H explains them
     linear: bool = True
-    observed: str = "both"
+    observed: str = "both"  # What its numbers can be told by: "qp" for states, "qv" for velocities, "both"
 
-    def tells(self, said: Said) -> bool:
+    def tells(self, constraints: Constraints) -> bool:
         """True if what is observed can tell the numbers of its models."""
-        return self.observed in ("both", "qv" if said.velocities else "qp")
+        return self.observed in ("both", "qv" if constraints.velocities else "qp")
 
 
 FAMILIES = {
@@ -312,7 +286,7 @@ uniform magnetic field, in Landau's gauge; the next three are functions H(q, p).
 neural potentials, which are fitted to the data themselves, and no H is learned."""
 
 
-def families(said: Said, name: str | None) -> list[str]:
+def families(constraints: Constraints, name: str | None) -> list[str]:
     """The names of the families that fit what is known, or of the one that is asked for.
 
     Raises
@@ -322,15 +296,21 @@ def families(said: Said, name: str | None) -> list[str]:
     """
     if name is not None and name not in FAMILIES:
         raise ValueError(f"`family` {name!r} is unknown: choose from {', '.join(FAMILIES)}, or leave it out.")
-    if name is not None and said.separable and not FAMILIES[name].separable:
+    if name is not None and constraints.separable and not FAMILIES[name].separable:
         raise ValueError(
             f"`family` {name!r} is of functions H(q, p), not separable: leave out `separable` or `family`."
         )
-    if said.frequency is not None and (said.separable is False or (name and not FAMILIES[name].separable)):
+    if constraints.frequency is not None and (
+        constraints.separable is False or (name and not FAMILIES[name].separable)
+    ):
         raise ValueError("`drive` is of a separable H: leave out `separable`, or the `family`.")
-    if said.inverse_mass is not None and (said.separable is False or (name and not FAMILIES[name].separable)):
+    if constraints.inverse_mass is not None and (
+        constraints.separable is False or (name and not FAMILIES[name].separable)
+    ):
         raise ValueError("`mass` is of T = ½ pᵀM⁻¹p in a separable H: leave out one of them.")
-    if name is not None and not (FAMILIES[name].tells(said) and any(True for _ in FAMILIES[name].models(said))):
+    if name is not None and not (
+        FAMILIES[name].tells(constraints) and any(True for _ in FAMILIES[name].models(constraints))
+    ):
         raise ValueError(
             f"`family` {name!r} does not apply: series need the `period` of an angle, pairs the coordinates of two "
             "bodies or more in two or three dimensions, central fields those of one, functions H(q, p) and flows "
@@ -339,12 +319,12 @@ def families(said: Said, name: str | None) -> list[str]:
         )
     if name is not None:
         return [name]
-    only = said.separable if said.inverse_mass is None and said.frequency is None else True
-    kinds = {name: family for name, family in FAMILIES.items() if family.tells(said)}
+    only = constraints.separable if constraints.inverse_mass is None and constraints.frequency is None else True
+    kinds = {name: family for name, family in FAMILIES.items() if family.tells(constraints)}
     return [name for name, family in kinds.items() if only is None or family.separable == only]
 
 
-def with_unit_mass(candidate: Candidate, said: Said) -> Candidate | None:
+def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate | None:
     """The same model with T = ½ p²; None if its T is not learned."""
     parts = candidate.model.parts
     if not any(part.of == "p" and part.n for part in parts) or (
@@ -353,7 +333,7 @@ def with_unit_mass(candidate: Candidate, said: Said) -> Candidate | None:
         return None
     rest = tuple(part for part in parts if part.of != "p")
     name = candidate.name.replace("T = ½ pᵀM⁻¹p", "T = ½ p²")
-    return Candidate(name, replace(candidate.model, parts=(FixedKinetic(np.eye(said.ndof)), *rest)))
+    return Candidate(name, replace(candidate.model, parts=(FixedKinetic(np.eye(constraints.ndof)), *rest)))
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:
@@ -361,14 +341,6 @@ def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, value
 
     Terms are left out one by one, that one first which, by the quadratic approximation of χ² at its minimum, raises it
     least, as long as Schwarz's criterion gains: by less than the logarithm of the number of values.
-
-    Parameters
-    ----------
-    theta : ndarray of shape (n,)
-    precision : ndarray of shape (n, n)
-        Half the second derivative of χ² by θ.
-    values : int
-        Numbers observed.
 
     References
     ----------

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import floats
 from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.models import Model
 from sympflow.learning.shooting import (
@@ -65,37 +66,34 @@ def limit_of(loss: str) -> float | None:
     return LOSSES[loss]
 
 
+def noise_of(noise: Any, ndof: int) -> np.ndarray | None:
+    """σ of each coordinate (2d,) as it was given; None if it was not."""
+    if noise is None:
+        return None
+    sigma = floats("noise", noise)
+    if sigma.shape not in ((), (2 * ndof,)) or not ((sigma >= 0) & (sigma < np.inf)).all():
+        raise ValueError(
+            f"`noise` must be a standard deviation, 0 or more, or one for each of the {2 * ndof} coordinates; got "
+            f"{noise!r}: leave it out where it is not known."
+        )
+    return np.broadcast_to(sigma, 2 * ndof).astype(float)
+
+
 @dataclass(frozen=True)
 class Setting:
-    """How a model is fitted.
+    """How a model is fitted."""
 
-    Attributes
-    ----------
-    noise : ndarray of shape (2d,) or None
-        σ of each coordinate; None for estimated.
-    huber : float or None
-        Residuals of more than so many σ count by their size.
-    stop : callable
-        Asked between steps.
-    seen : ndarray of shape (2d,) or None
-        The noise as it is seen without a model, at most: 0 where it is not.
-    lag : float
-        The time after which residuals are compared, if points are closer: what a model leaves is there still, while the
-        noise of data that were smoothed is another.
-    rival : ndarray of shape (2d,) or None
-        The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is given
-        up.
-    sketch : bool
-        True to end with orbits of a few points.
-    """
-
-    noise: np.ndarray | None = None
-    huber: float | None = None
-    stop: Stop = never
-    seen: np.ndarray | None = None
+    noise: np.ndarray | None = None  # (2d,): σ of each coordinate; None for estimated
+    huber: float | None = None  # Residuals of more than so many σ count by their size
+    stop: Stop = never  # Asked between steps
+    seen: np.ndarray | None = None  # (2d,): The noise as it is seen without a model, at most: 0 where it is not
+    # The time after which residuals are compared, if points are closer: what a model leaves is there still, while the
+    # noise of data that were smoothed is another
     lag: float = 0.0
+    # (2d,): The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is
+    # given up
     rival: np.ndarray | None = None
-    sketch: bool = False
+    sketch: bool = False  # True to end with orbits of a few points
 
     def plausible(self, noise: np.ndarray) -> bool:
         """True unless a model leaves so much (2d,) that it is rejected whatever its last digits are."""
@@ -115,25 +113,14 @@ class Setting:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A model with its numbers.
-
-    Attributes
-    ----------
-    fit : Fit
-        Of whole trajectories, or of pieces no longer than `span`; of a few points if that is 0.
-    sigma : ndarray of shape (2d,)
-        The noise, by the residuals or as it was given.
-    span : float
-    costs : list of float
-        χ² over the number of values after each step.
-    """
+    """A model with its numbers."""
 
     model: Field
     theta: np.ndarray
-    sigma: np.ndarray
-    fit: Fit
+    sigma: np.ndarray  # (2d,): The noise, by the residuals or as it was given
+    fit: Fit  # Of whole trajectories, or of pieces no longer than `span`; of a few points if that is 0
     span: float
-    costs: list[float]
+    costs: list[float]  # χ² over the number of values after each step
 
     @property
     def method(self) -> Method:
@@ -155,10 +142,7 @@ def fitted(
 ) -> Fitted:
     """Fit a model: to increments, to orbits of a few points, and to orbits as long as their errors stay small.
 
-    Parameters
-    ----------
-    theta : ndarray or Fitted, optional
-        A start, or the fit of the same model to other trajectories, whose orbits are as long at once; else one is made.
+    `theta` is a start, or the fit of the same model to other trajectories, whose orbits are as long at once.
     """
     scales, former = data.scales, theta if isinstance(theta, Fitted) else None
     theta = theta.theta if isinstance(theta, Fitted) else theta
@@ -271,39 +255,19 @@ def _span(
 
 @dataclass(frozen=True)
 class Held:
-    """How well a model explains trajectories that it was not fitted to; only their initial states are fitted.
+    """How well a model explains trajectories that it was not fitted to; only their initial states are fitted."""
 
-    Attributes
-    ----------
-    pieces : tuple of Run
-        The pieces of trajectories, each followed as one orbit.
-    residuals : tuple of ndarray
-        Of each piece, (2d, k); where the loss is robust outliers are limited.
-    losses : ndarray of shape (N,)
-        Minus the log-likelihood of each trajectory.
-    values : int
-        Numbers observed.
-    correlation : float
-        Of one residual with the next, or with one a lag later; NaN where there are none.
-    pairs : int
-        How many of them count as independent.
-    exact : bool
-        True if residuals are no more than rounding and the scheme leave.
-    loudness : float
-        Their root mean square in σ, of the noise on the trajectories that the model was fitted to; ρ in place of the
-        squares where the loss is robust.
-    excess : float
-        The noise that the model leaves of a coordinate, over that which is seen without a model; the largest.
-    """
-
-    pieces: tuple[Run, ...]
-    residuals: tuple[np.ndarray, ...]
-    losses: np.ndarray
-    values: int
-    correlation: float
-    pairs: int
-    exact: bool
+    pieces: tuple[Run, ...]  # The pieces of trajectories, each followed as one orbit
+    residuals: tuple[np.ndarray, ...]  # Of each piece, (2d, k); where the loss is robust outliers are limited
+    losses: np.ndarray  # (N,): Minus the log-likelihood of each trajectory
+    values: int  # Numbers observed
+    correlation: float  # Of one residual with the next, or with one a lag later; NaN where there are none
+    pairs: int  # How many of them count as independent
+    exact: bool  # True if residuals are no more than rounding and the scheme leave
+    # Their root mean square in σ, of the noise on the trajectories that the model was fitted to; ρ in place of the
+    # squares where the loss is robust
     loudness: float
+    # The noise that the model leaves of a coordinate, over that which is seen without a model; the largest
     excess: float = 0.0
     lag: float = 0.0
 
@@ -320,6 +284,8 @@ class Held:
     @property
     def complaint(self) -> str:
         """The reason why they are no noise."""
+        if not math.isfinite(self.loudness):
+            return "there was no time to follow them"
         if self.excess >= LOUDER:
             return f"they are {self.excess:.1f} times the noise that is seen without a model"
         if self.loudness >= LOUDER:

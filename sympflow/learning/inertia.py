@@ -17,15 +17,6 @@ class Inertia(Part):
     """½ pᵀM(q)⁻¹p, M symmetric, its entries sums Σ_k θ_k f_k(q) of given functions.
 
     With v = M⁻¹p Lagrange's equations p = M v and p' = ½ vᵀ(∂M/∂q)v − ∂V/∂q are linear in θ, which gives a start.
-
-    Parameters
-    ----------
-    functions : Waves
-        f, of q.
-    entries : ndarray of int, shape (n, 3), optional
-        For each θ the places k, i and j, i ≤ j; the default is all of them.
-    unit : ndarray of shape (d,), optional
-        q at which M₁₁ is 1: of velocities alone M is known but for a factor. The constant of M₁₁ is none of θ then.
     """
 
     of = "y"

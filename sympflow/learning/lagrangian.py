@@ -59,13 +59,7 @@ def _linear(part: Part) -> Part:
 
 
 class Equations:
-    """Lagrange's equations of a model along curves with rows q, p or v as observed, and v.
-
-    Parameters
-    ----------
-    model : Model
-    curves : Trajectories
-    """
+    """Lagrange's equations of a model along curves with rows q, p or v as observed, and v."""
 
     def __init__(self, model: Model, curves: Trajectories) -> None:
         self.model, self.d, self.observed = model, model.ndof, not curves.velocities

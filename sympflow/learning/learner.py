@@ -23,7 +23,7 @@ from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
 from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.diagnosis import drive_frequency, hint
-from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Said, families, pruned, with_unit_mass
+from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Constraints, families, pruned, with_unit_mass
 from sympflow.learning.fitting import (
     LAG,
     SILENT,
@@ -36,6 +36,7 @@ from sympflow.learning.fitting import (
     kept,
     left_out,
     limit_of,
+    noise_of,
     restored,
 )
 from sympflow.learning.library import library_for
@@ -59,7 +60,7 @@ from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.storage.identity import digest
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Path, Session, Silent
-from sympflow.training.starts import suited_step
+from sympflow.training.starts import step_of
 from sympflow.training.trainer import train
 from sympflow.workers import WorkerPool
 
@@ -74,6 +75,7 @@ HOPELESS = 2.0  # squares of increments, over those of the best model, from whic
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
 DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
+TABLE_SECONDS = 2.5  # that a flow takes, which is no more than 60 % of a time budget
 TABLE_SHARE = 0.3  # of a time budget, likewise
 HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
 MOST_VALUES = 40_000  # numbers observed by which models are chosen; the chosen one is fitted to all
@@ -197,9 +199,10 @@ def learn(
     data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()
     data.check_angles(None if period is None else np.isinf(periods_of(period, data.ndof)))
+    seed, damping = plain(seed), plain(damping)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
-    said = _said(data, separable, mass, damping, period, known)
+    constraints = _constraints(data, separable, mass, damping, period, known)
     check_drive(drive)
     huber = limit_of(loss)
     dt = plain(dt)
@@ -209,20 +212,22 @@ def learn(
     smooth = smoothed(data)
     rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
     seen = smooth.sigma if data.n_points >= ROUGH else None
-    setting = Setting(_noise(noise, data), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
+    setting = Setting(noise_of(noise, data.ndof), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
     if drive is not False:
-        said = replace(said, frequency=_frequency(said, smooth) if drive is True else float(drive))
-    said = replace(said, flow_scaling=data.scaling._replace(t=_step(data, rate) if dt is None else float(dt)))
-    chosen = families(said, family)
+        constraints = replace(constraints, frequency=_frequency(constraints, smooth) if drive is True else float(drive))
+    constraints = replace(
+        constraints, flow_scaling=data.scaling._replace(t=_step(data, rate) if dt is None else float(dt))
+    )
+    chosen = families(constraints, family)
     folds = [(_cut(one, rate), _cut(others, rate)) for one, others in _divided(data, seed)]
     if len(folds) == 1:
         folds = [(_few(folds[0][0], seed), _few(folds[0][1], seed))]
     if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0 or replicas == 1:
         raise ValueError(f"`replicas` must be an integer, 0, or 2 or more; got {replicas!r}: 20 give useful bands.")
     options: dict[str, Any] = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
-    options["drive"] = said.frequency
-    identity = _identity(data, said, setting, options)
-    search = Search(_cut(data, rate), folds, said, setting, seed, identity=identity, whole=data)
+    options["drive"] = constraints.frequency
+    identity = _identity(data, constraints, setting, options)
+    search = Search(_cut(data, rate), folds, constraints, setting, seed, identity=identity, whole=data)
     if resume is not None:
         search.resume(resume)
     with session.interruption, session.pool:
@@ -272,10 +277,10 @@ def check_drive(drive: Any) -> None:
         )
 
 
-def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Said:
+def _constraints(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Constraints:
     if separable is not None:
         check_flag("separable", separable)
-    if damping not in DAMPINGS:
+    if not isinstance(damping, bool | str) or damping not in DAMPINGS:
         raise ValueError(
             f'`damping` must be True for one rate that is learned, "each" for one of each p, "quadratic" for drag, or '
             f"False; got {damping!r}."
@@ -291,18 +296,18 @@ def _said(data: Trajectories, separable: Any, mass: Any, damping: Any, period: A
     momenta = None if data.velocities else _covariance(data)
     middle = np.nanmean(np.concatenate([run.y[:d] for run in data.runs], axis=1), axis=1)
     of_data: dict[str, Any] = {"momenta": momenta, "velocities": data.velocities, "middle": middle}
-    return Said(data.scales, separable, inverse, DAMPINGS[damping], _periods(period, d), parts, **of_data)
+    return Constraints(data.scales, separable, inverse, DAMPINGS[damping], _periods(period, d), parts, **of_data)
 
 
-def _frequency(said: Said, smooth: Smooth) -> float:
+def _frequency(constraints: Constraints, smooth: Smooth) -> float:
     """The angular frequency of a drive, by slopes beside those of a library of terms and friction."""
-    d, x = said.ndof, smooth.points
+    d, x = constraints.ndof, smooth.points
     if not len(x):
         raise ValueError("`drive` cannot be found without successive points that have all values: give its frequency.")
     fields = library_for(None, d, 4, x)[0].fields(x)
-    resistance = np.moveaxis((said.force or frictions)(x.T)[0], -1, 0)
-    base = said.driven(1.0)
-    return drive_frequency(np.concatenate([fields, resistance], axis=2), smooth, said.scales, base)
+    resistance = np.moveaxis((constraints.force or frictions)(x.T)[0], -1, 0)
+    base = constraints.driven(1.0)
+    return drive_frequency(np.concatenate([fields, resistance], axis=2), smooth, constraints.scales, base)
 
 
 def _covariance(data: Trajectories) -> np.ndarray:
@@ -338,23 +343,13 @@ def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
     return tuple(Formula(of, f.subs(values), names) for of, f, names in parts if f.free_symbols & set(names))
 
 
-def _identity(data: Trajectories, said: Said, setting: Setting, options: dict[str, Any]) -> dict[str, Any]:
+def _identity(
+    data: Trajectories, constraints: Constraints, setting: Setting, options: dict[str, Any]
+) -> dict[str, Any]:
     """The description that a search must share with the one that it goes on with."""
-    known = [str(part.formula) for part in said.known]
-    of_data = digest([data, said.inverse_mass, said.periods, setting.noise])
+    known = [str(part.formula) for part in constraints.known]
+    of_data = digest([data, constraints.inverse_mass, constraints.periods, setting.noise])
     return {"config": json.dumps(options), "architecture": json.dumps(known), "system": of_data}
-
-
-def _noise(noise: Any, data: Trajectories) -> np.ndarray | None:
-    if noise is None:
-        return None
-    sigma = floats("noise", noise)
-    if sigma.shape not in ((), (2 * data.ndof,)) or not ((sigma >= 0) & (sigma < np.inf)).all():
-        raise ValueError(
-            f"`noise` must be a standard deviation, 0 or more, or one for each of the {2 * data.ndof} coordinates; got "
-            f"{noise!r}: leave it out where it is not known."
-        )
-    return np.broadcast_to(sigma, 2 * data.ndof).astype(float)
 
 
 @dataclass(frozen=True)
@@ -443,27 +438,13 @@ Chosen = tuple[Candidate, Fitted, Held]
 
 @dataclass(frozen=True)
 class Freedom:
-    """A vector field that need not be Hamiltonian, or another order of the coordinates, beside the best H.
+    """A vector field that need not be Hamiltonian, or another order of the coordinates, beside the best H."""
 
-    Attributes
-    ----------
-    said : str
-        The field in words.
-    remedy : str
-        What to do where it has a form that is known; empty where it has none.
-    share : float
-        Of the squares of held-out residuals, that it leaves.
-    defect : float
-        The size of LᵀJ + JL, over that of JL, L its Jacobian: 0 for a Hamiltonian.
-    rate : float
-        At which volumes of phase space grow.
-    """
-
-    said: str
-    remedy: str
-    share: float
-    defect: float
-    rate: float
+    said: str  # The field in words
+    remedy: str  # What to do where it has a form that is known; empty where it has none
+    share: float  # Of the squares of held-out residuals, that it leaves
+    defect: float  # The size of LᵀJ + JL, over that of JL, L its Jacobian: 0 for a Hamiltonian
+    rate: float  # At which volumes of phase space grow
 
 
 def _certain(numbers: slice, fit: Fitted, held: Held) -> bool:
@@ -480,7 +461,7 @@ class Search:
     all: Trajectories
     folds: list[tuple[Trajectories, Trajectories]]
     """Divisions into trajectories that models are fitted to and held-out ones: one, or each trajectory in turn."""
-    said: Said
+    constraints: Constraints
     setting: Setting
     seed: int
     history: list[dict[str, Any]] = field(default_factory=list)
@@ -541,10 +522,12 @@ class Search:
 
     def run(self, names: list[str], session: Session) -> None:
         """Fit models of these families until one explains the held-out trajectories, or no richer one does better."""
-        deadline = session.deadline.part(1 - TABLE_SHARE) if session.time_budget is not None else session.deadline
+        deadline = session.deadline
+        if session.time_budget is not None:
+            deadline = deadline.part(1 - max(TABLE_SHARE, min(0.6, TABLE_SECONDS / session.time_budget)))
         self.late = deadline.over
         setting = replace(self.setting, stop=deadline.over)
-        total = sum(1 for name in names for _ in FAMILIES[name].models(self.said))
+        total = sum(1 for name in names for _ in FAMILIES[name].models(self.constraints))
         with session.bar(total, "Models") as self.bar:
             queue = self._ask(names, setting, session)
             if self.best is not None:
@@ -567,7 +550,7 @@ class Search:
             precision = found.fit.normal.precision()
             self._simplify(pruned(candidate, found.theta, precision, self.data.n_values), setting, session)
         if not deadline.over():
-            self._simplify(with_unit_mass(self.winner[0], self.said), setting, session)
+            self._simplify(with_unit_mass(self.winner[0], self.constraints), setting, session)
         candidate, self.final, _ = self.winner
         if not deadline.over():
             smooth = replace(setting, seen=None) if self.winner[2].lag else setting
@@ -584,10 +567,10 @@ class Search:
         families are returned in the order in which they are to be tried, with True for those that are linear: those
         that leave much more of increments than the best of all are the last.
         """
-        queue = [(FAMILIES[name].linear, [*FAMILIES[name].models(self.said)]) for name in names]
+        queue = [(FAMILIES[name].linear, [*FAMILIES[name].models(self.constraints)]) for name in names]
         linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
         drive = None
-        if self.said.frequency is None and not self.data.velocities and not self.late():
+        if self.constraints.frequency is None and not self.data.velocities and not self.late():
             drive = self._drive()
         models = [candidate.model for candidate in linear]
         found = best_by_increments(*self.folds[0], models, drive, setting.stop)
@@ -618,9 +601,9 @@ class Search:
     def _drive(self) -> Drive | None:
         """A drive of the likeliest frequency; None where the data cannot tell one."""
         smooth = smoothed(self.data)
-        if len(np.unique(smooth.owner)) < 2 or len(smooth.points) < 4 * self.said.driven(1.0).n:
+        if len(np.unique(smooth.owner)) < 2 or len(smooth.points) < 4 * self.constraints.driven(1.0).n:
             return None
-        return self.said.driven(_frequency(self.said, smooth))
+        return self.constraints.driven(_frequency(self.constraints, smooth))
 
     def _first_fold(self, model: Model, setting: Setting) -> tuple[Fitted, Held]:
         """A model that is fitted to the first division of the trajectories, and what it leaves of the others there."""
@@ -741,6 +724,14 @@ class Search:
             elif self.unseen:
                 warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
             return
+        if not math.isfinite(held.loudness):
+            warnings.warn(
+                f"The time budget ended before the best model, {candidate.name}, was compared with held-out "
+                "trajectories: give it more.",
+                UserWarning,
+                stacklevel=4,
+            )
+            return
         said = (
             f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: "
             f"{held.complaint}."
@@ -765,7 +756,7 @@ class Search:
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         if self.cut:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
-        library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.said.force is not None
+        library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.constraints.force is not None
         said += " " + hint(library, smooth, self.data, otherwise, damped)
         warnings.warn(said, UserWarning, stacklevel=4)
 
@@ -794,7 +785,7 @@ class Search:
         data, others = self.folds[0]
         scales, rivals = data.scales, [self.winner[0].model]
         if isinstance(reading.field, FreeField):
-            rivals.append(self.said.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
+            rivals.append(self.constraints.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
         fit = fitted(reading.field, reading.of(data), setting.turned(reading.rows))
         theirs = judged(fit, reading.of(others), self.setting.turned(reading.rows))
         left, share = theirs.squares(scales[[*reading.rows]]), 0.0
@@ -926,7 +917,7 @@ class Search:
             warnings.warn(str(warning.message), warning.category, stacklevel=3)
         flow.figures = {**flow.figures, **self.figures(flow.dt)}
         whole = system.autonomous and not isinstance(system, DoubledSystem)
-        flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole else None
+        flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole and not session.deadline.over() else None
         if self._is_worse(flow):
             error, noise = flow.figures["one_step_error"], flow.figures["noise"]
             warnings.warn(
@@ -974,17 +965,19 @@ class Search:
 
     def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
         """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
-        states = self._states()
+        states, model = self._states(), self.winner[0].model
         states = states[np.random.default_rng(self.seed).permutation(len(states))[:STEPPED]]
+        slopes = model.field(self.final.theta, states.T, True, False).slope
+        rates = np.abs(np.linalg.eigvals(np.moveaxis(np.broadcast_to(slopes, (*slopes.shape[:2], len(states))), -1, 0)))
+        step = min(step_of(rates.max(axis=1)), max(run.span for run in self.data.runs))
         if isinstance(system, DoubledSystem):
-            step = suited_step(system, system.lift(states)) if dt is None else dt
-            return SympFlow.collocated(system, dt=step, steps=DRAG_STEPS)
+            return SympFlow.collocated(system, dt=step if dt is None else dt, steps=DRAG_STEPS)
         if dt is not None:
             try:
                 return SympFlow.collocated(system, dt=dt, states=states)
             except ValueError as error:
                 warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
-        return SympFlow.collocated(system, dt=suited_step(system, states), states=states)
+        return SympFlow.collocated(system, dt=step, states=states)
 
     def _is_worse(self, flow: FlowMap) -> bool:
         """True of a flow that is worse than the H of which it is."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache, cached_property, lru_cache
 from typing import Any
 
@@ -70,13 +70,7 @@ LIBRARIES = {"polynomials": polynomials, "trigonometric": trigonometric, "distan
 
 
 class _Term:
-    """A term with its derivatives, as functions of the columns of the coordinates that it depends on.
-
-    Attributes
-    ----------
-    rows : list of int
-        The places of these coordinates among q1 … qd, p1 … pd.
-    """
+    """A term with its derivatives, as functions of the columns of the coordinates that it depends on."""
 
     def __init__(self, expression: sp.Expr, symbols: Sequence[sp.Symbol]) -> None:
         self.expression = expression
@@ -102,14 +96,7 @@ class _Term:
 
 
 class Library:
-    """Terms f_k of a Hamiltonian.
-
-    Parameters
-    ----------
-    expressions : sequence of sympy.Expr
-        In the symbols q1 … qd, p1 … pd.
-    ndof : int
-    """
+    """Terms f_k of a Hamiltonian, expressions in the symbols q1 … qd, p1 … pd."""
 
     def __init__(self, expressions: Sequence[sp.Expr], ndof: int) -> None:
         self.ndof = ndof
@@ -163,13 +150,7 @@ class Library:
 
 
 class Terms(Part):
-    """Σ_k θ_k f_k, the terms of a library, which are all of q alone, of p alone, or of both.
-
-    Parameters
-    ----------
-    library : Library
-    of : {"q", "p", "y"}
-    """
+    """Σ_k θ_k f_k, the terms of a library, which are all of q alone, of p alone, or of both."""
 
     def __init__(self, library: Library, of: str) -> None:
         self.of, self.library, self.n = of, library, len(library)
@@ -262,22 +243,11 @@ def _derivatives(terms: tuple[sp.Expr, ...], symbols: tuple[sp.Symbol, ...]) -> 
 
 
 def library_for(terms: Any, ndof: int, degree: int, states: np.ndarray) -> tuple[Library, tuple[sp.Expr, ...]]:
-    """The library that was asked for, and the terms of it that others make superfluous.
-
-    Parameters
-    ----------
-    terms : None or sequence of str or sympy.Expr
-        Names of `LIBRARIES`, and expressions; all of `LIBRARIES` if None.
-    ndof, degree : int
-    states : ndarray, shape (n, 2d)
-        Where the terms are compared.
-
-    Raises
-    ------
-    ValueError
-        If there are no terms, or an expression is none of the coordinates, or not finite at the states.
-    """
-    given = LIBRARIES if terms is None else [terms] if isinstance(terms, str | sp.Expr) else list(terms)
+    """The library that was asked for, and the terms of it that others make superfluous."""
+    given = LIBRARIES if terms is None else [terms] if isinstance(terms, str | sp.Expr) else terms
+    if not isinstance(given, Iterable):
+        raise TypeError(f"`terms` must be expressions and names of {', '.join(LIBRARIES)}; got {given!r}.")
+    given = list(given)
     if not given:
         raise ValueError(f"`terms` is an empty list: name terms, or some of {', '.join(LIBRARIES)}, or leave it out.")
     near, finite = _near_the_centre(states[:, :ndof]), distances(ndof)[4:]  # r, which has no pole

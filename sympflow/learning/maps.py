@@ -67,14 +67,6 @@ class NetworkFlow(VectorField):
     """A SympFlow with neural potentials, its weights θ the numbers of a model.
 
     Palindromic, ψ_t = φ_{t/2} ∘ φ_{−t/2}⁻¹, so that ψ_{−t} = ψ_t⁻¹, it has twice the layers of φ and the weights of φ.
-
-    Parameters
-    ----------
-    scaling : Scaling
-        Of the data; its t is Δt.
-    pairs, width : int
-        Of φ, or of the flow; each potential has one hidden layer.
-    palindromic : bool
     """
 
     separable = nystrom = lagrangian = linear = False

@@ -24,20 +24,11 @@ STEEP = 5.0
 
 
 class Linear(NamedTuple):
-    """A function f(θ, x) of columns x (m, N) with its derivatives; None for those that were not asked for.
+    """A function f(θ, x) of columns x (m, N) with its derivatives; None for those that were not asked for."""
 
-    Attributes
-    ----------
-    value : ndarray of shape (m, N)
-    slope : ndarray of shape (m, m, N) or (m, m, 1), or None
-        ∂f/∂x.
-    by_parameters : ndarray of shape (m, n, N) or None
-        ∂f/∂θ.
-    """
-
-    value: np.ndarray
-    slope: np.ndarray | None = None
-    by_parameters: np.ndarray | None = None
+    value: np.ndarray  # (m, N)
+    slope: np.ndarray | None = None  # (m, m, N): ∂f/∂x
+    by_parameters: np.ndarray | None = None  # (m, n, N): ∂f/∂θ
 
 
 class VectorField:
@@ -60,13 +51,7 @@ class VectorField:
 
 
 class Part(ABC):
-    """A function of q, p or y = [q, p], with n numbers θ.
-
-    Attributes
-    ----------
-    of : {"q", "p", "y"}
-    n : int
-    """
+    """A function of q, p or y = [q, p], with n numbers θ."""
 
     of: str
     n: int
@@ -138,15 +123,7 @@ class Part(ABC):
 
 
 class Polynomial(Part):
-    """Σ_m θ_m Π_i (x_i/s_i)^m_i.
-
-    Parameters
-    ----------
-    of : {"q", "p", "y"}
-    exponents : array_like of int, shape (n, m)
-    scales : array_like of shape (m,)
-        s, of the size of the data, which makes all θ comparable.
-    """
+    """Σ_m θ_m Π_i (x_i/s_i)^m_i, of exponents m (n, m) and scales s (m,), of the size of the data: θ are comparable."""
 
     def __init__(self, of: str, exponents: Any, scales: Any) -> None:
         self.of, self.exponents, self.scales = of, np.asarray(exponents, dtype=int), np.asarray(scales, dtype=float)
@@ -297,15 +274,7 @@ class FixedKinetic(Part):
 class Waves(Part):
     """Σ_m θ_m Π_i (x_i/s_i)^m_i cos(k_m·x + φ_m): Fourier series in angles, with powers of the other coordinates.
 
-    Parameters
-    ----------
-    of : {"q", "p", "y"}
-    exponents : array_like of int, shape (n, m)
-    waves : array_like of shape (n, m)
-        The wave vectors k.
-    phases : array_like of shape (n,)
-        φ, 0 for cosines and −π/2 for sines.
-    scales : array_like of shape (m,)
+    Exponents m and wave vectors k are (n, m), phases φ (n,): 0 for cosines, −π/2 for sines.
     """
 
     def __init__(self, of: str, exponents: Any, waves: Any, phases: Any, scales: Any) -> None:
@@ -406,17 +375,7 @@ class Waves(Part):
 
 
 class Network(Part):
-    """Σ_k w_k tanh(a_k·z + b_k), a layer of neurons; z has x_i/s_i, of an angle its cosine and sine.
-
-    Parameters
-    ----------
-    of : {"q", "p", "y"}
-    width : int
-        The number of neurons.
-    scales : array_like of shape (m,)
-    periods : ndarray of shape (m,), optional
-        Of angles, infinite for other coordinates.
-    """
+    """Σ_k w_k tanh(a_k·z + b_k), neurons in one layer; z has x_i/s_i, of an angle its cosine and sine."""
 
     def __init__(self, of: str, width: int, scales: Any, periods: np.ndarray | None = None) -> None:
         self.of, self.width, self.scales = of, width, np.asarray(scales, dtype=float)
@@ -513,14 +472,7 @@ class Network(Part):
 class Distances(Part):
     """Σ_k θ_k (r_k/s)^e_k, of distances r between two bodies, or of one from the origin; log(r/s) where e is 0.
 
-    Parameters
-    ----------
-    bodies : ndarray of int, shape (n_bodies, dim)
-        The places of the coordinates of each body in q.
-    terms : sequence of (int, int or None, int)
-        Two bodies, or one and None for the origin, and the exponent e.
-    scale : float
-        s, of the size of the distances.
+    `bodies` (n_bodies, dim) are places in q, `terms` two bodies, or one and None for the origin, and e.
     """
 
     of = "q"
@@ -610,15 +562,7 @@ class Distances(Part):
 
 
 class Formula(Part):
-    """A function that is known, in symbols of the coordinates.
-
-    Parameters
-    ----------
-    of : {"q", "p", "y"}
-    formula : sympy.Expr
-    symbols : sequence of sympy.Symbol
-        Those of the coordinates.
-    """
+    """A function that is known, in symbols of the coordinates."""
 
     def __init__(self, of: str, formula: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> None:
         self.of, self.n, self.formula, self.symbols = of, 0, formula, tuple(symbols)
@@ -656,15 +600,7 @@ def _float(value: float) -> sympy.Float:
 
 
 class Drive(Part):
-    """Σ_k (a_k cos ωt + b_k sin ωt) f_k(q), a force or a stiffness that a clock moves; θ = [a, b, change of ω].
-
-    Parameters
-    ----------
-    base : Part
-        Σ_k θ_k f_k(q).
-    frequency : float
-        ω, about.
-    """
+    """Σ_k (a_k cos ωt + b_k sin ωt) f_k(q), forces that a clock moves, of about this ω; θ = [a, b, change of ω]."""
 
     of = "q"
 
@@ -754,22 +690,12 @@ def turns(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Model(VectorField):
-    """H_θ(q, p), the sum of its parts, each with its own place in θ; y' = J∇H + Σ_k c_k F_k, c the last numbers of θ.
-
-    Parameters
-    ----------
-    ndof : int
-    parts : tuple of Part
-    force : callable, optional
-        F, such as `friction`, `drags` or `turns`.
-    velocities : bool
-        True if q' = ∂H/∂p is observed in place of p.
-    """
+    """H_θ(q, p), the sum of its parts, each with its own place in θ; y' = J∇H + Σ_k c_k F_k, c the last of θ."""
 
     ndof: int
     parts: tuple[Part, ...]
     force: Force | None = None
-    velocities: bool = False
+    velocities: bool = False  # True if q' = ∂H/∂p is observed in place of p
     stepper: ClassVar[Any] = None
     """The steps of a map of its own; None where schemes follow a field."""
 
@@ -925,13 +851,7 @@ class Model(VectorField):
 
 
 class FreeField(VectorField):
-    """A vector field of polynomials that need not be Hamiltonian, to be compared with those that are.
-
-    Parameters
-    ----------
-    scales : array_like of shape (2d,)
-    degree : int
-    """
+    """A vector field of polynomials that need not be Hamiltonian, to be compared with those that are."""
 
     separable = nystrom = lagrangian = False
     linear, forces, drive = True, 0, None

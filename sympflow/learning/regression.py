@@ -15,15 +15,7 @@ CORRELATED = 4
 
 
 class Regression:
-    """y ≈ X θ for few of the columns of X.
-
-    Parameters
-    ----------
-    X : ndarray, shape (n, K)
-    y : ndarray, shape (n,)
-    independent : float
-        How many of the n errors count as independent.
-    """
+    """y ≈ X θ for few of the columns of X (n, K), of whose n errors some count as independent."""
 
     def __init__(self, X: np.ndarray, y: np.ndarray, independent: float) -> None:
         self.lengths = np.linalg.norm(X, axis=0)

@@ -243,27 +243,13 @@ class Method:
 
 @dataclass(frozen=True)
 class Batch:
-    """Pieces of trajectories of about one length, side by side.
+    """Pieces of trajectories of about one length, side by side."""
 
-    Attributes
-    ----------
-    index : ndarray of int, shape (N,)
-        Their places among all pieces.
-    gaps : ndarray of shape (k, N)
-        Times from one point to the next, the first of them 0; 0 beyond a piece's end.
-    y : ndarray of shape (k, 2d, N)
-        0 where nothing was observed.
-    seen : ndarray of shape (k, 2d, N)
-        1 where there is an observation, 0 elsewhere.
-    starts : ndarray of shape (N,)
-        Their first times.
-    """
-
-    index: np.ndarray
-    gaps: np.ndarray
-    y: np.ndarray
-    seen: np.ndarray
-    starts: np.ndarray
+    index: np.ndarray  # (N,): Their places among all pieces
+    gaps: np.ndarray  # (k, N): Times from one point to the next, the first of them 0; 0 beyond a piece's end
+    y: np.ndarray  # (k, 2d, N): 0 where nothing was observed
+    seen: np.ndarray  # (k, 2d, N): 1 where there is an observation, 0 elsewhere
+    starts: np.ndarray  # (N,): Their first times
 
 
 def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
@@ -324,29 +310,22 @@ def _first_slope(run: Run, i: int) -> float:
 
 @dataclass
 class Normal:
-    """JᵀJ and Jᵀr with the shape of an arrow, and the cost |r|².
+    """JᵀJ and Jᵀr with the shape of an arrow, and the cost |r|²."""
 
-    Attributes
-    ----------
-    A, B, C : ndarray of shape (N, m, m), (N, m, n), (n, n)
-        Blocks of the initial states, of them with θ, and of θ.
-    a, c : ndarray of shape (N, m), (n,)
-        −Jᵀr.
-    """
-
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    a: np.ndarray
-    c: np.ndarray
+    A: np.ndarray  # (N, m, m): Blocks of the initial states, of them with θ, and of θ
+    B: np.ndarray  # (N, m, n)
+    C: np.ndarray  # (n, n)
+    a: np.ndarray  # (N, m): −Jᵀr
+    c: np.ndarray  # (n,)
     cost: float
+    scales: np.ndarray  # (m,): of the states
 
     def solved(self, damping: float, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
         """The steps of θ and of the initial states, and the decrease that they promise; None if it cannot be solved."""
         N, m, n = self.B.shape
         diagonal = np.einsum("nii->ni", self.A)
-        floor = np.finfo(float).tiny + LEAST_DAMPING * diagonal.max(axis=1, keepdims=True)
-        damped = self.A + np.eye(m) * (damping * diagonal + floor)[:, None, :]
+        floor = np.finfo(float).tiny + LEAST_DAMPING * (diagonal * self.scales**2).max(axis=1, keepdims=True)
+        damped = self.A + np.eye(m) * (damping * diagonal + floor / self.scales**2)[:, None, :]
         try:
             found = np.linalg.solve(damped, np.concatenate([self.B, self.a[..., None]], axis=2))
         except np.linalg.LinAlgError:
@@ -380,18 +359,7 @@ class Normal:
         return self.reduced()[0]
 
     def gains(self, fitted: np.ndarray) -> np.ndarray:
-        """Decrease of |r|², by the linear model, when one of the numbers that were not fitted joins those that were.
-
-        Parameters
-        ----------
-        fitted : ndarray of bool, shape (n,)
-            The numbers at whose minimum the problem stands.
-
-        Returns
-        -------
-        ndarray of shape (n,)
-            0 of the fitted numbers, and of those that they make up.
-        """
+        """Decrease of |r|² (n,) by the linear model, when one number joins those that were fitted; 0 of these."""
         S, g = self.reduced()
         inner = S[np.ix_(fitted, fitted)]
         found = np.linalg.solve(inner, np.column_stack([S[fitted], g[fitted]]))
@@ -409,28 +377,14 @@ def rho(r: np.ndarray, huber: float | None) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Problem:
-    """Least squares of θ and the initial states of pieces of trajectories.
-
-    Parameters
-    ----------
-    model : Model or FreeField
-    data : Trajectories
-        Its runs are the pieces.
-    method : Method
-    sigma : ndarray of shape (2d,)
-        The noise of each coordinate, by which residuals are divided.
-    frozen : bool
-        True if θ is not to change.
-    huber : float or None
-        Residuals of more than so many σ count by their size, not its square.
-    """
+    """Least squares of θ and the initial states of pieces of trajectories."""
 
     model: Field
-    data: Trajectories
+    data: Trajectories  # Its runs are the pieces
     method: Method
-    sigma: np.ndarray
-    frozen: bool = False
-    huber: float | None = None
+    sigma: np.ndarray  # (2d,): The noise of each coordinate, by which residuals are divided
+    frozen: bool = False  # True if θ is not to change
+    huber: float | None = None  # Residuals of more than so many σ count by their size, not its square
 
     @cached_property
     def batches(self) -> list[Batch]:
@@ -504,7 +458,8 @@ class Problem:
     def normal(self, theta: np.ndarray, states: np.ndarray, stop: Stop = never) -> Normal:
         """The normal equations at a point, as far as its orbits are finite."""
         N, m, n = len(states), 2 * self.model.ndof, 0 if self.frozen else self.model.n
-        made = Normal(np.zeros((N, m, m)), np.zeros((N, m, n)), np.zeros((n, n)), np.zeros((N, m)), np.zeros(n), 0.0)
+        A, B, C, a, c = (np.zeros(shape) for shape in ((N, m, m), (N, m, n), (n, n), (N, m), (n,)))
+        made = Normal(A, B, C, a, c, 0.0, self.data.scales)
         for batch in self.batches:
             size = len(batch.index)
             A, B, a = np.zeros((m, m, size)), np.zeros((m, n, size)), np.zeros((m, size))
@@ -540,30 +495,15 @@ class Problem:
 
 @dataclass(frozen=True)
 class Fit:
-    """A minimum.
-
-    Attributes
-    ----------
-    theta : ndarray of shape (n,)
-    states : ndarray of shape (N, 2d)
-        The latent initial state of each piece.
-    cost : float
-        Σ ρ(r) at the σ of the problem.
-    normal : Normal
-        The normal equations there.
-    costs : list of float
-        After each step.
-    reason : str
-        Why the search ended.
-    """
+    """A minimum."""
 
     problem: Problem
-    theta: np.ndarray
-    states: np.ndarray
-    cost: float
-    normal: Normal
-    costs: list[float] = field(default_factory=list)
-    reason: str = ""
+    theta: np.ndarray  # (n,)
+    states: np.ndarray  # (N, 2d): The latent initial state of each piece
+    cost: float  # Σ ρ(r) at the σ of the problem
+    normal: Normal  # The normal equations there
+    costs: list[float] = field(default_factory=list)  # After each step
+    reason: str = ""  # Why the search ended
 
     @cached_property
     def orbits(self) -> list[np.ndarray]:
@@ -771,13 +711,6 @@ def matched(
 
     No orbit is computed: y(t) − ∫ f_θ(y) dt is compared with a constant for each piece. That is linear where f is
     linear in θ, and one step solves it.
-
-    Parameters
-    ----------
-    weights : ndarray of shape (2d,)
-        One over the scales of the coordinates.
-    steps : int
-        Of Gauss–Newton.
     """
     pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
     if not pieces:

@@ -18,27 +18,15 @@ WINDOW, DEGREE = 6, 3
 
 @dataclass(frozen=True)
 class Smooth:
-    """Curves of all trajectories.
+    """Curves of all trajectories."""
 
-    Attributes
-    ----------
-    states, rates : tuple of ndarray, shape (2d, n)
-        The curve of each trajectory at its times, and its derivatives.
-    points, slopes : ndarray, shape (m, 2d)
-        States and their derivatives where both are known well.
-    times, owner : ndarray, shape (m,)
-        Their times, and the places of their trajectories.
-    sigma : ndarray, shape (2d,)
-        The noise of each coordinate, 0 if the trajectories are too short to tell it.
-    """
-
-    states: tuple[np.ndarray, ...]
-    rates: tuple[np.ndarray, ...]
-    points: np.ndarray
-    slopes: np.ndarray
-    times: np.ndarray
-    owner: np.ndarray
-    sigma: np.ndarray
+    states: tuple[np.ndarray, ...]  # (2d, n): The curve of each trajectory at its times, and its derivatives
+    rates: tuple[np.ndarray, ...]  # (2d, n)
+    points: np.ndarray  # (m, 2d): States and their derivatives where both are known well
+    slopes: np.ndarray  # (m, 2d)
+    times: np.ndarray  # (m,): Their times, and the places of their trajectories
+    owner: np.ndarray  # (m,)
+    sigma: np.ndarray  # (2d,): The noise of each coordinate, 0 if the trajectories are too short to tell it
 
 
 def smoothed(data: Trajectories) -> Smooth:

@@ -46,29 +46,14 @@ MOST_NUMBERS = 400
 
 @dataclass(frozen=True)
 class Reading:
-    """Another explanation of the data than a Hamiltonian in the coordinates as they are.
-
-    Attributes
-    ----------
-    field : Model or FreeField
-    rows : tuple of int
-        The order in which it takes the coordinates.
-    share : float
-        Squares of held-out increments that it leaves, over those of the best Hamiltonian.
-    said : str
-        The explanation in words.
-    advice : str
-        What to do then, with a place for the numbers of the forces.
-    numbers : slice or None
-        The places of the factors of forces beside those of H.
-    """
+    """Another explanation of the data than a Hamiltonian in the coordinates as they are."""
 
     field: Field
-    rows: tuple[int, ...]
-    share: float
-    said: str
-    advice: str = ""
-    numbers: slice | None = None
+    rows: tuple[int, ...]  # The order in which it takes the coordinates
+    share: float  # Squares of held-out increments that it leaves, over those of the best Hamiltonian
+    said: str  # The explanation in words
+    advice: str = ""  # What to do then, with a place for the numbers of the forces
+    numbers: slice | None = None  # The places of the factors of forces beside those of H
 
     def of(self, data: Trajectories) -> Trajectories:
         """The data with the coordinates in this order."""
@@ -87,21 +72,7 @@ class Reading:
         return self.said not in (FRICTION[0], DRAG_SAID[0]) or bool(theta[self.numbers or slice(0)].sum() > 0)
 
     def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
-        """The defect of symplecticity in the coordinates as they are, and the rate at which volumes grow.
-
-        Parameters
-        ----------
-        states : ndarray of shape (2d, n)
-            In the order of the reading.
-        scales : ndarray of shape (2d,)
-            Of the coordinates as they are.
-
-        Returns
-        -------
-        defect : float
-            The size of LᵀJ + JL over twice that of JL, L the Jacobian in units of the scales: at most 1, 0 for any H.
-        rate : float
-        """
+        """LᵀJ + JL over twice JL, 0 for any H, at states (2d, n) in the order of the reading; the rate of volumes."""
         slopes = self.field.field(theta, states, True, False).slope
         assert slopes is not None
         back = np.argsort(self.rows)
@@ -157,13 +128,9 @@ def best_by_increments(
     drive: Drive | None = None,
     stop: Stop = never,
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
-    """The place of the model, linear in its numbers, that explains held-out increments best, and a doubt, if any.
+    """The place of the model that explains held-out increments best, a doubt, if any, and the squares by places.
 
-    Returns
-    -------
-    tuple of int, (Reading or None) and dict, or None
-        The reading of the data that leaves much less than all models, None if there is none; the squares that the
-        models leave, by their places; None in place of all if there are too few points to tell.
+    The doubt is a reading of the data that leaves much less than all models. None in place of all for too few points.
     """
     scales, d = data.scales, data.ndof
     fitted, others = _smooth(data), _smooth(held)
@@ -174,7 +141,7 @@ def best_by_increments(
     squares = {k: _left(models[k], fitted, others, scales, smooth) for k in affordable if not stop()}
     if not squares:
         return None
-    best = min(affordable, key=lambda k: squares[k])
+    best = min(squares, key=lambda k: squares[k])
     if not 0 < squares[best] < math.inf:
         return best, None, squares
 

@@ -47,6 +47,8 @@ FEW = 8
 HELD_LEAST = PARTS = 3
 JUMP, STEP = 0.75, 0.3
 """Shares of a period: steps of an angle that was wrapped are longer than the first, or shorter than the second."""
+FAR, LARGEST = 1e3, 1e60
+"""Mean of a coordinate in its spread, from which powers of it lose digits; and the largest value that has powers."""
 ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}
 """Periods of angles that are looked for."""
 
@@ -159,6 +161,10 @@ class Trajectories(Shown):
         >>> Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]))).ndof
         1
         """
+        if ndof is not None and (isinstance(ndof, bool | str) or ndof not in range(1, MAX_ASKED_VALUES)):
+            raise ValueError(
+                f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}: or leave it out."
+            )
         if observed not in OBSERVED:
             raise ValueError(f"`observed` must be one of {', '.join(OBSERVED)}; got {observed!r}.")
         if observed != "qp" and velocity_mass is not None:
@@ -284,13 +290,26 @@ class Trajectories(Shown):
                     )
 
     def check_moving(self) -> None:
-        """Raise ValueError if a coordinate has the same value everywhere: H could have any slope in it."""
+        """Raise ValueError where a coordinate stands still or has no powers; warn of one that is far from 0."""
         for i, name in enumerate(self.names):
             values = np.concatenate([run.y[i] for run in self.runs])
-            if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
+            seen = values[np.isfinite(values)]
+            if seen.size and seen.min() == seen.max():
                 raise ValueError(
-                    f"`trajectories` have the same {name} at all points, {np.nanmin(values):g}: nothing can be learned "
+                    f"`trajectories` have the same {name} at all points, {seen[0]:g}: nothing can be learned "
                     "of it; drop this degree of freedom, or add trajectories in which it changes."
+                )
+            if seen.size and not 1 / LARGEST < np.abs(seen).max() < LARGEST:
+                raise ValueError(
+                    f"`trajectories` have {name} up to {np.abs(seen).max():.1g}, whose powers are no numbers of this "
+                    "machine: give `units`, or numbers nearer to 1."
+                )
+            if seen.size and abs(seen.mean()) > FAR * seen.std() > 0:
+                warnings.warn(
+                    f"`trajectories` have {name} about {seen.mean():.3g}, {abs(seen.mean()) / seen.std():.1g} times "
+                    "its spread, by which powers of it lose their digits: subtract that from it.",
+                    UserWarning,
+                    stacklevel=4,
                 )
 
     def split(self, share: float = 0.2, seed: int = 0) -> tuple[Trajectories, Trajectories]:
@@ -439,8 +458,8 @@ def _numbers(values: Any, name: str) -> np.ndarray:
         array = np.asarray(array)
         if array.dtype.kind in "mM":
             array = (array - array.ravel()[0]) / np.timedelta64(1, "s")
-        if array.dtype.kind == "c":
-            raise TypeError("complex numbers")
+        if array.dtype.kind in "cb":
+            raise TypeError("complex numbers" if array.dtype.kind == "c" else "booleans")
         return array.astype(float)
     except (TypeError, ValueError) as error:
         raise TypeError(f"`data` has {name} that are no real numbers ({error}): give arrays of numbers.") from error

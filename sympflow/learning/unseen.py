@@ -29,17 +29,6 @@ def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part:
     """Functions of some coordinates that are the same at all states: linear ones, or else quadratic ones.
 
     Of q and p together only linear ones: of few orbits some sum of the integrals of motion always has one value.
-
-    Parameters
-    ----------
-    states : ndarray of shape (n, 2d)
-        Along the orbits of a fit.
-    errors : ndarray of shape (2d,)
-        Their standard errors.
-    columns : sequence of int
-        The places of the coordinates.
-    part : Part, optional
-        Terms of these coordinates whose sums are looked at, in place of all of the first and second degree.
     """
     d = states.shape[1] // 2
     x = states[:, [*columns]].T

@@ -29,15 +29,15 @@ from sympflow.hamiltonian.lattice import BOUNDARIES
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.fits import PrimedFit
+from sympflow.training.least_squares import Check
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors
 from sympflow.training.starts import frequency
 from sympflow.training.table_fit import RunsFit, Table
-from sympflow.training.table_step import Check
 
 MOST_FITTED = 16
-"""Degrees of freedom up to which a lattice is fitted as it is, and not by a piece."""
+"""Degrees of freedom up to which a lattice is fitted as it is, and not by a subsystem."""
 TAIL = 2.0
-"""Times the upper density that the states of a piece have.
+"""Times the upper density that the states of a subsystem have.
 
 In a large lattice a few neighbours at a time have so much, and a flow's errors there decide about the energy of all."""
 NUMBERS = 16_000
@@ -45,17 +45,17 @@ NUMBERS = 16_000
 FEWEST, MOST_ORBITS, MOST_STATES, TIMES, CERTIFIED = 8, 40, 200, 9, 250
 """The certificate: fewest and most orbits, states, times in [0, Δt], and the steps of the orbits."""
 STEPS, SEEN, COPIES, ENDS_STATES = 200, 5, 4, 16
-"""Energy errors at ends: steps, steps between two looks, pieces in a row, and states."""
+"""Energy errors at ends: steps, steps between two looks, subsystems in a row, and states."""
 
 
-def on_piece(system: HamiltonianSystem) -> bool:
-    """Return True for a lattice, which a flow is fitted to by a piece."""
+def by_subsystem(system: HamiltonianSystem) -> bool:
+    """Return True for a lattice, which a flow is fitted to by a subsystem."""
     local, damping = system.local, system.damping
     return local is not None and local.has_subsystem and (damping is None or not damping.ndim)
 
 
 @dataclass(frozen=True)
-class LatticePiece:
+class LatticeSubsystem:
     """The few sites that a flow of a lattice is fitted on."""
 
     lattice: HamiltonianSystem
@@ -65,8 +65,8 @@ class LatticePiece:
     states: LatticeStates
 
     @classmethod
-    def of(cls, lattice: HamiltonianSystem, domain: Domain) -> LatticePiece:
-        """The piece of a lattice, for states of a domain of it."""
+    def of(cls, lattice: HamiltonianSystem, domain: Domain) -> LatticeSubsystem:
+        """The subsystem of a lattice, for states of a domain of it."""
         found = domain if isinstance(domain, LatticeStates) else LatticeStates.of_states(lattice, domain.sample(DRAWN))
         small = lattice.ndof <= MOST_FITTED
         few = lattice if small else lattice.subsystem()
@@ -81,7 +81,7 @@ class LatticePiece:
         return cls(lattice, few, written, domain if small else excited, found.of(lattice))
 
     def small(self, flow: FlowMap) -> PrimedFlow:
-        """A flow of the lattice as one of the piece by its coordinates."""
+        """A flow of the lattice as one of the subsystem by its coordinates."""
         assert isinstance(flow, PrimedFlow)
         flow.check_system(self.lattice)
         made = flow.bound(self.few).transferred(self.system)
@@ -99,7 +99,9 @@ class LatticePiece:
         local = self.lattice.local
         if self.lattice.damping is None and local is not None and local.uniform and local.ends:
             flow.figures |= {f"ends_{end}": self._error_at(flow, end) for end in BOUNDARIES}
-        judged, own = self._judged, flow
+        assert local is not None
+        smaller = local.judged()  # with the same ends
+        judged, own = self.lattice.subsystem(*smaller) if smaller else self.lattice, flow
         assert judged.local is not None
         if judged is not self.lattice:
             own = flow.bound(judged)
@@ -119,13 +121,6 @@ class LatticePiece:
             }
         return flow
 
-    @property
-    def _judged(self) -> HamiltonianSystem:
-        """The system, or a smaller one with the same ends."""
-        assert self.lattice.local is not None
-        judged = self.lattice.local.judged()
-        return self.lattice.subsystem(*judged) if judged else self.lattice
-
     @torch.no_grad()
     def _step_figures(self, flow: PrimedFlow, system: HamiltonianSystem, domain: Domain, n: int) -> dict[str, float]:
         """Errors of one step at held-out states of the lattice, and the share that it misses."""
@@ -139,7 +134,7 @@ class LatticePiece:
 
     @torch.no_grad()
     def _error_at(self, flow: PrimedFlow, end: str) -> float:
-        """The relative energy error, above rest, of a few pieces in a row with such ends: the median over states."""
+        """The relative energy error, above rest, of a few in a row with such ends: the median over states."""
         few = self.lattice.subsystem()
         assert few.local is not None
         row = self.lattice.subsystem((COPIES * few.local.shape[0], *few.local.shape[1:]), (end, *few.local.ends[1:]))
@@ -227,12 +222,12 @@ def check_runs(system: HamiltonianSystem, fit: PrimedFit) -> None:
         )
 
 
-def runs_of(piece: LatticePiece, runs: int, seed: int, fitted: PrimedFlow) -> EnergyRuns:
-    """Return the energy errors in so many runs of a larger piece, by the numbers of a flow of the piece."""
-    whole = piece.lattice
+def runs_of(subsystem: LatticeSubsystem, runs: int, seed: int, fitted: PrimedFlow) -> EnergyRuns:
+    """Return the energy errors in so many runs of a larger subsystem, by the numbers of a flow of the subsystem."""
+    whole = subsystem.lattice
     assert whole.local is not None
     larger = whole.subsystem(*whole.local.many())
-    domain = piece.states.of(larger)
+    domain = subsystem.states.of(larger)
     x = states(domain, runs, seed, Stream.RUNS)
     t_end = PERIODS * 2 * math.pi / frequency(larger, domain)
     return EnergyRuns(fitted.of_any_size(larger), larger, x, float(larger.hamiltonian(domain.at_rest)), t_end)

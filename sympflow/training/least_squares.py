@@ -29,13 +29,14 @@ from torch import Tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.kernels.gauss_newton import bent, damped, factored
 from sympflow.training.losses import Objective
-from sympflow.training.session import OutOfTime
+from sympflow.training.session import Deadline, OutOfTime
 
 PROBE = 0.1  # share of a step over which the residuals' curvature is measured
 CURVED = 0.75  # largest ratio of the second-order correction to the step
 FIRST_DAMPING = 1e-3
 STOPPED = "it was stopped"
 
+Check = Callable[[], None]
 Stop = Callable[[], bool]
 
 
@@ -214,6 +215,41 @@ class _Factored(LinearModel):
         probed = self.residuals(self.x + PROBE * step)
         given = self.J.columns, self.J.matrices, self.r, probed, PROBE, step, triangle, self.D, CURVED
         return self.x + step + bent(*given), decrease
+
+
+class Problem:
+    """Residuals of parameters θ whose sum of squares is to be small."""
+
+    compiled = False
+
+    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
+        """(m,); `check` is called within, and may raise."""
+        raise NotImplementedError
+
+    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
+        """The residuals and their Jacobian, (m, f)."""
+        raise NotImplementedError
+
+    def model(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray | Blocks]:
+        """The same, the Jacobian in blocks where these are smaller."""
+        return self.linearized(theta, check)
+
+    def own(self) -> Problem:
+        """The same for one thread alone; one that changes nothing is that already."""
+        return self
+
+    def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
+        """Least squares from θ, evaluated even past the deadline; a thorough one goes on where little is gained."""
+        at_start = self.residuals(theta)
+        return levenberg_marquardt(
+            lambda x: at_start if x is theta else self.residuals(x, deadline.check),
+            lambda x: self.model(x, deadline.check),
+            theta,
+            iterations=iterations,
+            patience=20 if thorough else 10,
+            gain=1e-3 if thorough else 1e-2,
+            stop=deadline.over,
+        )
 
 
 # the weights of a flow --------------------------------------------------------------------------------------------

@@ -217,7 +217,7 @@ class LossRun(Run):
 
     def _validate(self) -> dict[str, float]:
         figures = {"step": self.step, **self._figures()}
-        if math.isfinite(figures["loss"]) and figures["loss"] < min(self._losses(), default=math.inf):
+        if figures["loss"] < min((f["loss"] for f in self._finite()), default=math.inf):
             self.best = {name: value.detach().clone() for name, value in self.flow.state_dict().items()}
         self.history.append(figures)
         return figures
@@ -251,11 +251,11 @@ class LossRun(Run):
             m *= 2
         return points
 
-    def _losses(self) -> list[float]:
-        return [figures["loss"] for figures in self.history if math.isfinite(figures["loss"])]
+    def _finite(self) -> list[dict[str, float]]:
+        return [figures for figures in self.history if math.isfinite(figures["loss"])]
 
     def _best_figures(self) -> dict[str, float]:
-        return min((f for f in self.history if math.isfinite(f["loss"])), key=lambda f: f["loss"])
+        return min(self._finite(), key=lambda figures: figures["loss"])
 
 
 def _check_memory(flow: FlowMap, fit: Resolved, solver: Solver) -> None:

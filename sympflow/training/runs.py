@@ -6,7 +6,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.fits import Resolved
-from sympflow.training.least_squares import STOPPED, Minimum
+from sympflow.training.least_squares import STOPPED, Minimum, Problem
 from sympflow.training.points import USELESS, drive_times
 from sympflow.training.session import Deadline, Path, Session
 
@@ -242,21 +242,7 @@ class Unstarted(Run):
         self.flow.load_state_dict(state["best"])
 
 
-class Searched(Protocol):
-    """Least squares that are followed from many starts, by any workers."""
-
-    @property
-    def compiled(self) -> bool:
-        """True if most of the work is compiled code, so that threads can share it."""
-
-    def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
-        """The minimum that is found from θ."""
-
-    def own(self) -> Searched:
-        """The same for one thread alone."""
-
-
-def descended(common: tuple[Searched, int, Deadline, bool], theta: np.ndarray) -> Minimum:
+def descended(common: tuple[Problem, int, Deadline, bool], theta: np.ndarray) -> Minimum:
     """The minimum that least squares find from θ: a piece of work."""
     fit, iterations, deadline, thorough = common
     return fit.own().minimize(theta, iterations, deadline, thorough)
@@ -275,7 +261,7 @@ class SearchRun(Run):
     ROUND: ClassVar[int] = 200  # starts that are drawn at once: a time budget may be given any number
 
     @abstractmethod
-    def searched(self) -> Searched:
+    def searched(self) -> Problem:
         """The least squares of the search."""
 
     @abstractmethod

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from sympflow.hamiltonian.parts import SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.parts_loops import parts_loops
 from sympflow.training.fits import GaussNewton, Resolved
-from sympflow.training.least_squares import Minimum, Stop, levenberg_marquardt, put_weights
+from sympflow.training.least_squares import Minimum, Problem, Stop, levenberg_marquardt, put_weights
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors, stream_seed
 from sympflow.training.runs import LABEL_SHARE, SearchRun
 from sympflow.training.session import Deadline, Session
@@ -91,19 +91,14 @@ class SplitRun(SearchRun):
 
 
 @dataclass(frozen=True)
-class AtEnd:
+class AtEnd(Problem):
     """The fit at Δt, of the numbers u."""
 
     problem: SplitProblem
-    compiled: ClassVar[bool] = False
 
     def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
         """The minimum from the numbers θ = u; none of the searches is thorough."""
         return self.problem.minimize(theta, len(self.problem.t) - 1, iterations, deadline.over)
-
-    def own(self) -> AtEnd:
-        """The same: nothing changes in it."""
-        return self
 
 
 def _phases(share: np.ndarray) -> np.ndarray:

@@ -106,9 +106,8 @@ def check_step(system: HamiltonianSystem, domain: Domain, dt: float) -> None:
         )
 
 
-def suited_step(system: HamiltonianSystem, y: np.ndarray) -> float:
-    """Δt such that the fastest rate of the linearized motion, at 99 % of states y (n, 2d), times it is about 1."""
-    rates = _rates(system, y)
+def step_of(rates: np.ndarray) -> float:
+    """Δt such that the fastest rate of the linearized motion, at 99 % of states, times it is about 1."""
     rates = rates[np.isfinite(rates)]
     rate = float(np.quantile(rates, QUANTILE)) if len(rates) else 0.0
     return _rounded(PHASE / rate) if rate > 0 else 1.0

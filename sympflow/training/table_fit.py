@@ -34,7 +34,7 @@ from sympflow.flow.weights import check_memory
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.fits import GaussNewton, PrimedFit, Resolved
-from sympflow.training.least_squares import Blocks, Minimum, levenberg_marquardt, put_weights
+from sympflow.training.least_squares import Blocks, Check, Minimum, Problem, put_weights
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.points import (
     USELESS,
@@ -50,7 +50,7 @@ from sympflow.training.points import (
 )
 from sympflow.training.runs import LABEL_SHARE, SearchRun, descended
 from sympflow.training.session import Deadline, Session
-from sympflow.training.table_step import Check, TableStep
+from sympflow.training.table_step import TableStep
 
 SPREAD = 0.25  # of random coefficients about those of equal steps
 WIDE_SPREAD = 2.0  # without force gradients, where an order above 2 needs negative ones
@@ -403,41 +403,6 @@ def _tensors(data: tuple[np.ndarray, ...] | None) -> Any:
 
 
 # least squares ------------------------------------------------------------------------------------------------------
-
-
-class Problem:
-    """Residuals of parameters θ whose sum of squares is to be small."""
-
-    compiled = False
-
-    def residuals(self, theta: np.ndarray, check: Check = lambda: None) -> np.ndarray:
-        """(m,); `check` is called within, and may raise."""
-        raise NotImplementedError
-
-    def linearized(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray]:
-        """The residuals and their Jacobian, (m, f)."""
-        raise NotImplementedError
-
-    def model(self, theta: np.ndarray, check: Check = lambda: None) -> tuple[np.ndarray, np.ndarray | Blocks]:
-        """The same, the Jacobian in blocks where these are smaller."""
-        return self.linearized(theta, check)
-
-    def own(self) -> Problem:
-        """The same for one thread alone; one that changes nothing is that already."""
-        return self
-
-    def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
-        """Least squares from θ, evaluated even past the deadline; a thorough one goes on where little is gained."""
-        at_start = self.residuals(theta)
-        return levenberg_marquardt(
-            lambda x: at_start if x is theta else self.residuals(x, deadline.check),
-            lambda x: self.model(x, deadline.check),
-            theta,
-            iterations=iterations,
-            patience=20 if thorough else 10,
-            gain=1e-3 if thorough else 1e-2,
-            stop=deadline.over,
-        )
 
 
 class StackedFit(Problem):

@@ -10,7 +10,7 @@ derivatives by the drifts hold those by the times of kicks, and E is less the wo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -21,6 +21,7 @@ from sympflow.hamiltonian.hamiltonian import derivative
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
+from sympflow.training.least_squares import Check
 
 if TYPE_CHECKING:
     from sympflow.kernels.table_loops import LabelErrors, TableLoops
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 ALONG = 1e-4  # length of the difference, relative to q, that gives the third derivative of V along M⁻¹∇V
 PRODUCT = 1e-3  # length of the difference, relative to q, that gives ∇²V·v where it is not known
 
-Check = Callable[[], None]
 Product = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -232,22 +232,12 @@ class Forces(Protocol):
         """The terms, and their derivatives along directions v (k, d, P), of the same shape."""
 
 
-def _pair_forces(system: HamiltonianSystem, level: int) -> Forces:
-    from sympflow.hamiltonian.bodies import PairsHamiltonian
-    from sympflow.kernels.pairs import PairForces
-
-    assert isinstance(system.local, PairsHamiltonian)
-    return PairForces(system.local, level)
-
-
-LOCAL: Mapping[str, Callable[[HamiltonianSystem, int], Forces]] = {"pairs": _pair_forces}
-"""Compiled forces of systems that are given by one piece, by the `loops` of these."""
-
-
 def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), compiled: bool = False) -> Forces:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: compiled ones of pairs, else those of its functions."""
-    if compiled and system.local is not None and system.local.loops in LOCAL:
-        return LOCAL[system.local.loops](system, level)
+    if compiled and system.local is not None and system.local.loops == "pairs":
+        from sympflow.kernels.pairs import PairForces
+
+        return PairForces(system.local, level)  # type: ignore[arg-type]
     return ArrayForces(system, level, monomials)
 
 

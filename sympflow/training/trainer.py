@@ -47,7 +47,7 @@ from sympflow.training.fits import (
     keywords,
     said,
 )
-from sympflow.training.lattice_fit import LatticePiece, check_runs, on_piece, runs_of
+from sympflow.training.lattice_fit import LatticeSubsystem, by_subsystem, check_runs, runs_of
 from sympflow.training.network_fit import LossRun
 from sympflow.training.points import Stream, handed_in, start_times, unlabelled, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted
@@ -204,12 +204,12 @@ def fit_flow(
     if isinstance(fit, PrimedFit):
         if fit.runs is not None:
             check_runs(system, fit)
-        if fit.data is None and on_piece(system):
-            piece = LatticePiece.of(system, domain)
-            small = None if flow is None else piece.small(flow)
-            runs = None if fit.runs is None else partial(runs_of, piece, fit.runs, fit.seed)
-            fitted = _fitted(piece.system, small, kind, replace(fit, runs=None), solver, piece.domain, session, runs)
-            return piece.whole(fitted)
+        if fit.data is None and by_subsystem(system):
+            few = LatticeSubsystem.of(system, domain)
+            small = None if flow is None else few.small(flow)
+            runs = None if fit.runs is None else partial(runs_of, few, fit.runs, fit.seed)
+            fitted = _fitted(few.system, small, kind, replace(fit, runs=None), solver, few.domain, session, runs)
+            return few.whole(fitted)
     if not (primed or isinstance(fit, SplitFit) or session.pool.alone):
         raise TypeError(
             "`workers` share the starts of a search by 'gauss-newton' for primed and split flows, and this fit is one "

@@ -322,6 +322,8 @@ def test_forward_mode_gives_no_warnings_of_torch_itself():
         import torch
         import sympflow
         system = sympflow.systems.henon_heiles()
+        sympflow.volume_error(sympflow.solve(system, "sympflow", (0, 2)))
+        sympflow.symplecticity_defect(sympflow.solve(system, "mlp", (0, 2)))
         flow = sympflow.SympFlow.primed(system)
         flow.velocity(0.5, torch.zeros(3, 4, dtype=torch.float64))
         options = dict(steps=1, points=20, validation_points=20, reference_states=2, progress=False)

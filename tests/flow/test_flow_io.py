@@ -1,24 +1,18 @@
 """Files of flows: the round trip is exact, and nothing but a whole, sound file is accepted."""
 
-import json
 import math
 import struct
-from pathlib import Path
 
 import pytest
 import torch
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from conftest import record, tampered
 
-import sympflow
 from sympflow.flow.files import load
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.mlp import MLPFlow
 from sympflow.flow.potentials import MLPPotential
-from sympflow.flow.records import FORMAT, KEY, SUM, text_checksum
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
-from sympflow.flow.weights import checksum
 from sympflow.hamiltonian.domain import Box
 from sympflow.systems import harmonic_oscillator, henon_heiles
 
@@ -39,26 +33,6 @@ def file(tmp_path):
     flow, path = MAKERS["sympflow"](), tmp_path / "flow.safetensors"
     flow.domain, flow.fingerprint, flow.system_name = henon_heiles().domain, henon_heiles().fingerprint, "henon_heiles"
     flow.save(path)
-    return path
-
-
-def record(path):
-    content = path.read_bytes()
-    (length,) = struct.unpack("<Q", content[:8])
-    return json.loads(json.loads(content[8 : 8 + length])["__metadata__"][KEY])
-
-
-def tampered(
-    path, change_record=lambda record: None, change_tensors=lambda tensors: None, rechecked=True, altered=False
-):
-    """The file with another record or other tensors, and with checksums that fit them unless it is said otherwise."""
-    notes, tensors = record(path), load_file(path)
-    change_record(notes)
-    change_tensors(tensors)
-    if "checksum" in notes:
-        notes["checksum"] = checksum(tensors) if rechecked else notes["checksum"]
-    text, kept = json.dumps(notes), json.dumps(record(path), separators=(",", ":"))
-    save_file(tensors, path, {KEY: text, SUM: text_checksum(kept if altered else text)})
     return path
 
 
@@ -286,13 +260,3 @@ def test_a_device_to_load_to_must_be_there(file):
     with pytest.raises(ValueError, match=r"^`device` 'foo' is not to be had here .*: use device='cpu'"):
         load(file, device="foo")
     assert load(file, device="cpu").device == torch.device("cpu")
-
-
-@pytest.mark.parametrize(
-    "path", sorted(Path(sympflow.__file__).parent.glob("pretrained/*.safetensors")), ids=lambda path: path.stem
-)
-def test_the_records_of_shipped_files_have_checksums(path):
-    with safe_open(path, "np") as file:
-        notes = file.metadata()
-    assert json.loads(notes[KEY])["format"] == FORMAT
-    assert notes[SUM] == text_checksum(notes[KEY])

@@ -112,12 +112,6 @@ def test_files_hold_the_identity_and_those_of_before_load(name, system, tmp_path
     assert before.fingerprint == flow.fingerprint
 
 
-def test_every_flow_that_ships_has_one():
-    for flow in shipped_flows():
-        assert flow.identity is not None, flow.name
-        assert len(flow.identity.states) == 64
-
-
 def test_in_another_time_the_system_in_the_physical_one_is_known():
     kepler = systems.kepler(0.5)
     other = HamiltonianSystem.from_sympy(

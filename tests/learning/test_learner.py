@@ -16,10 +16,10 @@ from sympflow.learning.learner import (
     MOST_VALUES,
     Replicas,
     Search,
+    _constraints,
     _cut,
     _divided,
     _few,
-    _said,
     replica,
     without_growth,
 )
@@ -238,8 +238,8 @@ def test_bodies_whose_total_momentum_changes_are_no_bodies():
     """Two momenta cancel along each axis of coordinates in the order x1, x2, y1, y2."""
     x, y = np.random.default_rng(0).normal(size=(2, 50))
     runs = [(np.arange(50.0), np.stack([x, y, y, x, x, -x, y, -y]))]
-    said = _said(Trajectories.read([*runs, *runs]), None, None, False, None, None)
-    names = [candidate.name for candidate in FAMILIES["pairs"].models(said)]
+    constraints = _constraints(Trajectories.read([*runs, *runs]), None, None, False, None, None)
+    names = [candidate.name for candidate in FAMILIES["pairs"].models(constraints)]
     names = [name for name in names if "origin" not in name]
     assert len(names) == 2
     assert all("one axis after another" in name for name in names)
@@ -262,8 +262,8 @@ def test_central_fields_are_found(force, V, observed):
     rows = [0, 1] if observed == "q" else [0, 1, 2, 3]
     runs = [(t, y[rows] + 1e-3 * rng.normal(size=(len(rows), 81))) for y in orbits]
     data = Trajectories.read(runs, observed=observed)
-    said = _said(data, None, None, False, None, None)
-    found = [fitted(candidate.model, data, Setting()) for candidate in FAMILIES["central"].models(said)]
+    constraints = _constraints(data, None, None, False, None, None)
+    found = [fitted(candidate.model, data, Setting()) for candidate in FAMILIES["central"].models(constraints)]
     best = min(found, key=lambda one: one.loss(np.full(4, 1e-3)))
     y = np.concatenate(orbits, axis=1)
     H = (y[2:] ** 2).sum(0) / 2 + V(np.hypot(*y[:2]))
@@ -318,7 +318,8 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
     asked = {}
 
     def learned(data, **options):
-        asked.update(options, span=data.runs[0].span)
+        y = data.runs[0].y
+        asked.update(options, span=data.runs[0].span, velocities=data.velocities, missing=np.isnan(y[1]).all())
         return noisy
 
     monkeypatch.setattr("sympflow.learning.learner.learn", learned)
@@ -352,9 +353,34 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
     assert plot.stat().st_size > 10_000
     assert CliRunner().invoke(app, [*arguments, "--mass", "1,2", "--not-separable"]).exit_code == 0
     assert (asked["separable"], asked["mass"]) == (False, [1.0, 2.0])
+    for observed, letters in (("qv", "q,v"), ("q", "q")):
+        table = "\n".join(
+            [f"orbit,t,{letters}", *(row.rsplit(",", 1)[0] if observed == "q" else row for row in rows[1:])]
+        )
+        (tmp_path / "seen.csv").write_text(table)
+        seen = [
+            "learn",
+            str(tmp_path / "seen.csv"),
+            "--observed",
+            observed,
+            "--out",
+            str(to),
+            "--drive",
+            "1.5",
+            "--drag",
+        ]
+        found = CliRunner().invoke(app, seen)
+        assert found.exit_code == 0, found.output
+        assert asked["velocities"]
+        assert asked["missing"] == (observed == "q")
+        assert (asked["drive"], asked["damping"]) == (1.5, "quadratic")
+    found = CliRunner().invoke(app, [*seen, "--observed", "p"])
+    assert found.exit_code == 2
+    assert "`--observed` must be one of qp, qv, q" in " ".join(found.output.split())
     for option, message in (
         ("--mass", "`--mass` must be a number, or numbers with commas"),
         ("--known", "`--known` 'nonsense' is unknown"),
+        ("--drive", "`--drive` must be an angular frequency, or find"),
     ):
         found = CliRunner().invoke(app, [*arguments, option, "nonsense"])
         assert found.exit_code == 2
@@ -399,13 +425,13 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         sympflow.learn(runs, dt=0.5, checkpoint=path, callback=interrupt)
     data = Trajectories.read(runs)
-    search = Search(data, data.folds(0.2, 0), _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, data.folds(0.2, 0), _constraints(data, None, None, False, None, None), Setting(), 0)
     with pytest.raises(ValueError, match="`resume` is a run with another"):
         sympflow.learn(trajectories(6, 12, noise=0.02), dt=0.5, resume=path)
     state = checkpoints.read(path)
     assert state["step"] == 2
     name, numbers = next(iter(state["optimizer"].items()))
-    (candidate,) = [c for c in FAMILIES["polynomial"].models(search.said) if c.name == name]
+    (candidate,) = [c for c in FAMILIES["polynomial"].models(search.constraints) if c.name == name]
     again = restored(candidate.model, search.data, numbers, Setting())
     assert np.array_equal(again.theta, numbers["theta"].numpy())
     assert again.sigma == pytest.approx(fitted(candidate.model, search.data, Setting()).sigma)
@@ -414,7 +440,7 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
 def test_data_of_no_hamiltonian_are_called_so():
     """A damped oscillator, without a word of friction: the areas shrink at its rate."""
     data = Trajectories.read(trajectories(8, 15, rate=RATE))
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match=r"No symplectic map explains.*rate of -0\.2") as record:
         search.diagnose(Session())
@@ -446,7 +472,7 @@ def forced(request):
 
 def test_drives_and_drag_are_named_with_the_remedy(forced):
     _, data, remedy, _ = forced
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match=f"pass {remedy}|Pass {remedy}"):
         search.diagnose(Session())
@@ -465,7 +491,7 @@ def test_drives_and_drag_are_learned(forced):
 
 def test_orbits_that_diverge_are_left_out_of_the_region_of_a_flow():
     data = Trajectories.read(trajectories(8, 15))
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     for lost, kept in ((np.array([[np.nan, 1.0], [2.0, 3.0]]), [[2.0, 3.0]]), (np.full((2, 2), np.inf), data.states)):
         search.final = SimpleNamespace(states=lost)
         assert np.array_equal(search._states(), kept)
@@ -572,7 +598,7 @@ def test_residuals_beyond_the_noise_of_the_data_are_not_explained():
 def test_noise_alone_and_a_noise_that_is_too_small_are_called_so():
     random, t = np.random.default_rng(0), np.linspace(0, 4, 21)
     data = Trajectories.read((t, random.normal(size=(6, 2, 21))))
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
     search.run(["polynomial"], Session())
     with pytest.warns(UserWarning, match="explains next to nothing"):
         search.diagnose(Session())
@@ -628,7 +654,7 @@ def test_models_that_increments_rule_out_are_tried_last():
     t = np.linspace(0, 8, 81)
     runs = [(t, solve_ivp(field, (0, 8), rng.uniform(-1, 1, 2), t_eval=t, rtol=1e-9).y) for _ in range(5)]
     data = Trajectories.read([(t, y + 0.003 * rng.normal(size=y.shape)) for t, y in runs])
-    search = Search(data, data.folds(), _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0)
     names = ["polynomial", "network", "whole-polynomial", "whole-network"]
     groups = [[c.name for c in some] for _, some in search._ask(names, Setting(), Session())]
     assert groups[0][0] == "H(q, p) a polynomial of degree 4"
@@ -641,7 +667,7 @@ def test_a_family_is_climbed_by_its_own_best():
     """Two models are worse than another family, the third is far better; two that are no better end it."""
     losses = {"other": 0.0, "2": 5.0, "3": 5.1, "4": -9.0, "5": -9.0, "6": -9.0, "8": -9.0}
     data = Trajectories.read(trajectories(8, 15))
-    search, tried = Search(data, data.folds(), _said(data, None, None, False, None, None), Setting(), 0), []
+    search, tried = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0), []
 
     def fit(candidate, setting, session):
         tried.append(candidate.name)
@@ -667,3 +693,63 @@ def test_a_long_run_is_cut_and_the_only_one_divided():
     assert _cut(one.pieces(20), rate=1.0).runs[0].n_points == 20
     with pytest.raises(ValueError, match="one trajectory only"):
         _divided(one.subset([0]).pieces(40).subset([0]), 0)
+
+
+HOSTILE = [
+    ({}, 1e80, ValueError, "`trajectories` have q1 up to .*give `units`"),
+    ({"ndof": "1"}, 1, ValueError, "`ndof` must be a positive integer"),
+    ({"ndof": True}, 1, ValueError, "`ndof` must be a positive integer"),
+    ({"noise": "a"}, 1, TypeError, "`noise` must be made of real numbers"),
+    ({"noise": np.nan}, 1, ValueError, "`noise` must be a standard deviation"),
+]
+
+
+@pytest.mark.parametrize("make", [sympflow.learn, sympflow.discover])
+@pytest.mark.parametrize(("options", "factor", "error", "message"), HOSTILE)
+def test_hostile_input_is_refused_by_learn_and_discover(make, options, factor, error, message):
+    with pytest.raises(error, match=message):
+        make([(t, factor * y) for t, y in trajectories(4, 12)], **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "error"),
+    [
+        (sympflow.learn, {"damping": [1]}, ValueError),
+        (sympflow.learn, {"drive": np.nan}, ValueError),
+        (sympflow.discover, {"terms": 3}, TypeError),
+        (sympflow.discover, {"held_out": "x"}, ValueError),
+        (sympflow.discover, {"piece": "x"}, ValueError),
+        (sympflow.discover, {"progress": 3}, TypeError),
+        (sympflow.discover, {"degree": 100}, ValueError),
+    ],
+)
+def test_hostile_options_are_refused_by_name(make, options, error):
+    with pytest.raises(error, match=f"^`{next(iter(options))}`"):
+        make(trajectories(4, 12), **options)
+
+
+def test_units_of_any_size_give_the_same_formula():
+    """A step of the fit knows no unit: q in 1e20, p in 1e-20, and all as integers, single numbers or objects."""
+    t = np.linspace(0, 6, 31)
+    y = np.array([y for _, y in orbits(t)]) * np.ones((1, 2, 1))
+    terms = ["p**2", "q**2", "q**3", "q**4", "q*p"]
+    found = [sympflow.discover((t, y.astype(kind)), terms).discovery for kind in (float, np.float32)]
+    found.append(sympflow.discover((t, y.astype(object) * np.array([[1e20], [1e-20]])), terms).discovery)
+    for one in found:
+        assert [str(f) for f in one.terms] == ["p1**2", "q1**2", "q1**4"]
+    mixed = found[2].coefficients / found[0].coefficients
+    assert mixed == pytest.approx([1e40, 1e-40, 1e-80], rel=1e-3)
+
+
+def orbits(t):
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        y = solve_ivp(lambda t, y: [y[1], -y[0] - y[0] ** 3], (0, t[-1]), rng.uniform(-1, 1, 2), t_eval=t, rtol=1e-9).y
+        yield t, y + 0.005 * rng.normal(size=y.shape)
+
+
+def test_a_coordinate_far_from_zero_and_booleans_are_told():
+    with pytest.warns(UserWarning, match="q1 about 1e.06, .* subtract that"):
+        Trajectories.read([(t, y + np.array([[1e6], [0]])) for t, y in trajectories(4, 12)]).check_moving()
+    with pytest.raises(TypeError, match="booleans"):
+        Trajectories.read([(t, y > 0) for t, y in trajectories(4, 12)])

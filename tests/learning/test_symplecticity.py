@@ -10,7 +10,7 @@ import sympflow
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
-from sympflow.learning.learner import Search, _said
+from sympflow.learning.learner import Search, _constraints
 from sympflow.learning.library import library_for
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import best_by_increments
@@ -70,7 +70,7 @@ CASES = {
 def test_increments_tell_data_of_no_hamiltonian(name):
     make, said = CASES[name]
     data = Trajectories.read(make())
-    about = _said(data, None, None, False, None, None)
+    about = _constraints(data, None, None, False, None, None)
     models = [c.model for family in FAMILIES.values() if family.linear for c in family.models(about)]
     _, reading, _ = best_by_increments(*data.split(), models)
     assert (reading is None) == (not said)
@@ -79,7 +79,7 @@ def test_increments_tell_data_of_no_hamiltonian(name):
 
 def test_columns_in_the_wrong_order_are_told_before_any_other_model():
     data = Trajectories.read(in_pairs(runs(henon_heiles, 2, n=5, width=0.3, span=4.0, points=21)))
-    search = Search(data, data.folds(), _said(data, None, None, False, None, None), Setting(), 0)
+    search = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0)
     search.run([*FAMILIES], Session())
     assert len(search.history) == 1
     assert search.reading is not None
@@ -129,7 +129,7 @@ def test_friction_of_one_percent_is_named():
     data = Trajectories.read(
         runs(lambda t, y: [y[1], -np.sin(y[0]) - 0.01 * y[1]], 1, span=24.0, points=41, noise=0.02)
     )
-    search = Search(data, [data.split(0.2, 0)], _said(data, None, None, False, 2 * np.pi, None), Setting(), 0)
+    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, 2 * np.pi, None), Setting(), 0)
     search.run(["waves"], Session())
     with pytest.warns(UserWarning, match=r"There is friction, γ = 0\.01\d*: .* Pass damping=True"):
         search.diagnose(Session())

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow.learning.families import FAMILIES, Said, families
+from sympflow.learning.families import FAMILIES, Constraints, families
 from sympflow.learning.fitting import Setting, fitted
 from sympflow.learning.lagrangian import lagrangian_start
-from sympflow.learning.learner import _said
+from sympflow.learning.learner import _constraints
 from sympflow.learning.models import FixedKinetic, Kinetic, Model, Polynomial, friction
 from sympflow.learning.shooting import first_states
 from sympflow.learning.trajectories import Trajectories
@@ -41,7 +41,7 @@ def accelerations(model, theta, y):
 
 
 def candidate(name, data, place, period=None):
-    return [*FAMILIES[name].models(_said(data, None, None, False, period, None))][place].model
+    return [*FAMILIES[name].models(_constraints(data, None, None, False, period, None))][place].model
 
 
 @pytest.mark.parametrize("observed", ["qp", "qv", "q"])
@@ -151,19 +151,19 @@ def test_velocities_of_no_momenta_are_refused():
 
 
 def test_families_are_those_that_velocities_tell():
-    said = Said(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
-    assert families(said, None) == ["central", "pairs", "waves", "polynomial", "network", "inertia", "magnetic"]
-    assert "magnetic" not in families(replace(said, velocities=False), None)
+    constraints = Constraints(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
+    assert families(constraints, None) == ["central", "pairs", "waves", "polynomial", "network", "inertia", "magnetic"]
+    assert "magnetic" not in families(replace(constraints, velocities=False), None)
     with pytest.raises(ValueError, match="`family` 'whole-polynomial' does not apply"):
-        families(said, "whole-polynomial")
+        families(constraints, "whole-polynomial")
     for known, parts in ((None, 2), (np.eye(2), 1)):
-        assert len(replace(said, inverse_mass=known).kinetic()) == parts
+        assert len(replace(constraints, inverse_mass=known).kinetic()) == parts
 
 
 def test_only_the_factor_of_h_is_given():
     """(M⁻¹)₁₁ = 1 beside the numbers of all others."""
-    said = Said(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
-    model = said.separated(Polynomial.up_to(2, "q", np.ones(2)))
+    constraints = Constraints(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
+    model = constraints.separated(Polynomial.up_to(2, "q", np.ones(2)))
     assert model.n == Kinetic([1.0, 1.0]).n - 1 + 5
     assert isinstance(model.parts[0], FixedKinetic)
     W = model.field(np.ones(model.n), np.eye(4), True, False).slope[:2, 2:]

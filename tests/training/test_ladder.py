@@ -1,14 +1,17 @@
 """The flows that ship as ladders: chosen by accuracy and cost, listed, built by one command; and what they achieve."""
 
+import json
 import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 
 import sympflow
 from sympflow import (
@@ -23,6 +26,7 @@ from sympflow import (
     systems,
 )
 from sympflow.flow import shipped as catalogue
+from sympflow.flow.records import FORMAT, KEY, SUM, text_checksum
 from sympflow.flow.shipped import ShippedFlow, choose
 from sympflow.integrators import flows
 from sympflow.training import pretrained
@@ -30,7 +34,7 @@ from sympflow.training.clock_fit import clock_errors
 from sympflow.training.fits import GaussNewton, PrimedFit
 from sympflow.training.shipped import rows
 from sympflow.training.shipped.judges import ByCertificate, one_step_errors, primed_cost
-from sympflow.training.shipped.recipe import Recipe, made
+from sympflow.training.shipped.recipe import Recipe, file_of, made
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUARTIC = HamiltonianSystem.from_sympy("p**2/2 + q**4/4", name="plain_quartic", domain=sympflow.Ball([0.0, 0.0], 1.0))
@@ -266,10 +270,19 @@ def test_a_rung_starts_from_the_one_with_a_longer_step():
 # what ships ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", LADDERS)
-def test_every_rung_ships(name):
-    names = {f.name for f in FILES}
-    assert {f"{name}-{recipe.name}" for recipe in LADDERS[name]} <= names
+def test_every_recipe_ships_with_its_record():
+    """With checksums, the identity of its system, and a certificate if its judge gives one."""
+    recipes = {file_of(recipe, Path()).stem: recipe for recipe in rows.recipes()}
+    assert sorted(recipes) == sorted(f.name for f in shipped_flows())
+    for listed in shipped_flows():
+        assert len(listed.identity.states) == 64
+        with safe_open(listed.path, "np") as file:
+            notes = file.metadata()
+        assert json.loads(notes[KEY])["format"] == FORMAT
+        assert notes[SUM] == text_checksum(notes[KEY])
+        recipe, flow = recipes[listed.name], load(listed.path)
+        assert recipe.kind == "mlp" or (flow.certified is not None) == recipe.judge.certifies, listed.name
+        assert flow.certified is None or flow.certified.delta.largest > 0
 
 
 @pytest.mark.parametrize("flow", FILES, ids=lambda f: f.name)

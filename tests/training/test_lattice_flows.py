@@ -9,7 +9,7 @@ import sympflow
 from sympflow import Box, HamiltonianSystem, LatticeStates, SympFlow, solve, train
 from sympflow.flow.primed import PrimedFlow
 from sympflow.training import lattice_fit, table_fit
-from sympflow.training.lattice_fit import TAIL, LatticePiece
+from sympflow.training.lattice_fit import TAIL, LatticeSubsystem
 
 BOND = "r**2/2 + r**4/4"
 FIT = {"restarts": 1, "steps": 8, "points": 20, "label_times": 3, "reference_states": 10, "progress": False}
@@ -50,7 +50,7 @@ def test_a_piece_has_the_states_of_the_lattice():
     of_box = ring(6, domain=Box([-0.5] * 12, [0.5] * 12)).subsystem().domain
     assert 0.01 < of_box.bounds[0] < of_box.bounds[1] < 1
     large = ring(200)
-    fitted = LatticePiece.of(large, LatticeStates((0.1, 0.3)).of(large))
+    fitted = LatticeSubsystem.of(large, LatticeStates((0.1, 0.3)).of(large))
     assert fitted.domain.bounds == (0.1, TAIL * 0.3)  # a few neighbours have more than all of them
     assert fitted.states.bounds == (0.1, 0.3)
     assert ring(200).subsystem(8).domain is None

@@ -9,9 +9,7 @@ import torch
 from sympflow import max_energy_error, solve
 from sympflow.flow.files import load
 from sympflow.flow.mlp import MLPFlow
-from sympflow.flow.shipped import shipped
 from sympflow.flow.sympflow import SympFlow
-from sympflow.systems import harmonic_oscillator
 from sympflow.training import pretrained
 from sympflow.training.fits import GaussNewton, LossFit, NetworkFit
 from sympflow.training.shipped import rows
@@ -81,22 +79,6 @@ def test_shipped_sympflows_stay_for_a_hundred_thousand_steps(scene):
     flow = load(path(scene, "sympflow"))
     sol = solve(system, flow, (0.0, 1e5 * flow.dt), y0=y0, save_every=100, on_domain_exit="ignore")
     assert max_energy_error(sol) <= 1e-4
-
-
-def test_every_shipped_sympflow_has_its_certificate():
-    """If the judge of its recipe gives one."""
-    recipes = {file_of(recipe, SHIPPED).stem: recipe for recipe in rows.recipes()}
-    assert sorted(recipes) == sorted(file.stem for file in SHIPPED.glob("*.safetensors"))
-    for name, recipe in recipes.items():
-        if recipe.kind != "mlp":
-            flow = load(file_of(recipe, SHIPPED))
-            assert (flow.certified is not None) == recipe.judge.certifies, name
-            assert flow.certified is None or flow.certified.delta.largest > 0
-
-
-def test_no_shipped_flow():
-    with pytest.raises(ValueError, match=r"`system` 'harmonic_oscillator' has no shipped .*henon_heiles.*train"):
-        shipped(harmonic_oscillator(3.0))
 
 
 def test_a_blow_up_is_not_a_small_error():
