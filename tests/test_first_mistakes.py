@@ -107,6 +107,7 @@ ANSWERED = {
     "keyword": (lambda: H("p**2/2 + lambda*q"), ValueError, "lambda is a word of Python"),
     "2q": (lambda: H("p**2/2 + 2q"), ValueError, r"2q lacks a sign: write 2\*q"),
     "²": (lambda: H("p²/2"), ValueError, r"² is not understood: write q\*\*2"),
+    "dimension": (lambda: HamiltonianSystem(lambda q: q**2, dimension=1), TypeError, "of a function are `ndof`"),
     "H =": (lambda: H("H(q, p) = p**2/2"), ValueError, r"leave 'H\(q, p\) =' out"),
     "t_end": (lambda: solve("pendulum", "verlet", t_end=1), TypeError, r"times are `t_span`, \(start, end\)"),
     "n_steps": (lambda: solve("pendulum", "verlet", n_steps=10), TypeError, r"dt=\(t1 - t0\)/n"),

@@ -18,7 +18,7 @@ from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, named_values, parsed
 from sympflow.hamiltonian.poles import PairsPoles, Poles
-from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
+from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, without_deltas
 
 MOST_AXES = 3
 MOST_NEAR = 300
@@ -256,7 +256,7 @@ class PairsHamiltonian(LocalHamiltonian):
     @property
     def slopes(self) -> list[sp.Expr]:
         """V, 2V′, 4V″ and 8V‴, derivatives by s."""
-        return [2**k * sp.diff(self.V, self.s, k) if k else self.V for k in range(4)]
+        return [without_deltas(2**k * sp.diff(self.V, self.s, k)) if k else self.V for k in range(4)]
 
     # array functions, positions (..., d) ------------------------------------------------------------------------------
 

@@ -16,6 +16,13 @@ from sympflow.arrays import Array
 from sympflow.hamiltonian.domain import Domain
 
 UNNAMED = "custom"
+MEANT = {
+    **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`"),
+    **dict.fromkeys(("q0", "p0", "x0"), "the initial state is `y0`, [q, p] in one array"),
+    **dict.fromkeys(("h", "step"), "the step is `dt`"),
+    **dict.fromkeys(("mass", "m"), "masses are in T(p), or `masses` of pairs"),
+}
+"""Remedies for arguments that other packages have."""
 
 
 class SceneOptions(TypedDict, total=False):
@@ -74,7 +81,10 @@ class Scene:
             )
         for name in options:
             if name not in known:
-                raise TypeError(f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}.")
+                instead = f": {MEANT[name]}" if name in MEANT else ""
+                raise TypeError(
+                    f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}{instead}."
+                )
         return cls(**{**defaults, **options})
 
     def state(self, ndof: int) -> np.ndarray | None:

@@ -43,7 +43,7 @@ class Projected(FixedStep):
         return f"{self.inner.label}, projected"
 
     @property
-    def takes_driving(self) -> bool:
+    def takes_driving(self) -> bool:  # type: ignore[override]
         return self.inner.takes_driving
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:

@@ -107,6 +107,16 @@ class TestRuns:
         assert np.abs(p - p[:, :1]).max() < 8 * steps * eps * size
         assert np.abs(L - L[:, :1]).max() < 32 * steps * eps * size
 
+    @pytest.mark.parametrize("V", ["r**2/2", "Max(1 - r, 0)**2.5", "Min(r - 1, 0)**2"])
+    @pytest.mark.parametrize("more", [{}, {"box": 9.0}, {"cutoff": 3.0}])
+    def test_force_gradients_of_a_constant_slope_and_of_contacts(self, V, more):
+        y0 = np.array([0, 0, 0.8, 0, 1.6, 0, 0.5, 0, 0, 0, 0, 0])
+        system = HamiltonianSystem.pairs(V, masses=np.ones(3), dim=2, y0=y0, dt=0.02, **more)
+        exact = solve(system, "dop853", t_eval=[1.0], rtol=1e-10, atol=1e-12).y
+        for backend in ("compiled", "array"):
+            sol = solve(system, "chin4a", t_eval=[1.0], backend=backend)
+            np.testing.assert_allclose(sol.y, exact, atol=1e-6)
+
     @pytest.mark.parametrize("method", ["gauss_legendre4", "log_leapfrog"])
     def test_methods_that_need_symbols_take_those_of_a_few_bodies(self, method):
         system = gravity(3)
