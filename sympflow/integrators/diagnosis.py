@@ -191,8 +191,8 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
             continue
         _TOLD.add(poles)
         warn(
-            f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in "
-            "many digits, at it not finite. Write them by sinc, which is sin(x)/x without that, or near it by their "
+            f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in many "
+            "digits, and not finite at it. Write them by sinc, which is sin(x)/x without that, or near it by their "
             "series, in a Piecewise.",
             RuntimeWarning,
         )

@@ -151,7 +151,7 @@ OF_RUNS = {
     ),
 }
 OF_ENSEMBLES = {
-    "shape of chunks": (told(chunk_shape=[10**12]), "its chunk_shape .* is none of"),
+    "shape of chunks": (told(chunk_shape=[10**12]), "its chunk_shape .* does not fit"),
     "no shape of chunks": (told(chunk_shape="all"), "its chunk_shape is missing"),
     "messages linked": (linked("messages"), "'messages' is a link to elsewhere"),
 }
