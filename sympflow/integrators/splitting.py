@@ -138,7 +138,8 @@ class Splitting(FixedStep):
     corrector : int, optional
         For the splitting "kepler" and drift–kick–drift steps, as of "wisdom_holman": the order of a symplectic
         corrector, 3, 5, … 17, which is applied at the start, and its inverse to each output. It removes errors of
-        first order in the masses of the planets, and costs nothing in between.
+        first order in the masses of the planets, with "kepler_takahashi_imada" of second order too, and costs nothing
+        in between.
     shift : float, optional
         For the logarithmic clock: c, above the energy; default E + |E|, which is 0 for a bound system.
 
