@@ -46,6 +46,7 @@ PHRASES = {
     "sympflow.train(system)": "`sympflow train`",
     "flow.certificate(system)": "`sympflow certificate`",
     "poincare_section": "`sympflow section`",
+    'damping="quadratic"': "`--drag`",
     "period=2*np.pi": "period=6.283185307179586",
     "period=np.inf": "`--period inf`",
 }

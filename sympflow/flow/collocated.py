@@ -135,20 +135,14 @@ class CollocatedFlow(SystemFlow):
 
     @classmethod
     def of(
-        cls,
-        system: HamiltonianSystem,
-        *,
-        dt: float,
-        stages: int,
-        steps: int | None,
-        states: ArrayLike | None,
-        dtype: torch.dtype,
-        device: torch.device | str | None,
+        cls, system: HamiltonianSystem, *, stages: int, steps: int | None, states: ArrayLike | None, **like: Any
     ) -> Self:
         """Return a flow with as many steps as the system needs: see `SympFlow.collocated`."""
         check_system(system)
         check_for_flows(system, cls.takes_friction, cls.takes_driving)
-        flow = cls(system.ndof, stages, 1 if steps is None else steps, dt)  # all arguments are looked at before work
+        flow = cls(
+            system.ndof, stages, 1 if steps is None else steps, like["dt"]
+        )  # all arguments are looked at before work
         if steps is None:
             if states is None and system.domain is not None:
                 states = system.domain.sample(SAMPLED, 0)
@@ -158,7 +152,7 @@ class CollocatedFlow(SystemFlow):
                     "`states`."
                 )
             steps = enough_steps(system, flow.tableau, flow.dt, _checked_states(states, system.ndof))
-        made = cls(system.ndof, stages, steps, flow.dt, system, dtype, device)
+        made = cls(system.ndof, stages, steps, system=system, **like)
         made.domain = system.domain
         if system.domain is not None:
             made.identify(system, system.domain)

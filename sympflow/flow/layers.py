@@ -58,13 +58,7 @@ class Layer(nn.Module):
         raise NotImplementedError
 
     def network(self) -> NetworkLayer:
-        """Return its weights for compiled loops.
-
-        Raises
-        ------
-        ValueError
-            If there are none: if it is not a kick or a drift with an MLP potential.
-        """
+        """Return its weights for compiled loops; a ValueError if it is not a kick or a drift with an MLP potential."""
         raise ValueError(NO_NETWORK)
 
     def trained(self) -> TrainedNetwork | None:

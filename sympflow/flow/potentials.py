@@ -40,13 +40,7 @@ NO_NETWORK = "`flow` has layers other than kicks and drifts with MLP potentials:
 
 
 class Unregistered(ValueError):
-    """A name of an activation or a potential that nothing is registered under.
-
-    Attributes
-    ----------
-    what, remedy : str
-        For the message of a file that needs it.
-    """
+    """A name of an activation or a potential that nothing is registered under; `what` and `remedy` are for messages."""
 
     def __init__(self, kind: str, name: Any, known: Iterable[str]) -> None:
         self.what = f"{kind} {_short(name)}"
@@ -193,15 +187,7 @@ class Register(Generic[T]):
 
 
 def activation_named(name: str) -> Activation:
-    """Return the activation of that name: a built-in one, one that was registered, or that of a plug-in.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    ImportError
-        If the plug-in that announces it cannot be loaded.
-    """
+    """Return the activation of that name: built-in, registered or a plug-in's; else a ValueError."""
     return activations.named(name)
 
 
@@ -660,14 +646,8 @@ def hidden_widths(hidden: Sequence[int]) -> tuple[int, ...]:
 def module_weights(module: nn.Module) -> dict[str, Any]:
     """Return the arguments of `MLPPotential.from_weights` for a `torch.nn.Sequential` of the input [x, t].
 
-    Its activations are recognised by their values, whatever their classes.
-
-    Raises
-    ------
-    TypeError
-        If it is no Sequential of Linear layers and activations in turn, the output linear.
-    ValueError
-        If an activation is none of those that are known, or they differ.
+    Its activations are recognised by their values. A TypeError says that it is no Sequential of Linear layers and
+    activations in turn, the output linear, a ValueError that an activation is unknown, or that they differ.
     """
     layers = list(module) if isinstance(module, nn.Sequential) else []
     linear, between = layers[::2], layers[1::2]
@@ -741,15 +721,7 @@ potentials: Register[type[Potential]] = Register(
 
 
 def potential_named(name: str) -> type[Potential]:
-    """Return the class of potentials that files call by that name.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    ImportError
-        If the plug-in that announces it cannot be loaded.
-    """
+    """Return the class of potentials of that name; a ValueError says that there is none."""
     return potentials.named(name)
 
 

@@ -103,26 +103,12 @@ class PrimedFlow(PrimedKnown, SystemFlow):
             self.identify(system)
 
     @classmethod
-    def untrained(
-        cls,
-        system: HamiltonianSystem,
-        *,
-        stages: int | None,
-        dt: float,
-        palindromic: bool,
-        scheme: Scheme | str | None,
-        degree: int | None,
-        force_gradient: bool | Sequence[int] | None,
-        processor: int,
-        curvature: bool | Sequence[int],
-        polynomial: int | None,
-        first: str,
-        dtype: torch.dtype,
-        device: torch.device | str | None,
-    ) -> Self:
+    def untrained(cls, system: HamiltonianSystem, *, dt: float, dtype: Any, device: Any, **given: Any) -> Self:
         """Return a flow that is, at every t, equal leapfrog steps or the given scheme: see `SympFlow.primed`."""
-        stages, palindromic, scheme, degree = map(plain, (stages, palindromic, scheme, degree))
-        processor, polynomial = map(plain, (processor, polynomial))
+        stages, palindromic, scheme, degree, processor, polynomial = (
+            plain(given[name]) for name in ("stages", "palindromic", "scheme", "degree", "processor", "polynomial")
+        )
+        force_gradient, curvature, first = given["force_gradient"], given["curvature"], given["first"]
         some = None
         if force_gradient is not None:
             force_gradient, some = _kicks_of("force_gradient", force_gradient)

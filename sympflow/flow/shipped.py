@@ -272,24 +272,12 @@ def choose(
 
 
 def shipped(system: HamiltonianSystem, kind: str = "sympflow", tol: float | None = None) -> Any:
-    """Return the flow that the package ships for `system`, recognised by its fingerprint: see `choose`.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or none that meets `tol`; the message lists those there are.
-    """
+    """Return the flow that the package ships for `system`, or a ValueError that lists those there are: see `choose`."""
     return choose(system, kind, tol).load(system)
 
 
 def named(name: str) -> ShippedFlow:
-    """The flow that ships under a name, that of its file.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """The flow that ships under a name, that of its file; a ValueError says that there is none."""
     found = [f for f in _catalogue() if f.name == name]
     if not found:
         close = difflib.get_close_matches(name, [f.name for f in _catalogue()], n=3)

@@ -175,22 +175,12 @@ class SplitFlow(SystemFlow):
             self.identify(system)
 
     @classmethod
-    def untrained(
-        cls,
-        system: HamiltonianSystem,
-        *,
-        stages: int,
-        dt: float,
-        terms: int,
-        filters: bool,
-        force_gradient: bool | Sequence[int] | None,
-        parts: Sequence[str] | None,
-        linear_outside: bool,
-        dtype: torch.dtype,
-        device: torch.device | str | None,
-    ) -> Self:
+    def untrained(cls, system: HamiltonianSystem, *, parts: Sequence[str] | None, **given: Any) -> Self:
         """Return a flow of so many equal Strang steps: see `SympFlow.split`."""
-        stages, terms = plain(stages), plain(terms)
+        stages, terms, filters, force_gradient, linear_outside = (
+            plain(given[name]) for name in ("stages", "terms", "filters", "force_gradient", "linear_outside")
+        )
+        like = {name: given[name] for name in ("dt", "dtype", "device")}
         check_system(system)
         check_for_flows(system)
         check_flag("filters", filters)
@@ -214,11 +204,9 @@ class SplitFlow(SystemFlow):
             terms=terms,
             filters=filters,
             gradients=() if force_gradient is False else kicks,
-            dt=dt,
             expressions=parts,
             system=system,
-            dtype=dtype,
-            device=device,
+            **like,
         )
 
     @classmethod

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from sympflow.learning.library import Library, library_for, polynomials
-from sympflow.learning.models import Drive, Polynomial, drags, turns
+from sympflow.learning.models import drags, turns
+from sympflow.learning.parts import Drive, Polynomial
 from sympflow.learning.smoothing import Smooth
 from sympflow.learning.trajectories import Trajectories
 

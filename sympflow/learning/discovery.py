@@ -25,11 +25,13 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning import diagnosis
 from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
+from sympflow.learning.orbits import Method
+from sympflow.learning.reading import Run
 from sympflow.learning.regression import Regression
-from sympflow.learning.shooting import Fit, Method, Problem, chosen_method, minimized
+from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
-from sympflow.learning.trajectories import Run, Trajectories, periods_of
+from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.show.style import new_figure
 from sympflow.training.session import Session

@@ -13,19 +13,8 @@ import numpy as np
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.inertia import Inertia
 from sympflow.learning.maps import NetworkFlow
-from sympflow.learning.models import (
-    Distances,
-    Drive,
-    FixedKinetic,
-    Force,
-    Formula,
-    Kinetic,
-    Model,
-    Network,
-    Part,
-    Polynomial,
-    Waves,
-)
+from sympflow.learning.models import Force, Model
+from sympflow.learning.parts import Distances, Drive, FixedKinetic, Formula, Kinetic, Network, Part, Polynomial, Waves
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
 HARMONICS = (1, 2, 3, 4, 6, 8)

@@ -12,20 +12,10 @@ import numpy as np
 from sympflow.arguments import floats
 from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.models import Model
-from sympflow.learning.shooting import (
-    FINEST,
-    Field,
-    Fit,
-    Method,
-    Problem,
-    chosen_method,
-    first_states,
-    matched,
-    minimized,
-    rho,
-    steppers,
-)
-from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.learning.orbits import Field, Method, first_states, steppers
+from sympflow.learning.reading import Run
+from sympflow.learning.shooting import FINEST, Fit, Problem, chosen_method, matched, minimized, rho
+from sympflow.learning.trajectories import Trajectories
 from sympflow.training.least_squares import Stop, never
 
 FIRST_POINTS, SKETCH_POINTS = 10, 30  # of the pieces that a fit begins with, and that one of all terms has

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sympflow.learning.models import Linear, Part, Waves
+from sympflow.learning.parts import Linear, Part, Waves
 
 if TYPE_CHECKING:
     import sympy

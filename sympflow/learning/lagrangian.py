@@ -11,10 +11,12 @@ from functools import cached_property
 
 import numpy as np
 
-from sympflow.learning.models import Model, Network, Part, Polynomial
-from sympflow.learning.shooting import integrals
+from sympflow.learning.models import Model
+from sympflow.learning.orbits import integrals
+from sympflow.learning.parts import Network, Part, Polynomial
+from sympflow.learning.reading import Run
 from sympflow.learning.smoothing import Smooth, smoothed
-from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.learning.trajectories import Trajectories
 
 POINTS = 24
 """Number of points of a piece along which p is followed."""

@@ -11,7 +11,8 @@ import numpy as np
 import sympy as sp
 
 from sympflow.hamiltonian.symbolic import generate, parse
-from sympflow.learning.models import Linear, Model, Part
+from sympflow.learning.models import Model
+from sympflow.learning.parts import Linear, Part
 
 NEAR = 0.05
 """Least distance from a singular point, over the size of the coordinates, of data for which 1/r is in the library."""

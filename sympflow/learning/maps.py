@@ -20,7 +20,7 @@ from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.learning.models import VectorField
-from sympflow.learning.shooting import Method, Stepper
+from sympflow.learning.orbits import Method, Stepper
 
 ON_TIME = 1e-9
 """Share of Δt by which a time may exceed it and still counts as Δt."""

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.learning.reading import Run
+from sympflow.learning.trajectories import Trajectories
 
 FEWEST = 6
 """Points of a coordinate from which a curve is made; with fewer there are differences."""

@@ -19,10 +19,13 @@ import numpy as np
 
 from sympflow.learning.diagnosis import DRAG, DRIVEN, TURNED
 from sympflow.learning.lagrangian import lagrangian_start
-from sympflow.learning.models import Drive, FreeField, Model, drags, frictions, turns
-from sympflow.learning.shooting import Field, increments_left, matched
+from sympflow.learning.models import FreeField, Model, drags, frictions, turns
+from sympflow.learning.orbits import Field
+from sympflow.learning.parts import Drive
+from sympflow.learning.reading import Run
+from sympflow.learning.shooting import increments_left, matched
 from sympflow.learning.smoothing import Smooth, smoothed
-from sympflow.learning.trajectories import Run, Trajectories
+from sympflow.learning.trajectories import Trajectories
 from sympflow.training.least_squares import Stop, never
 
 DEGREES = (1, 2, 3)

@@ -9,8 +9,8 @@ import scipy.linalg
 import sympy as sp
 
 from sympflow.hamiltonian.domain import Tube
-from sympflow.learning.models import Part, Polynomial
-from sympflow.learning.trajectories import Run
+from sympflow.learning.parts import Part, Polynomial
+from sympflow.learning.reading import Run
 
 SAME = 1e-3
 """Variance of a function over the data, in that over a box around them, below which it is the same at all points."""

@@ -22,9 +22,9 @@ from scipy.linalg import block_diag
 from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.parts import SubFlow
+from sympflow.hamiltonian.parts import ExactParts, SubFlow
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.parts_loops import parts_loops
+from sympflow.kernels.parts_loops import PartsLoops, parts_loops
 from sympflow.training.fits import GaussNewton, Resolved
 from sympflow.training.least_squares import Minimum, Problem, Stop, levenberg_marquardt, put_weights
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors, stream_seed
@@ -118,9 +118,7 @@ class SplitProblem:
         solver: Resolved,
         deadline: Deadline,
     ) -> None:
-        self.flow, self.fit, self.solver, self.parts = flow, fit, solver, flow.parts
-        self.kernel = parts_loops(self.parts)
-        self.columns = flow.columns()
+        self.flow, self.fit, self.solver = flow, fit, solver
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
         self.n = int(ends[-1]) if len(ends) else 0
@@ -133,13 +131,17 @@ class SplitProblem:
         between = _phases((np.arange(2 * fit.label_times) + 1) / (2 * fit.label_times))
         self.held_out = Labels.of(system, x, flow.dt * between, deadline.part(LABEL_SHARE))
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("kernel", "parts", "columns")}
+    @property
+    def parts(self) -> ExactParts:
+        return self.flow.parts
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self.parts, self.columns = self.flow.parts, self.flow.columns()
-        self.kernel = parts_loops(self.parts)
+    @property
+    def kernel(self) -> PartsLoops:
+        return parts_loops(self.parts)
+
+    @property
+    def columns(self) -> list[Column]:
+        return self.flow.columns()
 
     def _modes(self, y: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(np.concatenate(self.parts.to_modes(y), axis=-1))

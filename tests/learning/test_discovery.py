@@ -8,7 +8,8 @@ import sympy as sp
 
 import sympflow
 from sympflow.learning.library import Library, coordinates, library_for, polynomials
-from sympflow.learning.shooting import Gauss, Method, Problem, minimized
+from sympflow.learning.orbits import Gauss, Method
+from sympflow.learning.shooting import Problem, minimized
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import damped_pendulum, pendulum

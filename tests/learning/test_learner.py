@@ -12,32 +12,13 @@ import sympflow
 from sympflow.learning.families import FAMILIES, Candidate, pruned
 from sympflow.learning.fitting import Held, Setting, fitted, judged, left_out, restored
 from sympflow.learning.inertia import Inertia
-from sympflow.learning.learner import (
-    MOST_VALUES,
-    Replicas,
-    Search,
-    _constraints,
-    _cut,
-    _divided,
-    _few,
-    replica,
-    without_growth,
-)
+from sympflow.learning.learner import MOST_VALUES, _constraints, _cut, _divided, _few
 from sympflow.learning.library import Library, Terms
-from sympflow.learning.models import (
-    Distances,
-    Drive,
-    FixedKinetic,
-    Formula,
-    Kinetic,
-    Model,
-    Network,
-    Polynomial,
-    Waves,
-    drags,
-    friction,
-)
-from sympflow.learning.shooting import Gauss, Method, Problem, chosen_method, first_states, matched, minimized
+from sympflow.learning.models import Model, drags, friction
+from sympflow.learning.orbits import Gauss, Method, first_states
+from sympflow.learning.parts import Distances, Drive, FixedKinetic, Formula, Kinetic, Network, Polynomial, Waves
+from sympflow.learning.search import Replicas, Search, replica, without_growth
+from sympflow.learning.shooting import Problem, chosen_method, matched, minimized
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training import checkpoint as checkpoints

@@ -11,7 +11,7 @@ import sympflow
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.learner import learn
 from sympflow.learning.maps import NetworkFlow
-from sympflow.learning.shooting import Method
+from sympflow.learning.orbits import Method
 
 DT = 0.8
 

@@ -10,8 +10,9 @@ import sympflow
 from sympflow.learning.diagnosis import hint
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
-from sympflow.learning.learner import Search, _constraints
+from sympflow.learning.learner import _constraints
 from sympflow.learning.library import library_for
+from sympflow.learning.search import Search
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import best_by_increments
 from sympflow.learning.trajectories import Trajectories

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from sympflow.learning.models import Distances
+from sympflow.learning.parts import Distances
 from sympflow.learning.unseen import unseen
 
 random = np.random.default_rng(0)

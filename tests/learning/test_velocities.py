@@ -10,8 +10,9 @@ from sympflow.learning.families import FAMILIES, Constraints, families
 from sympflow.learning.fitting import Setting, fitted
 from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.learner import _constraints
-from sympflow.learning.models import FixedKinetic, Kinetic, Model, Polynomial, friction
-from sympflow.learning.shooting import first_states
+from sympflow.learning.models import Model, friction
+from sympflow.learning.orbits import first_states
+from sympflow.learning.parts import FixedKinetic, Kinetic, Polynomial
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import double_pendulum
 

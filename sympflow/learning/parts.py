@@ -1,0 +1,621 @@
+"""Parts of an unknown H: functions of q, of p or of both, with some numbers θ to be learned."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import combinations, combinations_with_replacement, product
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import sympy
+STEEP = 5.0
+"""Size of the weights and biases of neurons, in the spread of the coordinates, beyond which they would be steps."""
+
+
+class Linear(NamedTuple):
+    """A function f(θ, x) of columns x (m, N) with its derivatives; None for those that were not asked for."""
+
+    value: np.ndarray  # (m, N)
+    slope: np.ndarray | None = None  # (m, m, N): ∂f/∂x
+    by_parameters: np.ndarray | None = None  # (m, n, N): ∂f/∂θ
+
+
+class Part(ABC):
+    """A function of q, p or y = [q, p], with n numbers θ."""
+
+    of: str
+    n: int
+
+    @property
+    def quadratic(self) -> bool:
+        """True if it is known to be a quadratic form."""
+        return False
+
+    @abstractmethod
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        """The gradient at columns x (m, N), with its derivatives."""
+
+    @abstractmethod
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """The values (N,)."""
+
+    @abstractmethod
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        """The function in symbols."""
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        """θ before anything is known."""
+        return np.zeros(self.n)
+
+    @property
+    def prior(self) -> np.ndarray:
+        """One over the size (n,) that each number is expected to have, 0 for any."""
+        return np.zeros(self.n)
+
+    def subset(self, kept: np.ndarray) -> Part:
+        """The part with some of its numbers (n,), where it is a sum of terms, one for each; else the part itself."""
+        return self
+
+    @property
+    def linear(self) -> bool:
+        """True if it is linear in θ."""
+        return True
+
+    @property
+    def terms(self) -> bool | np.ndarray:
+        """True if `subset` leaves terms out; or the numbers (n,) that it may leave out."""
+        return False
+
+    def at(self, t: np.ndarray) -> Part:
+        """The function at times t (N,), one for each column."""
+        return self
+
+    @property
+    def inertial(self) -> bool:
+        """True if it is a kinetic energy whose masses depend on q, and linear in θ in Lagrange's form."""
+        return False
+
+    def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """p = ∂L/∂v and p' = ∂L/∂q of a Lagrangian at q and v (d, N), for θ = 0; and their derivatives by θ (2d, n, N).
+
+        L has −V of what depends on q alone. Other parts stand in it with v in place of p, and numbers of their own.
+        """
+        x = {"q": q, "p": v, "y": np.concatenate([q, v])}[self.of]
+        f = self.gradient(np.zeros(self.n), x, False, True)
+        assert f.by_parameters is not None
+        return self._mechanics(f.value), self._mechanics(f.by_parameters)
+
+    def _mechanics(self, slopes: np.ndarray) -> np.ndarray:
+        """∂L/∂v and ∂L/∂q of slopes (m, …) of a part."""
+        none, d = np.zeros_like(slopes), len(slopes) // 2
+        rows = {"q": (none, -slopes), "p": (slopes, none), "y": (slopes[d:], slopes[:d])}
+        return np.concatenate(rows[self.of])
+
+
+class Polynomial(Part):
+    """Σ_m θ_m Π_i (x_i/s_i)^m_i, of exponents m (n, m) and scales s (m,), of the size of the data: θ are comparable."""
+
+    def __init__(self, of: str, exponents: Any, scales: Any) -> None:
+        self.of, self.exponents, self.scales = of, np.asarray(exponents, dtype=int), np.asarray(scales, dtype=float)
+        self.n = len(self.exponents)
+
+    @property
+    def quadratic(self) -> bool:
+        return bool((self.exponents.sum(axis=1) == 2).all())
+
+    @property
+    def terms(self) -> bool:
+        return True
+
+    @classmethod
+    def up_to(cls, degree: int, of: str, scales: Any) -> Polynomial:
+        """All monomials of degree 1 to `degree`."""
+        m = len(scales)
+        exponents = [e for e in product(range(degree + 1), repeat=m) if 0 < sum(e) <= degree]
+        return cls(of, sorted(exponents, key=lambda e: (sum(e), e[::-1])), scales)
+
+    @cached_property
+    def derivatives(self) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
+        """For each list of coordinates, of one or two: the factors and exponents of the derivatives by them."""
+        made: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
+        m = self.exponents.shape[1]
+        for places in [(i,) for i in range(m)] + [(i, j) for i in range(m) for j in range(i, m)]:
+            factor, left = np.ones(self.n), self.exponents.copy()
+            for i in places:
+                factor, left[:, i] = factor * left[:, i] / self.scales[i], np.maximum(left[:, i] - 1, 0)
+            made[places] = factor, left
+        return made
+
+    def tables(self, x: np.ndarray) -> list[np.ndarray]:
+        """The powers of each coordinate, (degree + 1, N)."""
+        powers = []
+        for z, most in zip(x / self.scales[:, None], self.exponents.max(axis=0, initial=0), strict=True):
+            table = np.ones((most + 1, len(z)))
+            for k in range(1, most + 1):
+                np.multiply(table[k - 1], z, out=table[k])
+            powers.append(table)
+        return powers
+
+    @staticmethod
+    def monomials(powers: list[np.ndarray], exponents: np.ndarray) -> np.ndarray:
+        made = powers[0][exponents[:, 0]]
+        for table, e in zip(powers[1:], exponents.T[1:], strict=True):
+            made *= table[e]
+        return made
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        powers, derivatives = self.tables(x), self.derivatives
+        value = np.empty((m, N))
+        columns = np.empty((m, self.n, N)) if by_parameters else None
+        for i in range(m):
+            factor, left = derivatives[i,]
+            made = self.monomials(powers, left)
+            value[i] = (theta * factor) @ made
+            if columns is not None:
+                np.multiply(made, factor[:, None], out=columns[i])
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for i in range(m):
+                for j in range(i, m):
+                    factor, left = derivatives[i, j]
+                    used = factor != 0
+                    slopes[i, j] = slopes[j, i] = (theta * factor)[used] @ self.monomials(powers, left[used])
+        return Linear(value, slopes, columns)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return theta @ self.monomials(self.tables(x), self.exponents)
+
+    def subset(self, kept: np.ndarray) -> Polynomial:
+        """The polynomial of some of the monomials (n,)."""
+        return Polynomial(self.of, self.exponents[kept], self.scales)
+
+    def coefficients(self, theta: np.ndarray) -> np.ndarray:
+        """The coefficients of the monomials in x itself."""
+        return theta / np.prod(self.scales**self.exponents, axis=1)
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        terms = zip(self.coefficients(theta), self.exponents.tolist(), strict=True)
+        return sympy.Add(
+            *(sympy.Float(c, 17) * sympy.Mul(*(v**e for v, e in zip(x, m, strict=True))) for c, m in terms if c)
+        )
+
+
+class Kinetic(Polynomial):
+    """½ pᵀM⁻¹p, M⁻¹ symmetric, θ its entries on and above the diagonal; or on the diagonal alone."""
+
+    def __init__(self, scales: Any, mixed: bool = True) -> None:
+        d = len(scales)
+        pairs = [(i, j) for i in range(d) for j in range(i, d if mixed else i + 1)]
+        exponents = np.zeros((len(pairs), d), dtype=int)
+        for row, pair in zip(exponents, pairs, strict=True):
+            for i in pair:
+                row[i] += 1
+        super().__init__("p", exponents, scales)
+        self._pairs = np.array(pairs)
+        self._units = 1 / np.array([self.scales[i] * self.scales[j] for i, j in pairs])
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        i, j = self._pairs.T
+        W = np.zeros((m, m))
+        np.add.at(W, (i, j), theta * self._units)
+        W += W.T  # an entry of the diagonal is twice its coefficient
+        by = None
+        if by_parameters:
+            by, places = np.zeros((m, self.n, N)), np.arange(self.n)
+            by[i, places] += self._units[:, None] * x[j]
+            by[j, places] += self._units[:, None] * x[i]
+        return Linear(W @ x, W[:, :, None] if slope else None, by)
+
+
+class FixedKinetic(Part):
+    """½ pᵀM⁻¹p of a mass matrix that is given."""
+
+    def __init__(self, inverse_mass: np.ndarray) -> None:
+        self.of, self.n, self.inverse_mass = "p", 0, inverse_mass
+
+    @property
+    def quadratic(self) -> bool:
+        return True
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        W = self.inverse_mass
+        return Linear(
+            W @ x, W[:, :, None] if slope else None, np.empty((len(x), 0, x.shape[1])) if by_parameters else None
+        )
+
+    def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        p = np.linalg.pinv(self.inverse_mass) @ v
+        return np.concatenate([p, np.zeros_like(p)]), np.zeros((2 * len(q), 0, q.shape[1]))
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return 0.5 * np.einsum("in,ij,jn->n", x, self.inverse_mass, x)
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        v = sympy.Matrix(list(x))
+        return sympy.expand((v.T * sympy.Matrix(self.inverse_mass.tolist()) * v)[0] / 2)
+
+
+class Waves(Part):
+    """Σ_m θ_m Π_i (x_i/s_i)^m_i cos(k_m·x + φ_m): Fourier series in angles, with powers of the other coordinates.
+
+    Exponents m and wave vectors k are (n, m), phases φ (n,): 0 for cosines, −π/2 for sines.
+    """
+
+    def __init__(self, of: str, exponents: Any, waves: Any, phases: Any, scales: Any) -> None:
+        self.of, self.waves, self.phases = of, np.asarray(waves, dtype=float), np.asarray(phases, dtype=float)
+        self.powers = Polynomial(of, exponents, scales)
+        self.n = len(self.waves)
+        self._angles, self._place = np.unique(self.waves, axis=0, return_inverse=True)
+        self._place = self._place.ravel()
+
+    @property
+    def terms(self) -> bool:
+        return True
+
+    @classmethod
+    def up_to(
+        cls, harmonics: int, degree: int, of: str, scales: Any, periods: np.ndarray, constant: bool = False
+    ) -> Waves:
+        """Harmonics to this order of the angles, which have a period, times powers of the others to this degree.
+
+        The constant, which moves nothing as a term of H, is the first term if it is asked for.
+        """
+        angles = np.isfinite(periods)
+        span = [range(-harmonics, harmonics + 1) if angle else (0,) for angle in angles]
+        reach = [(0,) if angle else range(degree + 1) for angle in angles]
+        vectors = [v for v in product(*span) if sum(map(abs, v)) <= harmonics and v >= tuple(-x for x in v)]
+        monomials = [e for e in product(*reach) if sum(e) <= degree]
+        terms = [
+            (e, v, phase)
+            for e in sorted(monomials, key=sum)
+            for v in sorted(vectors, key=lambda v: sum(map(abs, v)))
+            for phase in ((0.0, -np.pi / 2) if any(v) else (0.0,))
+            if constant or any(e) or any(v)
+        ]
+        exponents, chosen, phases = zip(*terms, strict=True)
+        return cls(of, exponents, np.array(chosen) * np.where(angles, 2 * np.pi / periods, 0.0), phases, scales)
+
+    def subset(self, kept: np.ndarray) -> Waves:
+        exponents = self.powers.exponents[kept]
+        return Waves(self.of, exponents, self.waves[kept], self.phases[kept], self.powers.scales)
+
+    def _turns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The cosines of all terms and their derivatives by the angle, (n, N)."""
+        u = self._angles @ x
+        cos, sin = np.cos(u)[self._place], np.sin(u)[self._place]
+        c, s = np.cos(self.phases)[:, None], np.sin(self.phases)[:, None]
+        return cos * c - sin * s, -(sin * c + cos * s)
+
+    def derivatives(
+        self, x: np.ndarray, twice: bool
+    ) -> tuple[np.ndarray, np.ndarray, dict[tuple[int, int], np.ndarray]]:
+        """The terms (n, N), their slopes (m, n, N), and for i ≤ j their second derivatives (n, N) if asked for."""
+        m, N = x.shape
+        wave, turned = self._turns(x)
+        if not self.powers.exponents.any():  # of angles alone
+            slopes = self.waves.T[..., None] * turned
+            pairs = combinations_with_replacement(range(m), 2) if twice else ()
+            return wave, slopes, {(i, j): -(self.waves[:, i] * self.waves[:, j])[:, None] * wave for i, j in pairs}
+        powers = self.powers.tables(x)
+        whole = self.powers.monomials(powers, self.powers.exponents)
+        slopes = np.empty((m, self.n, N))
+        first, second = [], {}
+        for i in range(m):
+            factor, left = self.powers.derivatives[i,]
+            first.append(factor[:, None] * self.powers.monomials(powers, left) if factor.any() else 0.0)
+            slopes[i] = first[i] * wave + self.waves[:, i, None] * whole * turned
+        for i, j in combinations_with_replacement(range(m), 2) if twice else ():
+            factor, left = self.powers.derivatives[i, j]
+            ki, kj = self.waves[:, i, None], self.waves[:, j, None]
+            second[i, j] = (first[i] * kj + first[j] * ki) * turned - ki * kj * whole * wave
+            if factor.any():
+                second[i, j] += factor[:, None] * self.powers.monomials(powers, left) * wave
+        return whole * wave, slopes, second
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        _, by, second = self.derivatives(x, slope)
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for (i, j), terms in second.items():
+                slopes[i, j] = slopes[j, i] = theta @ terms
+        return Linear(np.stack([theta @ rows for rows in by]), slopes, by if by_parameters else None)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return theta @ (self.powers.monomials(self.powers.tables(x), self.powers.exponents) * self._turns(x)[0])
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        made = []
+        rows = zip(
+            self.powers.coefficients(theta), self.powers.exponents.tolist(), self.waves, self.phases, strict=True
+        )
+        for c, m, k, phase in rows:
+            angle = sympy.Add(*(_float(a) * v for a, v in zip(k, x, strict=True) if a))
+            turn = sympy.sin(angle) if phase else sympy.cos(angle)
+            made.append(_float(c) * sympy.Mul(*(v**e for v, e in zip(x, m, strict=True))) * turn)
+        return sympy.Add(*made)
+
+
+class Network(Part):
+    """Σ_k w_k tanh(a_k·z + b_k), neurons in one layer; z has x_i/s_i, of an angle its cosine and sine."""
+
+    def __init__(self, of: str, width: int, scales: Any, periods: np.ndarray | None = None) -> None:
+        self.of, self.width, self.scales = of, width, np.asarray(scales, dtype=float)
+        self.periods = np.full(len(self.scales), np.inf) if periods is None else periods
+        self.inputs = [
+            (i, kind) for i, P in enumerate(self.periods) for kind in (("cos", "sin") if np.isfinite(P) else ("line",))
+        ]
+        self.n = width * (len(self.inputs) + 2)
+
+    @property
+    def linear(self) -> bool:
+        return False
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        a = rng.normal(size=(self.width, len(self.inputs)))
+        a *= rng.uniform(0.5, 1.5, self.width)[:, None] / np.linalg.norm(a, axis=1, keepdims=True)
+        w = 0.1 * rng.normal(size=self.width)
+        return np.concatenate([w, a.ravel(), rng.uniform(-1.5, 1.5, self.width)])
+
+    @property
+    def prior(self) -> np.ndarray:
+        return np.concatenate([np.zeros(self.width), np.full(self.n - self.width, 1 / STEEP)])
+
+    def _split(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        K, e = self.width, len(self.inputs)
+        return theta[:K], theta[K : K + K * e].reshape(K, e), theta[K + K * e :]
+
+    def _embedded(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The inputs z (e, N), with their first and second derivatives by the coordinate of each."""
+        z, first, second = (np.empty((len(self.inputs), x.shape[1])) for _ in range(3))
+        for row, (i, kind) in enumerate(self.inputs):
+            if kind == "line":
+                z[row], first[row], second[row] = x[i] / self.scales[i], 1 / self.scales[i], 0.0
+            else:
+                k = 2 * np.pi / self.periods[i]
+                cos, sin = np.cos(k * x[i]), np.sin(k * x[i])
+                z[row], first[row] = (cos, -k * sin) if kind == "cos" else (sin, k * cos)
+                second[row] = -k * k * z[row]
+        return z, first, second
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        K = self.width
+        w, a, b = self._split(theta)
+        z, first, second = self._embedded(x)
+        neuron = np.tanh(a @ z + b[:, None])
+        s1 = 1 - neuron * neuron
+        s2 = -2 * neuron * s1
+        rows = [[r for r, (place, _) in enumerate(self.inputs) if place == i] for i in range(m)]
+        along = [a[:, r] @ first[r] for r in rows]  # of each coordinate, (K, N)
+        value = np.stack([w @ (s1 * v) for v in along])
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for i in range(m):
+                for j in range(i, m):
+                    slopes[i, j] = slopes[j, i] = w @ (s2 * along[i] * along[j])
+                slopes[i, i] += w @ (s1 * (a[:, rows[i]] @ second[rows[i]]))
+        if not by_parameters:
+            return Linear(value, slopes)
+        by = np.empty((m, self.n, N))
+        e = len(self.inputs)
+        for i in range(m):
+            np.multiply(s1, along[i], out=by[i, :K])
+            bent = (w[:, None] * s2) * along[i]
+            by[i, K + K * e :] = bent
+            for r in range(e):
+                column = by[i, K + r : K + K * e : e]
+                np.multiply(bent, z[r], out=column)
+                if r in rows[i]:
+                    column += (w[:, None] * s1) * first[r]
+        return Linear(value, slopes, by)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        w, a, b = self._split(theta)
+        return w @ np.tanh(a @ self._embedded(x)[0] + b[:, None])
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        w, a, b = self._split(theta)
+        inputs = []
+        for i, kind in self.inputs:
+            angle = _float(2 * np.pi / self.periods[i]) * x[i]
+            inputs.append(
+                x[i] / _float(self.scales[i]) if kind == "line" else (sympy.cos if kind == "cos" else sympy.sin)(angle)
+            )
+        made = []
+        for weight, row, bias in zip(w, a, b, strict=True):
+            sum_ = sympy.Add(_float(bias), *(_float(c) * z for c, z in zip(row, inputs, strict=True)))
+            made.append(_float(weight) * sympy.tanh(sum_))
+        return sympy.Add(*made)
+
+
+class Distances(Part):
+    """Σ_k θ_k (r_k/s)^e_k, of distances r between two bodies, or of one from the origin; log(r/s) where e is 0.
+
+    `bodies` (n_bodies, dim) are places in q, `terms` two bodies, or one and None for the origin, and e.
+    """
+
+    of = "q"
+
+    def __init__(self, bodies: np.ndarray, terms: Sequence[tuple[int, int | None, int]], scale: float) -> None:
+        self.bodies, self.kinds, self.scale, self.n = bodies, list(terms), scale, len(terms)
+
+    @classmethod
+    def between(cls, bodies: np.ndarray, powers: Sequence[int], scale: float, central: bool = False) -> Distances:
+        """All powers of the distances of all pairs of bodies, and from the origin if asked for."""
+        n = len(bodies)
+        lines = [*combinations(range(n), 2), *((a, None) for a in range(n) if central)]
+        return cls(bodies, [(*line, e) for line in lines for e in powers], scale)
+
+    @property
+    def terms(self) -> bool:
+        return True
+
+    def subset(self, kept: np.ndarray) -> Distances:
+        return Distances(self.bodies, [kind for kind, keep in zip(self.kinds, kept, strict=True) if keep], self.scale)
+
+    def squares(self) -> Distances:
+        """The squares of the same distances."""
+        return Distances(self.bodies, [(*line, 2) for line in self._lines], 1.0)
+
+    @cached_property
+    def _lines(self) -> dict[tuple[int, int | None], list[int]]:
+        """The numbers of each distance."""
+        made: dict[tuple[int, int | None], list[int]] = {}
+        for k, (a, b, _) in enumerate(self.kinds):
+            made.setdefault((a, b), []).append(k)
+        return made
+
+    def _distance(self, x: np.ndarray, a: int, b: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """The line from b to a, and its length, in units of s."""
+        line = (x[self.bodies[a]] - (0.0 if b is None else x[self.bodies[b]])) / self.scale
+        return line, np.sqrt(np.sum(line * line, axis=0))
+
+    def _functions(self, numbers: list[int], r: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """f, f' and f'' of some terms, (k, N)."""
+        powers = [self.kinds[k][2] for k in numbers]
+        f = np.stack([r**e if e else np.log(r) for e in powers])
+        first = np.stack([e * r ** (e - 1.0) if e else 1 / r for e in powers])
+        second = np.stack([e * (e - 1) * r ** (e - 2.0) if e else -1 / r**2 for e in powers])
+        return f, first, second
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        value = np.zeros((m, N))
+        slopes = np.zeros((m, m, N)) if slope else None
+        by = np.zeros((m, self.n, N)) if by_parameters else None
+        for (a, b), places in self._lines.items():
+            line, r = self._distance(x, a, b)
+            unit = line / r
+            _, first, second = self._functions(places, r)
+            pull = theta[places] @ first
+            curved = (theta[places] @ second - pull / r) * unit[:, None] * unit
+            curved[np.diag_indices(len(unit))] += pull / r
+            ends = [(self.bodies[a], 1.0)] + ([] if b is None else [(self.bodies[b], -1.0)])
+            for rows, sign in ends:
+                value[rows] += sign / self.scale * pull * unit
+                if by is not None:
+                    by[np.ix_(rows, places)] += sign / self.scale * unit[:, None] * first
+                if slopes is not None:
+                    for others, turn in ends:
+                        slopes[np.ix_(rows, others)] += sign * turn / self.scale**2 * curved
+        return Linear(value, slopes, by)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        total = np.zeros(x.shape[1])
+        for line, places in self._lines.items():
+            total += theta[places] @ self._functions(places, self._distance(x, *line)[1])[0]
+        return total
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        made = []
+        for c, (a, b, e) in zip(theta, self.kinds, strict=True):
+            others = [0 if b is None else x[i] for i in self.bodies[a if b is None else b]]
+            square = sympy.Add(*((x[i] - other) ** 2 for i, other in zip(self.bodies[a], others, strict=True)))
+            if e:
+                made.append(_float(c / self.scale**e) * square ** sympy.Rational(e, 2))
+            else:
+                made.append(_float(c / 2) * sympy.log(square))
+        return sympy.Add(*made)
+
+
+class Formula(Part):
+    """A function that is known, in symbols of the coordinates."""
+
+    def __init__(self, of: str, formula: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> None:
+        self.of, self.n, self.formula, self.symbols = of, 0, formula, tuple(symbols)
+
+    @cached_property
+    def _functions(self) -> tuple[Any, Any, Any]:
+        """The function, its gradient and its second derivatives on and above the diagonal."""
+        import sympy
+
+        first = [self.formula.diff(v) for v in self.symbols]
+        second = [f.diff(v) for i, f in enumerate(first) for v in self.symbols[i:]]
+        return tuple(sympy.lambdify([self.symbols], f, "numpy", cse=True) for f in (self.formula, first, second))
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        _, first, second = self._functions
+        value = np.stack([np.broadcast_to(f, N) for f in first(x)])
+        slopes = np.empty((m, m, N)) if slope else None
+        if slopes is not None:
+            for (i, j), f in zip(combinations_with_replacement(range(m), 2), second(x), strict=True):
+                slopes[i, j] = slopes[j, i] = f
+        return Linear(value, slopes, np.empty((m, 0, N)) if by_parameters else None)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(self._functions[0](x), x.shape[1])
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        return self.formula.subs(dict(zip(self.symbols, x, strict=True)), simultaneous=True)
+
+
+def _float(value: float) -> sympy.Float:
+    import sympy
+
+    return sympy.Float(float(value), 17)
+
+
+class Drive(Part):
+    """Σ_k (a_k cos ωt + b_k sin ωt) f_k(q), forces that a clock moves, of about this ω; θ = [a, b, change of ω]."""
+
+    of = "q"
+
+    def __init__(self, base: Part, frequency: float, times: np.ndarray | float = 0.0) -> None:
+        self.base, self.frequency, self.times = base, frequency, times
+        self.n = 2 * base.n + 1 if base.n else 0
+
+    @property
+    def terms(self) -> np.ndarray:
+        return np.arange(self.n) < self.n - 1
+
+    def subset(self, kept: np.ndarray) -> Part:
+        """The terms of which the cosine or the sine is kept."""
+        return Drive(self.base.subset(kept[: self.base.n] | kept[self.base.n : -1]), self.frequency)
+
+    def at(self, t: np.ndarray) -> Part:
+        return Drive(self.base, self.frequency, t)
+
+    def _waves(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        angle = (self.frequency + theta[-1]) * self.times
+        return np.cos(angle), np.sin(angle)
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        cos, sin = self._waves(theta)
+        a, b = (self.base.gradient(part, x, slope, by_parameters) for part in np.split(theta[:-1], 2))
+        slopes = by = None
+        if a.slope is not None and b.slope is not None:
+            slopes = a.slope * cos + b.slope * sin
+        if a.by_parameters is not None:
+            turned = self.times * (b.value * cos - a.value * sin)
+            by = np.concatenate([a.by_parameters * cos, a.by_parameters * sin, turned[:, None]], axis=1)
+        return Linear(a.value * cos + b.value * sin, slopes, by)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        a, b = np.split(theta[:-1], 2)
+        cos, sin = self._waves(theta)
+        return self.base.value(a, x) * cos + self.base.value(b, x) * sin
+
+    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
+        import sympy
+
+        angle = _float(self.frequency + theta[-1]) * sympy.Symbol("t", real=True)
+        a, b = (self.base.expression(part, x) for part in np.split(theta[:-1], 2))
+        return a * sympy.cos(angle) + b * sympy.sin(angle)

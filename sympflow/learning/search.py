@@ -1,0 +1,758 @@
+"""The search among models of an unknown H, and the flow of the best."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from sympflow.arguments import floats
+from sympflow.flow.flow_map import FlowMap
+from sympflow.flow.sympflow import SympFlow
+from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
+from sympflow.hamiltonian.doubling import DoubledSystem, doubled
+from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.learning.diagnosis import drive_frequency, hint
+from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Constraints, pruned, with_unit_mass
+from sympflow.learning.fitting import (
+    SILENT,
+    Fitted,
+    Held,
+    Setting,
+    fitted,
+    gains,
+    judged,
+    kept,
+    left_out,
+    restored,
+)
+from sympflow.learning.library import library_for
+from sympflow.learning.models import FreeField, Model, drags, frictions
+from sympflow.learning.orbits import Field, Method
+from sympflow.learning.parts import Distances, Drive, Part, Polynomial
+from sympflow.learning.reading import Run
+from sympflow.learning.smoothing import Smooth, smoothed
+from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
+from sympflow.learning.trajectories import Trajectories
+from sympflow.learning.unseen import remark_on, tube, unseen
+from sympflow.training import checkpoint as checkpoints
+from sympflow.training.session import Path, Session, Silent
+from sympflow.training.starts import step_of
+from sympflow.training.trainer import train
+
+SHARE = 3  # of families that are still to be tried, whose time is given to the next
+MANY = 20  # numbers of a model that is simplified before its orbits are followed
+HOPELESS = 2.0  # squares of increments, over those of the best model, from which a model is one of the last
+TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
+STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
+DOUBTFUL_SECONDS = 5.0  # for a flow of data that no symplectic map explains
+TABLE_SECONDS = 2.5  # that a flow takes, which is no more than 60 % of a time budget
+TABLE_SHARE = 0.3  # of a time budget, likewise
+HORIZONS = (1, 10, 100)  # in Δt, of the held-out errors
+POOR = 1e-3  # one-step error of a flow, relative to the spread of the data, that is worth a warning
+LEAST_SECONDS = 1.0  # for the flow, however late it is
+MARGIN = 0.05  # of the spread of the states, by which Ω exceeds them
+FREER = 0.5  # of the squares, that a field which is not Hamiltonian must leave at most to be worth a word
+CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
+SYMPLECTIC = 1e-9  # defect of a field, up to which it is of an H
+GROWS = 4.0  # standard errors below 0, from which a negative friction is no chance
+DRAG_STEPS = 20  # of a Gauss method in Δt, with a force that has a kink
+OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
+
+
+def drive_frequency_of(constraints: Constraints, smooth: Smooth) -> float:
+    """The angular frequency of a drive, by slopes beside those of a library of terms and friction."""
+    d, x = constraints.ndof, smooth.points
+    if not len(x):
+        raise ValueError("`drive` cannot be found without successive points that have all values: give its frequency.")
+    fields = library_for(None, d, 4, x)[0].fields(x)
+    resistance = np.moveaxis((constraints.force or frictions)(x.T)[0], -1, 0)
+    base = constraints.driven(1.0)
+    return drive_frequency(np.concatenate([fields, resistance], axis=2), smooth, constraints.scales, base)
+
+
+@dataclass(frozen=True)
+class Replicas:
+    """A model with numbers that were fitted to trajectories drawn anew: how much of them is chance.
+
+    Attributes
+    ----------
+    theta : ndarray of shape (n,)
+        The numbers of the flow.
+    thetas : ndarray of shape (replicas, n)
+    drawn : int
+        The number of trajectories that are drawn.
+    """
+
+    model: Model
+    method: Method
+    theta: np.ndarray
+    thetas: np.ndarray
+    drawn: int
+
+    def predictions(self, y0: ArrayLike, t: ArrayLike) -> np.ndarray:
+        """The orbits (replicas, 2d, n) from y0 (2d,) at times t (n,), ascending from the time of y0, t[0]."""
+        times = floats("t", t)
+        if times.ndim != 1 or len(times) < 1 or (np.diff(times) < 0).any():
+            raise ValueError(f"`t` must be ascending times (n,), the first that of y0; got {t!r}.")
+        start, gaps = floats("y0", y0), np.diff(times, prepend=times[0])[:, None]
+        if start.shape != (2 * self.model.ndof,) or not np.isfinite(start).all():
+            raise ValueError(f"`y0` must be one finite state ({2 * self.model.ndof},); got {y0!r}.")
+        orbits = []
+        for theta in self.thetas:
+            orbit = self.method.stepper.orbit(
+                self.method, self.model, theta, start[:, None].copy(), None, gaps, times[:1]
+            )
+            orbits.append(np.stack([state[:, 0].copy() for state, _ in orbit], axis=1))
+        return np.stack(orbits)
+
+    def bands(self, y0: ArrayLike, t: ArrayLike, level: float = 0.9) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds (2d, n) and (2d, n) between which the true orbit from y0 lies at each time with this probability.
+
+        They lie t standard deviations of the replicas about the orbit of the flow, t by Student's distribution, for few
+        replicas of few trajectories tell these deviations but roughly. The family of models is taken for true.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"`level` must lie between 0 and 1; got {level!r}: 0.9 is usual.")
+        n = self.drawn
+        deviation = self.predictions(y0, t).std(axis=0, ddof=1) * math.sqrt(n / (n - 1))  # of n that are drawn from n
+        wide = deviation * stats.t.ppf((1 + level) / 2, min(n, len(self.thetas)) - 1)
+        middle = replace(self, thetas=self.theta[None]).predictions(y0, t)[0]
+        return middle - wide, middle + wide
+
+
+def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number: int) -> np.ndarray:
+    """The numbers of a model that is fitted to trajectories drawn with repetition: a piece of work."""
+    model, data, setting, theta, seed = common
+    drawn = np.random.default_rng([seed, number]).integers(0, len(data.runs), len(data.runs))
+    return fitted(model, data.subset(drawn), setting, theta).theta
+
+
+def without_growth(found: Fitted) -> Fitted:
+    """The fit with rates of friction that are not negative: those below 0 are 0, and other numbers the best beside.
+
+    Of data without friction chance makes half of the rates negative. One that is more than chance is told.
+    """
+    model, theta = found.model, found.theta
+    first = model.n - model.forces
+    growing = np.arange(model.n) >= np.where(theta < 0, first, model.n)
+    if not growing.any():
+        return found
+    covariance = found.fit.covariance()
+    errors = np.sqrt(np.diag(covariance))
+    worst = int(np.argmin(np.where(growing, theta / errors, np.inf)))
+    if theta[worst] < -GROWS * errors[worst]:
+        warnings.warn(
+            f"`damping` is {theta[worst]:.2g} ± {errors[worst]:.1g} by the data, whose energy grows: it is taken as 0. "
+            "Look at the order of the times and the sign of the momenta, or leave `damping` out.",
+            UserWarning,
+            stacklevel=5,
+        )
+    moved = covariance[:, growing] @ np.linalg.pinv(covariance[np.ix_(growing, growing)]) @ theta[growing]
+    return replace(found, theta=np.where(growing, 0.0, theta - moved))
+
+
+Chosen = tuple[Candidate, Fitted, Held]
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """A vector field that need not be Hamiltonian, or another order of the coordinates, beside the best H."""
+
+    said: str  # The field in words
+    remedy: str  # What to do where it has a form that is known; empty where it has none
+    share: float  # Of the squares of held-out residuals, that it leaves
+    defect: float  # The size of LᵀJ + JL, over that of JL, L its Jacobian: 0 for a Hamiltonian
+    rate: float  # At which volumes of phase space grow
+
+
+def _certain(numbers: slice, fit: Fitted, held: Held) -> bool:
+    """True if the factor of one of the forces is more than chance, which noise that is correlated makes larger."""
+    repeated = min(max(held.correlation, 0.0), 0.99) if math.isfinite(held.correlation) else 0.99
+    errors = np.sqrt(np.diag(fit.fit.covariance())[numbers] * (1 + repeated) / (1 - repeated))
+    return bool((np.abs(fit.theta[numbers]) > CERTAIN * max(held.loudness, 1.0) * errors).any())
+
+
+@dataclass
+class Search:
+    """The models that were fitted so far, and the best of them."""
+
+    all: Trajectories
+    folds: list[tuple[Trajectories, Trajectories]]
+    """Divisions into trajectories that models are fitted to and held-out ones: one, or each trajectory in turn."""
+    constraints: Constraints
+    setting: Setting
+    seed: int
+    history: list[dict[str, Any]] = field(default_factory=list)
+    best: Chosen | None = None
+    identity: dict[str, Any] = field(default_factory=dict)
+    done: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """The numbers of the models that were fitted, by their names."""
+    cut: bool = False
+    """True if the time was up before the search came to its end."""
+    bar: Silent = field(default_factory=Silent)
+    reading: Reading | None = None
+    """Another explanation of the data, where increments make any H doubtful."""
+    tested: list[Freedom | None] = field(default_factory=list)
+    """The comparison with a vector field that need not be Hamiltonian, once it was made; None where H does as well."""
+    whole: Trajectories | None = None
+    """The trajectories as they were before they were cut; None if they were not."""
+    final: Fitted = field(init=False)
+    """The chosen model, fitted to all trajectories."""
+    late: Callable[[], bool] = lambda: False
+    """True once there is no time for another model."""
+
+    @property
+    def data(self) -> Trajectories:
+        """The trajectories that models are fitted to: of few all, whose fit is the start of those without one."""
+        return self.folds[0][0] if len(self.folds) == 1 else self.all
+
+    @property
+    def held(self) -> Trajectories:
+        """The held-out trajectories."""
+        return self.folds[0][1] if len(self.folds) == 1 else self.all
+
+    @property
+    def numbers(self) -> int:
+        """The numbers that the least of the fits has, beside the initial states."""
+        return min(data.n_values - 2 * data.ndof * len(data.runs) for data, _ in self.folds)
+
+    @property
+    def winner(self) -> Chosen:
+        """The chosen model, as it was fitted without the held-out trajectories."""
+        assert self.best is not None
+        return self.best
+
+    @property
+    def reason(self) -> str:
+        """Why this model."""
+        held = self.winner[2]
+        others = len({record["model"] for record in self.history}) - 1
+        because = (
+            "its residuals on held-out trajectories are no more than rounding"
+            if held.exact
+            else "it explains held-out trajectories best, and its residuals are noise: one tells nothing of "
+            f"{held.later}"
+            if held.explained
+            else f"it explains held-out trajectories best; but its residuals are not noise: {held.complaint}"
+        )
+        ended = "; the time budget ended the search" if self.cut else ""
+        return f"{because} (of {others + 1} models{ended})"
+
+    def run(self, names: list[str], session: Session) -> None:
+        """Fit models of these families until one explains the held-out trajectories, or no richer one does better."""
+        deadline = session.deadline
+        if session.time_budget is not None:
+            deadline = deadline.part(1 - max(TABLE_SHARE, min(0.6, TABLE_SECONDS / session.time_budget)))
+        self.late = deadline.over
+        setting = replace(self.setting, stop=deadline.over)
+        total = sum(1 for name in names for _ in FAMILIES[name].models(self.constraints))
+        with session.bar(total, "Models") as self.bar:
+            queue = self._ask(names, setting, session)
+            if self.best is not None:
+                self.final, self.cut = self.winner[1], deadline.over()
+                return
+            for place, (linear, candidates) in enumerate(queue):
+                if self.best is not None and (self.best[2].explained or deadline.over()):
+                    break
+                if self.best is not None and not linear and self.freedom(setting) is not None:
+                    break
+                own = deadline.part(min(SHARE / (len(queue) - place), 1.0))
+                self._climb(candidates, replace(setting, stop=own.over), session)
+        if self.best is None:
+            raise ValueError(
+                f"`trajectories` have {self.data.n_values} numbers, fewer than the simplest model and the initial "
+                "states have: give longer trajectories, or more of them."
+            )
+        if not deadline.over():
+            candidate, found, _ = self.winner
+            precision = found.fit.normal.precision()
+            self._simplify(pruned(candidate, found.theta, precision, self.data.n_values), setting, session)
+        if not deadline.over():
+            self._simplify(with_unit_mass(self.winner[0], self.constraints), setting, session)
+        candidate, self.final, _ = self.winner
+        if not deadline.over():
+            smooth = replace(setting, seen=None) if self.winner[2].lag else setting
+            found = fitted(candidate.model, self.whole or self.all, smooth, self.final)
+            shorter = found.span < self.final.span or not math.isfinite(found.fit.cost)
+            self.final = self.final if setting.stop() and shorter else found
+        self.final = without_growth(self.final)
+        self.cut = deadline.over()
+
+    def _ask(self, names: list[str], setting: Setting, session: Session) -> list[tuple[bool, list[Candidate]]]:
+        """Keep the best of the simple models if no H explains the data, which is known before any other is fitted.
+
+        Where increments say so, orbits of that model are compared with those of another reading. The models of the
+        families are returned in the order in which they are to be tried, with True for those that are linear: those
+        that leave much more of increments than the best of all are the last.
+        """
+        queue = [(FAMILIES[name].linear, [*FAMILIES[name].models(self.constraints)]) for name in names]
+        linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
+        drive = None
+        if self.constraints.frequency is None and not self.data.velocities and not self.late():
+            drive = self._drive()
+        models = [candidate.model for candidate in linear]
+        found = best_by_increments(*self.folds[0], models, drive, setting.stop)
+        if found is None:
+            return queue
+        place, self.reading, squares = found
+        if self.reading is not None:
+            chosen = linear[place], *self._first_fold(linear[place].model, setting)
+            self.best = chosen
+            if not chosen[2].explained and self.freedom(setting) is not None:
+                self._note(chosen, session)
+                return []
+            self.best = self.reading = None
+            self.tested.clear()
+        hopeless = [id(linear[k]) for k in squares if squares[k] > HOPELESS * squares[place]]
+        kept = [(kind, [c for c in some if id(c) not in hopeless]) for kind, some in queue]
+        # H = T(p) + V(q) is tried first, unless functions H(q, p) alone explain increments; networks last
+        separable = [name for name in names if FAMILIES[name].separable]
+        promising = any(
+            of for (_, of), name in zip(kept, names, strict=True) if name in separable and FAMILIES[name].linear
+        )
+        apart = bool(squares) and not promising
+        judged = [any(id(c) in map(id, linear) for c in of) for _, of in queue]
+        order = sorted(range(len(names)), key=lambda i: (not judged[i], apart and names[i] in separable))
+        late = [(True, [c for c in some if id(c) in hopeless]) for _, some in queue]
+        return [group for group in [*(kept[i] for i in order), *late] if group[1]]
+
+    def _drive(self) -> Drive | None:
+        """A drive of the likeliest frequency; None where the data cannot tell one."""
+        smooth = smoothed(self.data)
+        if len(np.unique(smooth.owner)) < 2 or len(smooth.points) < 4 * self.constraints.driven(1.0).n:
+            return None
+        return self.constraints.driven(drive_frequency_of(self.constraints, smooth))
+
+    def _first_fold(self, model: Model, setting: Setting) -> tuple[Fitted, Held]:
+        """A model that is fitted to the first division of the trajectories, and what it leaves of the others there."""
+        data, held = self.folds[0]
+        if self.best is not None and self.best[0].model is model and (len(self.folds) == 1 or self.reading is not None):
+            return self.best[1], self.best[2]
+        found = fitted(model, data, setting, seed=self.seed)
+        return found, judged(found, held, self.setting)
+
+    def _climb(self, candidates: list[Candidate], setting: Setting, session: Session) -> None:
+        """Fit the models of a family, until two that follow each other are no better than one of it before."""
+        worse, best = 0, None
+        for candidate in candidates:
+            over = self.best is not None and (self.best[2].exact or setting.stop())
+            if over or worse == 2 or not self._affords(candidate):
+                return
+            sparse = self._sparse(candidate, setting)
+            made = None if sparse is None else self._try(sparse, setting, session)
+            if made is None or not (made[2].explained or setting.stop()):
+                made = self._try(candidate, setting, session)
+            better = best is None or gains(best[2], made[2])
+            worse, best = (0, made) if better else (worse + 1, best)
+
+    def _sparse(self, candidate: Candidate, setting: Setting) -> Candidate | None:
+        """A model of many numbers whose orbits take long, without the terms that short orbits do not ask for."""
+        if candidate.model.n < MANY or not candidate.model.lagrangian:
+            return None
+        found = fitted(candidate.model, self.data, replace(setting, sketch=True), seed=self.seed)
+        if not math.isfinite(found.fit.cost):
+            return None
+        return pruned(candidate, found.theta, found.fit.normal.precision(), self.data.n_values)
+
+    def _affords(self, candidate: Candidate) -> bool:
+        """True if there are more numbers than the model and the initial states have."""
+        return self.numbers > candidate.model.n
+
+    def _fit(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
+        numbers = self.done.get(candidate.name)
+        if numbers is None:
+            found = fitted(candidate.model, self.data, setting, seed=self.seed)
+            if not setting.stop():
+                self.done[candidate.name] = kept(found)
+                self.save(session)
+        else:
+            found = restored(candidate.model, self.data, numbers, setting)
+        chosen = candidate, found, left_out(found, self.folds, replace(self.setting, stop=self.late))
+        self._note(chosen, session)
+        return chosen
+
+    def _note(self, chosen: Chosen, session: Session) -> None:
+        """The figures of a model, which join the history and are shown."""
+        candidate, found, held = chosen
+        figures = {
+            "parameters": candidate.model.n,
+            "training_chi2": found.costs[-1],
+            "held_out_loss": held.loss,
+            "correlation": held.correlation,
+            "noise": float(np.mean((found.sigma / self.data.scales)[found.fit.counts > 0])),
+        }
+        self.history.append({"model": candidate.name, **figures})
+        self.bar.tries(len(self.history), f"{candidate.name}: held-out loss {held.loss:.3g}")
+        if session.callback is not None:
+            session.callback(len(self.history), figures)
+
+    def _try(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
+        """Fit a model, and keep it if it is the best so far, and was judged before the time was up."""
+        rival = None if self.best is None else self.best[1].sigma
+        made = self._fit(candidate, replace(setting, rival=rival), session)
+        if self.best is None or (not self.late() and gains(self.best[2], made[2])):
+            self.best = made
+        return made
+
+    def _simplify(self, candidate: Candidate | None, setting: Setting, session: Session) -> None:
+        """Fit the best model with fewer numbers, and take that unless what it explains less is worth them."""
+        if candidate is None:
+            return
+        rich, simple = self.winner, self._fit(candidate, setting, session)
+        fewer = rich[0].model.n - candidate.model.n
+        lost = 2 * (simple[1].loss(rich[1].sigma) - rich[1].loss(rich[1].sigma))
+        if self.late():
+            return
+        if simple[2].exact or lost < fewer * math.log(self.data.n_values):
+            self.best = simple
+
+    def save(self, session: Session) -> None:
+        """Write a checkpoint, if one is asked for."""
+        if session.checkpoint is not None:
+            fits = {
+                name: {key: torch.as_tensor(v) if isinstance(v, np.ndarray) else v for key, v in numbers.items()}
+                for name, numbers in self.done.items()
+            }
+            state = {"step": len(fits), "flow": {}, "best": {}, "optimizer": fits, "history": [], "seconds": 0.0}
+            checkpoints.write(session.checkpoint, self.identity | state)
+
+    def resume(self, path: Path) -> None:
+        """Take over the models that were fitted before a run was ended.
+
+        Raises
+        ------
+        ValueError
+            If the file is not a checkpoint, or one of other trajectories or options.
+        """
+        self.done = checkpoints.read_same(path, self.identity)["optimizer"]
+
+    def diagnose(self, session: Session) -> None:
+        """Warn where the residuals of the best model are no noise, with what may be the reason."""
+        candidate, _, held = self.winner
+        if held.explained:
+            share = float(np.min(self.winner[1].sigma / self.data.scales))
+            if share > SILENT:
+                warnings.warn(
+                    f"The best model, {candidate.name}, explains next to nothing: the noise that it leaves is "
+                    f"{share:.0%} of the spread of every coordinate or more. Points may be in no order, of other "
+                    "trajectories or too far apart; else there is only noise.",
+                    UserWarning,
+                    stacklevel=4,
+                )
+            elif self.unseen:
+                warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
+            return
+        if not math.isfinite(held.loudness):
+            warnings.warn(
+                f"The time budget ended before the best model, {candidate.name}, was compared with held-out "
+                "trajectories: give it more.",
+                UserWarning,
+                stacklevel=4,
+            )
+            return
+        said = (
+            f"The best model, {candidate.name}, leaves residuals on held-out trajectories that are no noise: "
+            f"{held.complaint}."
+        )
+        deadline = session.deadline
+        free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
+        if free is not None:
+            if free.defect < SYMPLECTIC:
+                said += (
+                    f" No H without the time explains these data: {free.said} leaves {free.share:.1e} of the squares."
+                )
+            else:
+                said += (
+                    f" No symplectic map explains these data: {free.said} leaves {free.share:.1e} of the squares. Its "
+                    f"Jacobian L fails the test of symplecticity: LᵀJ + JL, which is 0 for a Hamiltonian, is "
+                    f"{free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
+                )
+            if free.remedy:
+                warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=4)
+                return
+        smooth = smoothed(self._whole(self.data))
+        otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
+        if self.cut:
+            otherwise = f"The time budget ended the search: give it more. {otherwise}"
+        library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.constraints.force is not None
+        said += " " + hint(library, smooth, self.data, otherwise, damped)
+        warnings.warn(said, UserWarning, stacklevel=4)
+
+    def freedom(self, setting: Setting) -> Freedom | None:
+        """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
+
+        A field of polynomials has those of all H(q, p) one degree higher, which must leave as much as the best model:
+        so that not only functions are missing.
+        """
+        if not self.tested:
+            self.tested.append(self._freedom(setting))
+        return self.tested[0]
+
+    def _freedom(self, setting: Setting) -> Freedom | None:
+        """The same by one division of the trajectories: a difference as large as is asked for needs no more."""
+        if self.reading is not None:
+            return self._beside(self.reading, setting)
+        best, scales = self.winner[0].model, self.data.scales
+        damped = [] if best.forces or not isinstance(best, Model) else forced(best)[:1]
+        free = next((r for r in map(partial(free_reading, scales), (3, 2)) if self._affords_field(r.field)), None)
+        found = (self._beside(r, setting) for r in (*damped, free) if r is not None and self._affords_field(r.field))
+        return next((one for one in found if one is not None), None)
+
+    def _beside(self, reading: Reading, setting: Setting) -> Freedom | None:
+        """A reading beside the best H; None if it does not explain much more."""
+        data, others = self.folds[0]
+        scales, rivals = data.scales, [self.winner[0].model]
+        if isinstance(reading.field, FreeField):
+            rivals.append(self.constraints.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
+        fit = fitted(reading.field, reading.of(data), setting.turned(reading.rows))
+        theirs = judged(fit, reading.of(others), self.setting.turned(reading.rows))
+        left, share = theirs.squares(scales[[*reading.rows]]), 0.0
+        if reading.numbers and not (_certain(reading.numbers, fit, theirs) and reading.possible(fit.theta)):
+            return None
+        for model in rivals:
+            _, held = self._first_fold(model, setting)
+            share = max(share, left / held.squares(scales))
+            if not gains(held, theirs) or not share < (DAMPED if reading.numbers else FREER):
+                return None
+        return Freedom(reading.said, reading.remedy(fit.theta), share, *reading.test(fit.theta, fit.states.T, scales))
+
+    def _affords_field(self, model: Field) -> bool:
+        return model.n <= MOST_TERMS and self.numbers > 2 * model.n
+
+    def bootstrap(self, n: int, session: Session) -> Replicas:
+        """Fit the chosen model to trajectories that are drawn anew, n times, or two at least until the time is up."""
+        setting = self.setting
+        model = self.winner[0].model
+        common = model, self.all, setting, self.final.theta, self.seed
+        thetas: list[np.ndarray] = []
+        for theta in session.each(replica, common, range(n), session.deadline):
+            thetas.append(theta)
+            if len(thetas) > 1 and session.deadline.over():
+                break
+        if len(thetas) < n:
+            warnings.warn(
+                f"The time budget ended the bootstrap after {len(thetas)} of {n} replicas: bands are rough.",
+                UserWarning,
+                stacklevel=4,
+            )
+        return Replicas(model, self.final.method, self.final.theta, np.stack(thetas), len(self.all.runs))
+
+    # the flow ---------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def unseen(self) -> list[Any]:
+        """Functions that are the same along all orbits, and that the chosen model could depend on in any way."""
+        model, d, states = self.winner[0].model, self.data.ndof, self.final.states
+        if not np.isfinite(states).all() or (self.final.sigma > SILENT * self.data.scales).any():
+            return []
+        q, p = range(d), range(d, 2 * d)
+        groups: list[tuple[range, Part | None]] = []
+        parts = [part for part in model.parts if part.n] if isinstance(model, Model) else []
+        if not parts or any(part.of == "y" and not part.inertial for part in parts):
+            groups.append((range(2 * d), None))
+        else:
+            distances = next((part for part in parts if isinstance(part, Distances)), None)
+            if distances is not None:
+                groups.append((q, distances.squares()))
+            elif any(part.of != "p" for part in parts):
+                groups.append((q, None))
+            if any(part.of != "q" for part in parts):
+                groups.append((p, Polynomial.up_to(1, "p", self.data.scales[d:])))
+        errors = self._wide(self.final.sigma) * math.sqrt(self.final.fit.states.size / self.data.n_values)
+        return [g for columns, part in groups for g in unseen(states, errors, columns, part)]
+
+    def _states(self) -> np.ndarray:
+        """The states (n, 2d) of all orbits that do not diverge; those of the data where all do."""
+        states = self.final.states
+        finite = np.isfinite(states).all(axis=1)
+        return states[finite] if finite.any() else self._whole(self.all).states
+
+    def _wide(self, sizes: np.ndarray) -> np.ndarray:
+        """Sizes (2d,) of observations as such of states, whose momenta may be wider or narrower than velocities."""
+        if not self.data.velocities:
+            return sizes
+        return sizes * self.final.states.std(axis=0) / self.data.scales
+
+    def _whole(self, data: Trajectories) -> Trajectories:
+        """Trajectories of states, by the model that was learned where velocities were observed."""
+        if not data.velocities:
+            return data
+        model, theta = self.winner[0].model, self.winner[1].theta
+        runs = zip(data.runs, smoothed(data).states, strict=True)
+        return replace(data, runs=tuple(Run(run.t, model.states(theta, y)) for run, y in runs), velocities=False)
+
+    def _domain(self) -> tuple[Box | Tube, np.ndarray]:
+        """A box around the states (n, 2d) of all orbits, or a tube where they do not tell H beyond them; and these."""
+        states = self._states()
+        if self.unseen:
+            fitted = next(data for data in (self.all, self.data) if data.n_points == len(states))
+            return tube(states, fitted.runs, self._wide(self.all.scales)), states
+        low, high = states.min(axis=0), states.max(axis=0)
+        wider = MARGIN * (high - low)
+        return Box(low - wider, high + wider), states
+
+    def system(self, name: str) -> HamiltonianSystem:
+        """The H that was learned."""
+        found, model = self.final, self.winner[0].model
+        domain: Domain
+        domain, states = self._domain()
+        energies = model.hamiltonian(found.theta, states.T)
+        start, options = 0.0, {}
+        if model.drive is not None:
+            (place,) = (place for part, place in zip(model.parts, model.places, strict=True) if part is model.drive)
+            period = 2 * math.pi / (model.drive.frequency + found.theta[place][-1])
+            start, options = float(self.all.runs[0].t[0]), {"time": "t", "period": period}
+        elif isinstance(domain, Box) and np.isfinite(energies).all():
+            top = float(energies.max())
+            domain = EnergySublevel(top + MARGIN * (top - float(energies.min())), domain)
+        rates, drag = found.theta[model.n - model.forces :], model.force is drags
+        system = HamiltonianSystem.from_sympy(
+            model.expression(found.theta),
+            damping=None if drag or not model.forces else float(rates[0]) if len(rates) == 1 else rates,
+            name=name,
+            domain=domain,
+            y0=states[0],
+            t_span=(start, start + max(run.span for run in self.data.runs)),
+            dt=self.data.time_scale,
+            **options,
+        )
+        p = [f"p{i + 1}" if len(rates) > 1 else "p" for i in range(len(rates))]
+        pushes = [f"-{float(c)!r}*abs({x})*{x}" for c, x in zip(rates, p, strict=True)]
+        return doubled(system, pushes, name=name) if drag else system
+
+    def flow(self, dt: float | None, name: str, session: Session) -> Any:
+        """A flow of the H that was learned, or the flow that was fitted itself."""
+        own = self.winner[0].model.flow(self.final.theta)
+        if own is not None:
+            return self._own(own, name)
+        system = self.system(name)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            flow = self._primed(system, dt, session) if system.separable else self._collocated(system, dt)
+        if system.separable and system.autonomous and self._is_worse(flow):
+            flow, told = self._collocated(system, dt), []
+        for warning in told:
+            warnings.warn(str(warning.message), warning.category, stacklevel=3)
+        flow.figures = {**flow.figures, **self.figures(flow.dt)}
+        whole = system.autonomous and not isinstance(system, DoubledSystem)
+        flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole and not session.deadline.over() else None
+        if self._is_worse(flow):
+            error, noise = flow.figures["one_step_error"], flow.figures["noise"]
+            warnings.warn(
+                f"The flow is worse than the H that was learned: its one-step error is {error:.1e}, the noise "
+                f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme.",
+                UserWarning,
+                stacklevel=4,
+            )
+        flow.history = self.history
+        model, theta = self.winner[0].model, self.final.theta
+        damping = theta[model.n - model.forces :].tolist() if model.forces else None
+        flow.recipe = {**flow.recipe, "learned": {**self._learned, "damping": damping}}
+        flow.take_learned(system)
+        return flow
+
+    @property
+    def _learned(self) -> dict[str, Any]:
+        return {"model": self.winner[0].name, "reason": self.reason, "models": self.history}
+
+    def _own(self, flow: Any, name: str) -> Any:
+        """The flow that was fitted itself, with the system of its own Hamiltonian."""
+        domain, states = self._domain()
+        flow.domain, flow.history = domain, self.history
+        flow.recipe = {"learned": {**self._learned, "own_hamiltonian": True}}
+        flow.figures = {**self.figures(flow.dt), "energy_scatter": self.energy_scatter(flow)}
+        longest = max(run.span for run in self.data.runs)
+        flow.take_learned(flow.mean_system(name=name, domain=domain, y0=states[0], t_span=(0.0, longest), dt=flow.dt))
+        return flow
+
+    def _primed(self, system: HamiltonianSystem, dt: float | None, session: Session) -> FlowMap:
+        options: dict[str, Any] = {"restarts": TABLE_STARTS}
+        if session.time_budget is not None:
+            options["time_budget"] = max(session.deadline.left, LEAST_SECONDS)
+        if self.tested and self.tested[0] is not None:
+            options["time_budget"] = min(options.get("time_budget", math.inf), DOUBTFUL_SECONDS)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Training", category=RuntimeWarning)
+            try:
+                return train(system, dt, progress=session.progress, seed=self.seed, **options)
+            except ValueError as error:
+                if dt is None:
+                    raise
+                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+            return train(system, None, progress=session.progress, seed=self.seed, **options)
+
+    def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
+        """Steps of a Gauss method, as many as they take where the data are: no fit comes near their accuracy."""
+        states, model = self._states(), self.winner[0].model
+        states = states[np.random.default_rng(self.seed).permutation(len(states))[:STEPPED]]
+        slopes = model.field(self.final.theta, states.T, True, False).slope
+        rates = np.abs(np.linalg.eigvals(np.moveaxis(np.broadcast_to(slopes, (*slopes.shape[:2], len(states))), -1, 0)))
+        step = min(step_of(rates.max(axis=1)), max(run.span for run in self.data.runs))
+        if isinstance(system, DoubledSystem):
+            return SympFlow.collocated(system, dt=step if dt is None else dt, steps=DRAG_STEPS)
+        if dt is not None:
+            try:
+                return SympFlow.collocated(system, dt=dt, states=states)
+            except ValueError as error:
+                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+        return SympFlow.collocated(system, dt=step, states=states)
+
+    def _is_worse(self, flow: FlowMap) -> bool:
+        """True of a flow that is worse than the H of which it is."""
+        error, noise = flow.figures.get("one_step_error"), self.noise
+        return error is not None and error > max(noise, POOR * float(self.data.scales.min()))
+
+    @property
+    def noise(self) -> float:
+        """The noise of a value that was observed, in the root mean square of all coordinates."""
+        found = self.winner[1]
+        return float(np.sqrt(np.mean(found.sigma[found.fit.counts > 0] ** 2)))
+
+    def figures(self, dt: float) -> dict[str, float]:
+        """The figures of the chosen model on the held-out trajectories, before its last fit to all of them."""
+        _, found, held = self.winner
+        noise = {name: float(found.sigma[i]) for i, name in enumerate(self.data.names) if found.fit.counts[i]}
+        made = {
+            "held_out_loss": held.loss,
+            "held_out_trajectories": len(self.held.runs),
+            "residual_correlation": held.correlation,
+            "noise": self.noise,
+        }
+        if self.tested and self.tested[0] is not None:
+            made["unconstrained_share"] = self.tested[0].share
+        made |= {f"noise_{name}": sigma for name, sigma in noise.items()}
+        passed = np.concatenate([run.t - run.t[0] for run in held.pieces])
+        residuals = np.concatenate(held.residuals, axis=1)
+        seen = np.isfinite(residuals).any(axis=0)
+        passed, squares = passed[seen], np.nanmean(residuals[:, seen] ** 2, axis=0)
+        for k in HORIZONS:
+            near = np.abs(passed - k * dt) <= 0.5 * dt * max(1, k / 10)
+            if near.any():
+                made[f"held_out_error_{k}"] = float(np.sqrt(squares[near].mean()))
+        return made
+
+    def energy_scatter(self, flow: FlowMap) -> float | None:
+        """The standard deviation of 𝓗 along a held-out trajectory, in their mean; None where no state is whole."""
+        runs = [run.y[:, np.isfinite(run.y).all(axis=0)] for run in self._whole(self.held).runs]
+        energies = self._energy(flow, np.concatenate(runs, axis=1).T)
+        along = np.split(energies, np.cumsum([y.shape[1] for y in runs])[:-1])
+        scatter = [float(np.std(values)) for values in along if len(values) > 1]
+        return float(np.mean(scatter)) if scatter else None
+
+    @staticmethod
+    def _energy(flow: FlowMap, states: np.ndarray) -> np.ndarray:
+        """𝓗 of the flow at states (n, 2d), averaged over [0, Δt]; with friction H."""
+        if flow.system is not None and flow.system.friction:  # the maps of a damped flow have no 𝓗
+            return flow.system.hamiltonian(states)
+        x = torch.as_tensor(states)
+        times = flow.dt * np.arange(OVER_TIMES) / (OVER_TIMES - 1)
+        return np.mean([flow.hamiltonian(float(t), x).numpy() for t in times], axis=0)
