@@ -16,9 +16,8 @@ from sympflow.arguments import plain
 from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
-from sympflow.hamiltonian.linear_part import quadratic_terms
+from sympflow.hamiltonian.linear_part import RestOfPotential, quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, numbered, parsed
-from sympflow.hamiltonian.parts import RestOfPotential
 from sympflow.hamiltonian.poles import LatticePoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, exact
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arrays import Array, like
+from sympflow.arrays import Array, concatenate, like
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -161,6 +161,37 @@ class LinearPart(NormalModes):
             if not same:
                 found.append((kind, float(rate)))
         return np.array(labels)
+
+
+class RestOfPotential:
+    """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a definition by functions; V, where the linear part is left out of that."""
+
+    of_positions, turns = True, False
+
+    def __init__(self, definition: Any, linear: LinearPart | None = None) -> None:
+        self.definition, self.ndof, self.timed = definition, definition.ndof, definition.timed
+        self.K: np.ndarray | None = None if linear is None else linear.stiffness_matrix
+        self.center: Any = 0.0 if linear is None else linear.center
+
+    def hamiltonian(self, y: Array, *t: Any) -> Array:
+        q = y[..., : self.ndof]
+        V = self.definition.potential(q, *t)
+        if self.K is None:
+            return V
+        x = q - like(self.center, q)
+        return V - (x * (x @ like(self.K, q))).sum(-1) / 2
+
+    def gradient(self, y: Array, *t: Any) -> Array:
+        q = y[..., : self.ndof]
+        slope = self.definition.potential_gradient(q, *t)
+        if self.K is not None:
+            slope = slope - (q - like(self.center, q)) @ like(self.K, q)
+        return concatenate([slope, 0 * q])
+
+    def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
+        """∇²U(q)·v: (..., 2d), (..., d) to (..., d)."""
+        product = self.definition.hessian_vector(y[..., : self.ndof], v, *t)
+        return product if self.K is None else product - v @ like(self.K, v)
 
 
 def check_parts_conservative(system: Any) -> None:

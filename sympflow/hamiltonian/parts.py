@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, detached, is_tensor, library, like, stack
-from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
+from sympflow.hamiltonian.linear_part import (
+    LinearPart,
+    RestOfPotential,
+    check_parts_conservative,
+    linear_part,
+    read_off,
+)
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 from sympflow.hamiltonian.times import stage_time
 
@@ -63,37 +69,6 @@ class PartFunctions(SymbolicHamiltonian):
     def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
         """∇²_q H_k(y)·v: (..., 2d), (..., d) to (..., d)."""
         return (self.hessian(y, *t)[..., : self.ndof, : self.ndof] @ v[..., None])[..., 0]
-
-
-class RestOfPotential:
-    """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a definition by functions; V, where the linear part is left out of that."""
-
-    of_positions, turns = True, False
-
-    def __init__(self, definition: Any, linear: LinearPart | None = None) -> None:
-        self.definition, self.ndof, self.timed = definition, definition.ndof, definition.timed
-        self.K: np.ndarray | None = None if linear is None else linear.stiffness_matrix
-        self.center: Any = 0.0 if linear is None else linear.center
-
-    def hamiltonian(self, y: Array, *t: Any) -> Array:
-        q = y[..., : self.ndof]
-        V = self.definition.potential(q, *t)
-        if self.K is None:
-            return V
-        x = q - like(self.center, q)
-        return V - (x * (x @ like(self.K, q))).sum(-1) / 2
-
-    def gradient(self, y: Array, *t: Any) -> Array:
-        q = y[..., : self.ndof]
-        slope = self.definition.potential_gradient(q, *t)
-        if self.K is not None:
-            slope = slope - (q - like(self.center, q)) @ like(self.K, q)
-        return concatenate([slope, 0 * q])
-
-    def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
-        """∇²U(q)·v: (..., 2d), (..., d) to (..., d)."""
-        product = self.definition.hessian_vector(y[..., : self.ndof], v, *t)
-        return product if self.K is None else product - v @ like(self.K, v)
 
 
 class ExactParts:
