@@ -552,6 +552,15 @@ _TABLE = (
         f"{_NEARLY_INTEGRABLE}, ABA (10, 6, 4): errors of order εh¹⁰ + ε²h⁶ + ε³h⁴ where kicks are small, of order ε",
     ),
     _scheme(
+        "takahashi_imada",
+        2,
+        _drift_first((0.5, 0.5), (1.0,)),
+        "M. Takahashi and M. Imada, Monte Carlo calculation of quantum systems, II: higher order correction, J. Phys. "
+        "Soc. Japan 53 (1984) 3765–3769; of order 4 in other coordinates: G. Rowlands, A numerical algorithm for "
+        "Hamiltonian systems, J. Comput. Phys. 97 (1991) 235–239",
+        gradients={1: 1.0 / 12.0},
+    ),
+    _scheme(
         "chin4a",
         4,
         _kick_first((1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0), (0.5, 0.5)),
@@ -705,7 +714,7 @@ _SPACING = Fraction(7, 40)  # of the kicks, squared, in steps
 
 
 @cache
-def corrector_maps(order: int, sign: int = 1) -> tuple[tuple[str, float], ...]:
+def corrector_maps(order: int, sign: int = 1, symmetric: bool = False) -> tuple[tuple[str, float], ...]:
     """Return the processor of drift–kick–drift steps with small kicks: kicks and drifts in units of the step.
 
     Kicks bᵢ and −bᵢ at ±aᵢ, aᵢ = i√(7/40), with Σ 2bᵢ sinh(aᵢz) = ((z/2)/sinh(z/2) − 1)/z up to z^(order − 2), remove
@@ -717,6 +726,9 @@ def corrector_maps(order: int, sign: int = 1) -> tuple[tuple[str, float], ...]:
         Odd, from 3 to 17.
     sign : int
         1 for the map before the steps, −1 for its inverse, before an output.
+    symmetric : bool
+        True for a palindrome, twice as long, whose logarithm is odd in ε: as kicks with force gradients want it, whose
+        errors ε² dt² are removed, where those of an asymmetric corrector would be ε² dt³.
 
     References
     ----------
@@ -730,6 +742,9 @@ def corrector_maps(order: int, sign: int = 1) -> tuple[tuple[str, float], ...]:
     places = [sqrt(s) for s in squares]
     kicks = [float(x) / a for x, a in zip(_solved(rows, values), places, strict=True)]
     maps = [pair for a, b in zip(places, kicks, strict=True) for pair in ((a, b), (-a, -b))]
+    if symmetric:
+        half = [(a, b / 2) for a, b in maps[:-1]]
+        maps = [*half, maps[-1], *half[::-1]]
     if sign < 0:
         maps = [(a, -b) for a, b in reversed(maps)]
     found, at = [], 0.0

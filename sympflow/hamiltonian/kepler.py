@@ -21,7 +21,7 @@ import numpy as np
 
 from sympflow.arrays import detached
 from sympflow.compiler.control import Value
-from sympflow.compiler.functions import apply, where
+from sympflow.compiler.functions import apply, fma, where
 
 SHORT = 0.25  # βX² up to which a series of so many terms is exact to rounding
 TERMS = 7
@@ -35,21 +35,21 @@ def dot(x: Sequence[Any], y: Sequence[Any]) -> Any:
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
 
-def tail(z: Any, n: int, terms: int) -> Any:
-    """Σₖ (−z)ᵏ/(n + 2k)!, of so many terms, by Horner's rule, without a bias by the rounding of the first numbers."""
+def tail(z: Any, n: int, terms: int, rough: bool = False) -> Any:
+    """Σₖ (−z)ᵏ/(n + 2k)!, of so many terms, by Horner's rule; unless rough, without a bias by its rounded numbers."""
     c: Any = 1.0 / math.factorial(n + 2 * terms - 2)
     for k in range(terms - 2, -1, -1):
         number = 1.0 / math.factorial(n + 2 * k)
         rest = float(Fraction(1, math.factorial(n + 2 * k)) - Fraction(number))
-        c = number - (z * c - rest) if k < 2 and rest else number - z * c
+        c = number - (z * c - rest) if k < 2 and rest and not rough else number - z * c
     return c
 
 
-def series(X: Any, beta: Any, terms: int) -> tuple[Any, Any, Any, Any]:
+def series(X: Any, beta: Any, terms: int, rough: bool = False) -> tuple[Any, Any, Any, Any]:
     """G₀ to G₃ of a small βX²."""
     square = X * X
     z = square * beta
-    G2, G3 = square * tail(z, 2, terms), X * square * tail(z, 3, terms)
+    G2, G3 = square * tail(z, 2, terms, rough), X * square * tail(z, 3, terms, rough)
     return 1.0 - beta * G2, X - beta * G3, G2, G3
 
 
@@ -116,7 +116,7 @@ def coefficients(X: Any, G: Sequence[Any], r: Any, inverse: Any, eta: Any, zeta:
     """f − 1, g, f′, g′ − 1 after a step d of Newton's method from X, so short that it is linear; d; g as rG₁ + ηG₂."""
     G0, G1, G2, G3 = G
     slope = 1.0 / (r + (eta * G1 + zeta * G2))
-    d = -((r * X + (eta * G2 + zeta * G3) - t) * slope)
+    d = -((fma(r, X, -t) + (eta * G2 + zeta * G3)) * slope)
     end = slope * (1.0 - (slope * d) * (eta * G0 + zeta * G1))
     G1, G2, G3 = G1 + d * G0, G2 + d * G1, G3 + d * G2
     a = mu * G2

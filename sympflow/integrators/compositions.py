@@ -625,12 +625,11 @@ class KeplerInteraction(Composition):
         if corrector is not None:
             if [s[:2] for s in scheme.substeps] != [("drift", 0.5), ("kick", 1.0), ("drift", 0.5)]:
                 raise ValueError(
-                    f"`corrector` goes with the steps of 'wisdom_holman', and method {method!r} makes other ones: "
-                    "leave it out."
+                    "`corrector` goes with the steps of 'wisdom_holman' and 'kepler_takahashi_imada', and method "
+                    f"{method!r} makes other ones: leave it out."
                 )
-            self.before, self.after = (
-                _paired([(*m, 0.0) for m in corrector_maps(corrector, sign)]) for sign in (1, -1)
-            )
+            maps = (corrector_maps(corrector, sign, bool(scheme.level)) for sign in (1, -1))
+            self.before, self.after = (_paired([(*m, 0.0) for m in each]) for each in maps)
 
     def force_times(self) -> list[float]:
         return []

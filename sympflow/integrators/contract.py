@@ -186,6 +186,12 @@ class Integrator:
     tensors too."""
     tangent_holds: ClassVar[str] = ""
     """The quantity that `tangent` holds fixed though a step from a neighbouring state would change it."""
+    takes_friction: ClassVar[bool] = False
+    """True if every step holds the friction −Γp of a damped system; where it does not, the system is refused."""
+    takes_driving: ClassVar[bool] = False
+    """True if every step takes H at its times, of a driven system H(t, q, p); where not, the system is refused."""
+    takes_forces: ClassVar[bool] = False
+    """True if every step holds any force beside −∂H/∂q, as one by `system.vector_field` does."""
     keeps: ClassVar[str] = ""
     """Name of what a run keeps from step to step beside the state y, so that `step` from y alone does not know it."""
 
@@ -214,11 +220,6 @@ class Integrator:
         """Return the `source`, or the first line of the docstring of a method that gives none."""
         return cls.source or (cls.__doc__ or "").partition("\n")[0]
 
-    @property
-    def takes_friction(self) -> bool:
-        """True if every step holds the friction −Γp of a damped system; where it does not, the system is refused."""
-        return False
-
     def takes_parameter_values(self, problem: Problem) -> bool:
         """True if a run takes values of parameters for each trajectory, as numbers of one compiled run."""
         return False
@@ -229,16 +230,6 @@ class Integrator:
             f"`params` has {', '.join(problem.followed)}, to which no gradient flows through method {self.name!r}: use "
             "a splitting method on the splitting 'kinetic', such as 'kahan_li8', or detach them."
         )
-
-    @property
-    def takes_driving(self) -> bool:
-        """True if every step takes H at its times, of a driven system H(t, q, p); where not, the system is refused."""
-        return False
-
-    @property
-    def takes_forces(self) -> bool:
-        """True if every step holds any force beside −∂H/∂q, as one by `system.vector_field` does."""
-        return False
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
         """Return True if a step takes a force at its end or beyond it, of first order where H jumps there in t."""
@@ -360,17 +351,9 @@ class Integrator:
 class ByVectorField(Integrator):
     """An integrator whose steps evaluate `system.vector_field` at its times, and take all that this holds."""
 
-    @property
-    def takes_friction(self) -> bool:
-        return True
-
-    @property
-    def takes_forces(self) -> bool:
-        return True
-
-    @property
-    def takes_driving(self) -> bool:
-        return True
+    takes_friction: ClassVar[bool] = True
+    takes_driving: ClassVar[bool] = True
+    takes_forces: ClassVar[bool] = True
 
 
 def in_blocks(steps: Steps) -> Steps:

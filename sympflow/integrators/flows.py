@@ -317,6 +317,8 @@ class SympFlowIntegrator(FlowIntegrator):
     name: ClassVar[str] = "sympflow"
     source: ClassVar[str] = "A trained SympFlow: symplectic for every step length, with an exact inverse."
     symplectic: ClassVar[bool] = True
+    takes_friction: ClassVar[bool] = True  # of the system that a flow was made for; it refuses every other
+    takes_driving: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -330,16 +332,6 @@ class SympFlowIntegrator(FlowIntegrator):
         for name in ("flow", "dt"):
             if getattr(self, name) is not None:
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
-
-    @property
-    def takes_friction(self) -> bool:
-        """True: a flow holds the friction of the system that it was made for, and refuses every other."""
-        return True
-
-    @property
-    def takes_driving(self) -> bool:
-        """True: a flow takes the time of the driven system that it was made for, and refuses every other."""
-        return True
 
     @property
     def tolerance(self) -> float | None:

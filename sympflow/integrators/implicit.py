@@ -59,6 +59,8 @@ class Gauss(FixedStep):
 
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
+    takes_friction: ClassVar[bool] = True
+    takes_driving: ClassVar[bool] = True
     breakdown: ClassVar[Failure] = Failure.UNSOLVED
     tableau: ClassVar[Tableau]
 
@@ -89,14 +91,6 @@ class Gauss(FixedStep):
             E = collocation.decays(system, h[..., 0])
             J = np.concatenate([J[..., : n // 2, :], E @ J[..., n // 2 :, :]], axis=-2)
         return collocation.advanced(system, self.tableau, y, K, h), J
-
-    @property
-    def takes_friction(self) -> bool:
-        return True
-
-    @property
-    def takes_driving(self) -> bool:
-        return True
 
     def own_stepper(self, problem: Problem) -> Stepper:
         from sympflow.kernels.newton import implicit_kernel

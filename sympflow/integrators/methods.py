@@ -77,7 +77,7 @@ TRIPLES: dict[str, Triple] = {
     "wisdom_holman": Triple("leapfrog", "kepler", source=_KEPLER),
     **{
         f"kepler_{name}": Triple(name, "kepler", source=_of(name, f", on Kepler's motion | interaction; {_KEPLER}"))
-        for name in ("aba104", "aba864", "aba1064")
+        for name in ("takahashi_imada", "aba104", "aba864", "aba1064")
     },
     "strang_parts": Triple(
         "verlet", "parts", source="G. Strang, SIAM J. Numer. Anal. 5 (1968) 506–517, for any number of parts"

@@ -92,37 +92,15 @@ CLOCKS = {
 """The clocks by the name that the option `clock` takes."""
 
 
-class OfClock:
-    """A trait of the contract that depends on the clock of the method."""
+class Trait:
+    """A trait of the contract that depends on the splitting and the clock of the method."""
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
+    def __init__(self, of: Callable[[type[Composition], Clock], Any]) -> None:
+        self.of = of
 
     def __get__(self, method: Splitting | None, cls: type[Splitting]) -> Any:
-        return getattr(CLOCKS[cls.clock if method is None else method.clock], self.name)
-
-
-class Breakdown(OfClock):
-    """The reason for which runs end that cannot go on: that of the splitting, where it has one."""
-
-    def __get__(self, method: Splitting | None, cls: type[Splitting]) -> Failure:
-        own = SPLITTINGS[(cls if method is None else method).splitting].breakdown
-        return super().__get__(method, cls) if own is None else own
-
-
-class OfGrid:
-    """True if a peer can drive the steps: equal ones in t, of the state y alone."""
-
-    def __get__(self, method: Splitting | None, cls: type[Splitting]) -> bool:
         triple = cls if method is None else method
-        return not (CLOCKS[triple.clock].in_another_time or SPLITTINGS[triple.splitting].keeps)
-
-
-class Kept:
-    """Name of what a run keeps beside y: that of the splitting."""
-
-    def __get__(self, method: Splitting | None, cls: type[Splitting]) -> str:
-        return SPLITTINGS[(cls if method is None else method).splitting].keeps
+        return self.of(SPLITTINGS[triple.splitting], CLOCKS[triple.clock])
 
 
 @dataclass(frozen=True, repr=False)
@@ -134,7 +112,7 @@ class Splitting(FixedStep):
     dt : float, optional
         Step length; the default is `system.dt`. On the logarithmic clock the physical length of a step where the
         kinetic energy is B = c − E, at the energy E of the system's y0; for Newtonian attraction the mean along the
-        orbit. Elsewhere a step is then dt·2B/(c − V(q)).
+        orbit. Away from there a step is dt·2B/(c − V(q)).
     compensated : bool
         True to sum with Kahan's compensation, which slows the growth of round-off over many steps. Compiled only, for
         the splittings "kinetic" and "kepler". The sums begin anew with each piece of a run that is executed in pieces:
@@ -154,13 +132,14 @@ class Splitting(FixedStep):
         found in the terms of H: as few as possible, potentials first and the linear part last.
     omega : float, optional
         For the splitting "copies": ω, a rate; the copies are bound by ω Σ (s²(q − x)² + (p − y)²/s²)/2, where s makes q
-        and p comparable. The default is the largest |λ| of J∇²H at the system's y0. Weaker, the copies may drift apart,
-        of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the copies; a run
-        keeps both, and is symplectic in their phase space [3]_.
+        and p comparable. The default is the largest |λ| of J∇²H at the system's y0. With a smaller ω the two copies may
+        diverge; a RuntimeWarning reports it. With a larger one the steps must be shorter. States are the means of the
+        copies; a run keeps both, and is symplectic in their phase space [3]_.
     corrector : int, optional
         For the splitting "kepler" and drift–kick–drift steps, as of "wisdom_holman": the order of a symplectic
         corrector, 3, 5, … 17, which is applied at the start, and its inverse to each output. It removes errors of
-        first order in the masses of the planets, and costs nothing in between.
+        first order in the masses of the planets, with "kepler_takahashi_imada" of second order too, and costs nothing
+        in between.
     shift : float, optional
         For the logarithmic clock: c, above the energy; default E + |E|, which is 0 for a bound system.
 
@@ -187,13 +166,15 @@ class Splitting(FixedStep):
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
-    finds_events: ClassVar[Any] = OfClock()
-    on_grid: ClassVar[Any] = OfGrid()
-    keeps: ClassVar[Any] = Kept()
-    in_another_time: ClassVar[Any] = OfClock()
-    arrays_only: ClassVar[Any] = OfClock()
-    tangent_holds: ClassVar[Any] = OfClock()
-    breakdown: ClassVar[Any] = Breakdown()
+    finds_events: ClassVar[Any] = Trait(lambda splitting, clock: clock.finds_events)
+    on_grid: ClassVar[Any] = Trait(lambda splitting, clock: not (clock.in_another_time or splitting.keeps))
+    keeps: ClassVar[Any] = Trait(lambda splitting, clock: splitting.keeps)
+    in_another_time: ClassVar[Any] = Trait(lambda splitting, clock: clock.in_another_time)
+    arrays_only: ClassVar[Any] = Trait(lambda splitting, clock: clock.arrays_only)
+    tangent_holds: ClassVar[Any] = Trait(lambda splitting, clock: clock.tangent_holds)
+    breakdown: ClassVar[Any] = Trait(lambda splitting, clock: splitting.breakdown or clock.breakdown)
+    takes_friction: ClassVar[Any] = Trait(lambda splitting, clock: splitting.takes_friction and clock.on is None)
+    takes_driving: ClassVar[Any] = Trait(lambda splitting, clock: splitting.takes_driving and clock.on is None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -295,14 +276,6 @@ class Splitting(FixedStep):
         cls = type(self)
         other = [mine for mine, own in ((self.splitting, cls.splitting), (self.clock, cls.clock)) if mine != own]
         return f"{self.name} ({', '.join(other)})" if other else self.name
-
-    @property
-    def takes_friction(self) -> bool:
-        return SPLITTINGS[self.splitting].takes_friction and self.clock == "physical"
-
-    @property
-    def takes_driving(self) -> bool:
-        return SPLITTINGS[self.splitting].takes_driving and self.clock == "physical"
 
     def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> Splitting | None:
         return self if SPLITTINGS[self.splitting].takes_extended else None

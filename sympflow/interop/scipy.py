@@ -15,7 +15,7 @@ from sympflow.arguments import as_float, warn
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Problem
 from sympflow.integrators.grid import Grid, no_event, open_end
-from sympflow.integrators.impulses import landings
+from sympflow.integrators.impulses import landings, spans
 from sympflow.integrators.registry import check_applies, naming_plugin
 from sympflow.integrators.steppers import Stepper
 from sympflow.interop.matching import Comparison, fixed_step
@@ -138,17 +138,19 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         self._check(fun)
         system = self._solved
         dt = self.integrator.step_length(system)
+        jumps: list[float] = []
         if self._driven and math.isfinite(t_bound):
             system.check_times(t0, t_bound)
-            told, _ = landings(self.integrator, system, t0, t_bound, able=False)
+            told, jumps = landings(self.integrator, system, t0, t_bound)
             if told:
                 warn(told, RuntimeWarning)
-        self._grid = Grid(t0, open_end(t0, t_bound, dt), dt)
-        self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, self._grid.t1, self.y))
-        self._parts = max(1, math.ceil(abs(self._grid.h) / max_step * (1 - 1e-12)))
-        self._k, self._part = 0, 0  # the grid point before the state, and the sample after it
-        self._t_anchor, self._anchor = float(t0), self.y
-        self._next_anchor = (self._t_anchor, self.y)
+        end = open_end(t0, t_bound, dt)
+        self._pieces, self._length = spans(float(t0), float(end), [], jumps)[::-1], dt
+        self._stepper = self._counts.stepper = self.integrator.stepper(Problem(system, t0, end, self.y))
+        self._parts = max(1, math.ceil(dt / max_step * (1 - 1e-12)))
+        self._part = 0  # the sample after the grid point before the state
+        self._anchor = self.y
+        self._begin()
         self._ahead: deque[np.ndarray] = deque()
         self._block = 1
 
@@ -186,6 +188,12 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             self._comparison.at_start(self._slope, self.y, (self.t, self.t_bound), fun)
         self._count_compared()
 
+    def _begin(self) -> None:
+        """Begin the next piece between jumps of H in t, from the state."""
+        start, end, self._stop = self._pieces.pop()
+        self._grid, self._k = Grid(start, end, self._length), 0  # the grid, and the point of it before the state
+        self._t_anchor, self._next_anchor = start, (start, self.y)
+
     def _compare_again(self, last: bool) -> None:
         """Compare at the state, if it is the last or the run is due."""
         if self._fun is not None and (last or self._comparison.is_due(self._k)):
@@ -220,8 +228,11 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
     def _step_impl(self) -> tuple[bool, str | None]:
         grid = self._grid
         if self._part == 0:
-            if self._k == grid.n_steps and not grid.remainder:
-                return False, no_event(self._k, self.t)
+            if self._k == grid.n_steps + bool(grid.remainder):
+                if not self._pieces:
+                    return False, no_event(self._k, self.t)
+                self._begin()
+                grid = self._grid
             self._t_anchor, self._anchor = self._next_anchor
             whole = self._k < grid.n_steps
             self._h = grid.h if whole else grid.remainder
@@ -244,6 +255,8 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         if self._part == self._parts:
             self._k, self._part = self._k + 1, 0
             self.t, self.y = self._next_anchor
+            if self._k == grid.n_steps + bool(grid.remainder):
+                self.t = self._stop
             self._compare_again(last=self.t == self.t_bound)
         else:
             h = self._h * self._part / self._parts

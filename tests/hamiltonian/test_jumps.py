@@ -464,6 +464,12 @@ def test_metrics_of_a_run_that_lands_on_jumps_are_those_of_its_steps():
     assert sympflow.lyapunov(LATE, "kahan_li8", (0, 30)).value == pytest.approx(0, abs=0.05)
     left = sympflow.escape_times(LATE, "kahan_li8", outside=0.9)
     assert switched(1.03, 0.9, left.time) < 1e-13
+    for span in ((0, 3), (0, 1.03)):
+        scipy = solve_ivp(LATE, span, [0.5, 0.1], method=as_scipy("kahan_li8", LATE), dense_output=True)
+        assert scipy.t[-1] == span[1]
+        assert switched(1.03, scipy.y[0], scipy.t).max() < 1e-13
+        times = np.linspace(*span, 77)
+        assert switched(1.03, scipy.sol(times)[0], times).max() < 1e-13
 
 
 def test_runs_that_do_not_land_on_jumps_warn(tmp_path):
@@ -472,7 +478,6 @@ def test_runs_that_do_not_land_on_jumps_warn(tmp_path):
         lambda: solve(LATE, "kahan_li8", store=tmp_path / "run.zarr"),
         lambda: solve(fast, "leapfrog", (0, 10), dt=0.1),
         lambda: solve(LATE, "mclachlan4"),  # whose forces lie beyond the ends of its steps
-        lambda: solve_ivp(LATE, (0, 3), [0.5, 0.1], method=as_scipy("kahan_li8", LATE)),
         lambda: odeint(LATE, torch.tensor([0.5, 0.1]).double(), torch.tensor([0.0, 3.0]), method="kahan_li8"),
     ):
         with pytest.warns(RuntimeWarning, match="jumps within a step, at t ="):

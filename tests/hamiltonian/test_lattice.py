@@ -281,7 +281,7 @@ class TestPoles:
         y0[1, 4] = 4.0
         sol = sf.solve(HamiltonianSystem.lattice(bond="log(3 + r)", shape=6), "verlet", (0, 1), y0, dt=0.1)
         np.testing.assert_array_equal(sol.status, [0, -1])
-        assert "H of trajectory 1 is infinite, or no number, at `y0`" in sol.message
+        assert "H of trajectory 1 is infinite, or NaN, at `y0`" in sol.message
 
     def test_a_start_at_one_is_named(self):
         system = HamiltonianSystem.lattice(bond="1/(1 + r)", shape=(4, 4), boundary=("fixed", "periodic"))

@@ -74,7 +74,7 @@ def test_the_array_form_of_a_written_triple_is_the_compiled_one():
         ({"clock": ["physical"]}, r"^`clock` must be one of 'physical', 'logarithmic'; got \['physical'\]"),
         ({"shift": 1.0}, r"^`shift` is for the clock 'logarithmic'"),
         ({"parts": ["p**2/2"]}, r"^`parts` are for the splitting 'parts'"),
-        ({"splitting": "parts", "compensated": True}, r"^`compensated` sums are for the splitting 'kinetic'"),
+        ({"splitting": "parts", "compensated": True}, r"^`compensated` sums are for the splittings 'kinetic'"),
     ],
 )
 def test_a_triple_without_meaning_is_a_value_error(options, message):

@@ -15,7 +15,14 @@ pytestmark = pytest.mark.filterwarnings("ignore:`dt` .* is too long:RuntimeWarni
 FIRST_EXIT = {
     **{"verlet": 2.0, "leapfrog": 2.0, "yoshida4": 1.5734, "yoshida6": 2.2691, "suzuki4": 2.7210, "mclachlan4": 3.0355},
     **{"blanes_moan4": 3.1328, "kahan_li6": 2.5326, "kahan_li8": 3.0964, "srkn6b": 3.1635, "srkn11b": 3.1414},
-    **{"srkn14a": 3.1409, "chin4a": math.sqrt(12), "chin4c": math.sqrt(8), "omelyan4": 3.1393, "omelyan6": 3.0426},
+    **{
+        "srkn14a": 3.1409,
+        "takahashi_imada": math.sqrt(12),
+        "chin4a": math.sqrt(12),
+        "chin4c": math.sqrt(8),
+        "omelyan4": 3.1393,
+        "omelyan6": 3.0426,
+    },
     **{"aba104": 3.0896, "aba864": 3.1422, "aba1064": 3.1461},
 }
 
