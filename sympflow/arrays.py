@@ -90,7 +90,7 @@ def masked(y: Array, mask: Any, value: float) -> Array:
 
 def of_library(value: Any, like: Array) -> Array:
     """Return a tensor as it is where `like` is one, and else as an array."""
-    return value if is_tensor(like) else value.detach().numpy()
+    return value if is_tensor(like) else to_numpy(value)
 
 
 def assemble(values: Sequence[Any], like: Array) -> Array:

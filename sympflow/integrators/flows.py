@@ -8,13 +8,13 @@ import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from sympflow.arguments import as_float, check_flag
-from sympflow.arrays import Array, is_tensor, to_numpy, untransformed
+from sympflow.arrays import Array, is_tensor, to_numpy, transformed, untransformed
 from sympflow.flow.known import KnownFlow
 from sympflow.flow.shipped import choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
@@ -183,8 +183,9 @@ class FlowIntegrator(FixedStep):
         """The compiled loops of the flow, or None where the call needs, or asks for, array operations."""
         system = None
         if is_tensor(problem.y0) and str(problem.y0.dtype) == "torch.float64":  # for float32 there is another flow
-            weights: Any = flow
-            system = None if any(x.requires_grad for x in weights.parameters()) else problem.system
+            weights = [*cast(Any, flow).parameters()]
+            learns = any(x.requires_grad for x in weights) or transformed(*weights)
+            system = None if learns else problem.system
         return compiled_loops(lambda: flow.kernel_for(problem.system), problem.y0, problem.backend, system=system)
 
     def own_stepper(self, problem: Problem) -> Stepper:

@@ -32,6 +32,8 @@ def rolled_out(
 
 def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
     """`Stepper.shorter` of tensors, differentiable by their lengths too."""
+    if transformed(y, h):
+        return _by_arrays(stepper, y, h, t, *stepper.followed)
     if y.dtype != torch.float64:
         h = h.double() if isinstance(h, Tensor) else h
         return stepped(stepper, y.double(), h, t).to(y.dtype)

@@ -140,8 +140,9 @@ def test_compiled_and_array_results_agree_to_rounding(batch, span):
 
 
 def test_a_forced_backend_that_does_not_apply_says_why():
-    with pytest.raises(ValueError, match=r"^`backend` 'compiled' does not apply. `y0` is a tensor"):
-        solve(HH, FLOW, (0.0, 1.0), y0=torch.tensor(HH.y0), backend="compiled")
+    y0 = torch.tensor(HH.y0, requires_grad=True)
+    with pytest.raises(ValueError, match=r"^`backend` 'compiled' does not apply. `y0` requires gradients"):
+        solve(HH, FLOW, (0.0, 1.0), y0=y0, backend="compiled")
     with pytest.raises(ValueError, match=r"^`backend` 'compiled' does not apply. `method` 'mlp'"):
         solve(HH, MLP, (0.0, 1.0), backend="compiled")
 
