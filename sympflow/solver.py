@@ -122,7 +122,7 @@ def solve(
         of one state y0 they make a batch. The others keep the system's values. Splitting methods on the splitting
         "kinetic" take them as numbers of one compiled run, and each trajectory is that of a batch on
         ``system.with_params(...)``, up to rounding with compensated sums, force gradients, friction or a drive.
-        Elsewhere trajectories of equal values run together, one set of values after the other. A trained flow holds for
+        Otherwise trajectories are grouped by parameter values, and the groups run in sequence. A trained flow holds for
         its own parameters alone. Gradients flow to tensors that require them, by splitting methods on the splitting
         "kinetic".
     t_eval : array_like of shape (n,), optional
@@ -139,9 +139,10 @@ def solve(
         increases (decreases) count. They are located by Brent's method on the dense output, while the run streams by:
         no state is stored for them. For single trajectories; `poincare_section` takes batches.
     event_step : float, optional
-        Longest time between two samples of the event functions; two zeros of one between two samples are missed. It
-        never changes the run: longer steps are sampled within, by the dense output, as `max_step` does inside
-        `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and every step for adaptive methods.
+        Longest time between two samples of the event functions; two zeros of the same function between two samples are
+        missed. It never changes the run: longer steps are sampled within, by the dense output, as `max_step` does
+        inside `solve_ivp`. The default is `system.dt` for fixed steps, which may be long, and every step for adaptive
+        methods.
     backend : "auto", "compiled" or "array"
         "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states and, by
         splitting methods, for tensors on the CPU; everything else with array operations, tensors on a GPU too. What ran
@@ -154,20 +155,20 @@ def solve(
         True to look at the run when it is over: for places where H is infinite that it passed, for steps that are too
         long, and, where it becomes non-finite, if the solution itself does, and when: a tenth of a second or so.
     progress : bool or callable
-        True for a bar on stderr; or a function of the time that is done and the whole one, called a few times a second.
-        A method that is not run in pieces, such as one of a library, tells its end only.
+        True for a bar on stderr; or a function of the time that is done and of the total, called a few times a second.
+        A method that is not run in windows, such as that of a library, reports its end only.
     store : path, optional
-        A folder, a zarr store, that takes the outputs as they come: fixed steps, NumPy states. Memory does not grow
-        with them: `t` and `y` of the solution are read from the store when they are asked for, and
+        A folder, a zarr store, into which outputs are written as they are computed: fixed steps, NumPy states. Memory
+        does not grow with them: `t` and `y` of the solution are read from the store when they are asked for, and
         ``xarray.open_zarr(store)`` reads it at any time.
     resume : bool
         Go on with the run that is in the store, if there is one: after a kill at any moment, or to a later end of
-        `t_span`, with later times in `t_eval`, the bits are those of a run that was never interrupted. A store of
-        another run is refused: it is known by all that it is made of, functions and classes by their code and the
-        values that they use.
+        `t_span`, with later times in `t_eval`, the result equals that of an uninterrupted run bit for bit. A store of
+        another run is refused: runs are compared by everything that defines them, functions and classes by their code
+        and the values that they use.
     same : bool
-        With `resume`, take functions and objects of Python for those of the store: where one cannot be told from
-        another, such as what a compiled library made, or where code was rewritten and means the same.
+        With `resume`, assume that functions and Python objects are those of the store. Use it where they cannot be
+        compared, such as results of a compiled library, or where code was rewritten with the same meaning.
     checkpoint_every : float, optional
         Seconds of work, at most, that a kill loses; the default is 10. Outputs are chosen by `t_eval` and `save_every`.
     **options

@@ -200,5 +200,5 @@ def _chunk_shape(store: Store, layout: Layout) -> Index:
     if not isinstance(sizes, list) or len(sizes) != len(layout.shape):
         raise store.damaged("its chunk_shape is missing")
     if not all(isinstance(k, int) and 1 <= k <= n for k, n in zip(sizes, layout.shape, strict=True)):
-        raise store.damaged(f"its chunk_shape {sizes} is none of {layout.shape} orbits")
+        raise store.damaged(f"its chunk_shape {sizes} does not fit {layout.shape} orbits")
     return tuple(sizes)

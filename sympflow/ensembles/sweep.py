@@ -96,14 +96,14 @@ def ensemble(
     chunk : int, optional
         Orbits that a worker is given at a time; a store that is there already keeps its own.
     store : path, optional
-        A folder, in zarr's format, into which the workers write what is kept, each chunk when it is done, so that none
-        of it stays in memory. `xarray.open_zarr` reads it; workers on other machines must see it by the same path.
+        A folder, in zarr's format, into which the workers write each chunk of results when it is done, so that nothing
+        stays in memory. `xarray.open_zarr` reads it; workers on other machines must see it by the same path.
     resume : bool
-        Go on with the store of the same ensemble, if there is one: what is there is not done again. It is known by all
-        that it is made of: functions and classes by their code and the values that they use.
+        Go on with the store of the same ensemble, if there is one: what is there is not computed again. Ensembles are
+        compared by everything that defines them, functions and classes by their code and the values that they use.
     same : bool
-        With `resume`, take functions and objects of Python for those of the store: where one cannot be told from
-        another, such as what a compiled library made, or where code was rewritten and means the same.
+        With `resume`, assume that functions and Python objects are those of the store. Use it where they cannot be
+        compared, such as results of a compiled library, or where code was rewritten with the same meaning.
     progress : bool or callable
         True prints how far the ensemble is; a callable is called with the numbers of orbits done and in all.
     backend : "auto", "compiled" or "array"

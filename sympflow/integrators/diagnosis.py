@@ -191,8 +191,8 @@ def warn_of_cancelling(outcome: Outcome, problem: Problem) -> None:
             continue
         _TOLD.add(poles)
         warn(
-            f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in "
-            "many digits, and at it no number. Write them by sinc, which is sin(x)/x without that, or near it by their "
+            f"`system` has terms that cancel {each.name}: near it the force of this run is wrong in many "
+            "digits, and not finite at it. Write them by sinc, which is sin(x)/x without that, or near it by their "
             "series, in a Piecewise.",
             RuntimeWarning,
         )
@@ -283,11 +283,11 @@ def _end(
     rows = sorted(found, key=lambda row: (found[row].end - problem.t0) * sign)
     first, which = found[rows[0]], _which(problem, rows, values)
     if not first.place:
-        outcome.message = f"H{which} is infinite, or no number, at `y0`: start elsewhere."
+        outcome.message = f"H{which} is infinite, or NaN, at `y0`: start elsewhere."
     else:
         outcome.message = (
             f"Between t = {first.begin:.10g} and {first.end:.10g} the run{which} passed {first.place}, "
-            f"where H is infinite or no number: no solution does. {_remedy(integrator, problem)}, or end `t_span` "
+            f"where H is infinite or NaN: no solution does. {_remedy(integrator, problem)}, or end `t_span` "
             "earlier."
         )
     if problem.y0.ndim == 1:

@@ -62,7 +62,7 @@ FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
 MOST_SAMPLES = 65536  # of the events, in a chunk
 COUNTED = ("force_evaluations", "hessian_evaluations", "curvature_evaluations", "newton_iterations")
 """Statistics of which those of a run that goes on are added to the earlier ones, where it counts them itself."""
-UNDER_WAY = "The run had reached t = {t:.17g}: make the same call with resume=True to go on."
+UNDER_WAY = "The run had reached t = {t:.15g}: make the same call with resume=True to go on."
 
 
 class Run(ABC):
@@ -175,13 +175,13 @@ class GridRun(Run):
 
     def report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
         """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there."""
-        grid, reason = self.grid, self.integrator.breakdown
         done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
         outcome.finite = done and (outcome.finite or known_finite(outcome.y))
         if outcome.finite:
             if finite.ndim:
                 outcome.status = np.zeros(finite.shape, dtype=int)
             return
+        grid, reason = self.grid, self.integrator.breakdown
         ok = finite_states(outcome.y)  # (n, ...): shorter steps may overflow too
         if lanes(outcome.y):
             if not ok.all():
@@ -216,10 +216,10 @@ def broken_off(
     """Return the message of a run, or of trajectories `failed` (n, k) of a batch, that cannot go on after time t."""
     what, remedy = (part.format(**numbers) for part in reason.value)
     if failed is None:
-        return f"{what} after t = {t:.17g}{step}. {remedy}, or end `t_span` earlier."
+        return f"{what} after t = {t:.15g}{step}. {remedy}, or end `t_span` earlier."
     index = ", ".join(map(str, failed[0].tolist()))
     return (
-        f"{len(failed)} of {of} trajectories failed, the first of them (index {index}) after t = {t:.17g}. "
+        f"{len(failed)} of {of} trajectories failed, the first of them (index {index}) after t = {t:.15g}. "
         f"{what}. {remedy}."
     )
 
@@ -231,7 +231,7 @@ def report_lanes(outcome: Outcome, ok: np.ndarray, breakdown: Failure) -> None:
     outcome.status = np.where(bad, -1, 0) if bad.ndim else -1
     outcome.stats["failed_at"] = float(outcome.t[int(np.argmin(ok.reshape(len(ok), -1).all(1)))])
     outcome.message = (
-        f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.17g}. {remedy}, or pass the "
+        f"{what} in some lane of torch.func.vmap before t = {outcome.stats['failed_at']:.15g}. {remedy}, or pass the "
         "states as a batch, whose trajectories are told apart."
     )
 
@@ -608,11 +608,11 @@ class StoredRun(GridRun):
             return n
         if k > outputs.last:
             raise ValueError(
-                f"`t_span` ends at t = {self.grid.t1:.17g}, and `store` {store.asked!r} has reached t = "
-                f"{self.grid.t0 + k * self.grid.h:.17g}: give an end at that or later."
+                f"`t_span` ends at t = {self.grid.t1:.15g}, and `store` {store.asked!r} has reached t = "
+                f"{self.grid.t0 + k * self.grid.h:.15g}: give an end at that or later."
             )
         if n > outputs.n + 1:
-            raise store.store.damaged(f"it tells of {n:,} outputs, and its {k:,} steps have none such")
+            raise store.store.damaged(f"it reports {n:,} outputs, more than its {k:,} steps have")
         if n and not (n <= outputs.n and store.times(n - 1)[0] == outputs.part(n - 1, n)[0][0]):
             n -= 1
             store.truncate(n)

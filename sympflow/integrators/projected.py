@@ -30,7 +30,7 @@ class Projected(FixedStep):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.of is None:
-            raise TypeError("`of` is needed: the method, or trained flow, of which each step is projected.")
+            raise TypeError("`of` is needed: the method, or trained flow, whose steps are projected.")
         object.__setattr__(self, "of", build(self.of, {}))
 
     @property

@@ -112,7 +112,7 @@ class Splitting(FixedStep):
     dt : float, optional
         Step length; the default is `system.dt`. On the logarithmic clock the physical length of a step where the
         kinetic energy is B = c − E, at the energy E of the system's y0; for Newtonian attraction the mean along the
-        orbit. Elsewhere a step is then dt·2B/(c − V(q)).
+        orbit. Away from there a step is dt·2B/(c − V(q)).
     compensated : bool
         True to sum with Kahan's compensation, which slows the growth of round-off over many steps. Compiled only, for
         the splittings "kinetic" and "kepler". The sums begin anew with each piece of a run that is executed in pieces:
@@ -132,9 +132,9 @@ class Splitting(FixedStep):
         found in the terms of H: as few as possible, potentials first and the linear part last.
     omega : float, optional
         For the splitting "copies": ω, a rate; the copies are bound by ω Σ (s²(q − x)² + (p − y)²/s²)/2, where s makes q
-        and p comparable. The default is the largest |λ| of J∇²H at the system's y0. Weaker, the copies may drift apart,
-        of which a RuntimeWarning tells; stronger, the steps must be shorter. States are the means of the copies; a run
-        keeps both, and is symplectic in their phase space [3]_.
+        and p comparable. The default is the largest |λ| of J∇²H at the system's y0. With a smaller ω the two copies may
+        diverge; a RuntimeWarning reports it. With a larger one the steps must be shorter. States are the means of the
+        copies; a run keeps both, and is symplectic in their phase space [3]_.
     corrector : int, optional
         For the splitting "kepler" and drift–kick–drift steps, as of "wisdom_holman": the order of a symplectic
         corrector, 3, 5, … 17, which is applied at the start, and its inverse to each output. It removes errors of

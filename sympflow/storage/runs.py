@@ -69,9 +69,9 @@ class Place:
         kinds = place.running.dtype.kind + place.finite.dtype.kind + place.state.dtype.kind + place.failed.dtype.kind
         shapes = [place.running.shape[:-1], place.finite.shape, place.state.shape[:-1], place.failed.shape]
         if steps < 0 or kinds != "fifb" or any(shape != batch for shape in shapes):
-            raise ValueError(f"its arrays are none of {steps} steps of trajectories {batch}")
+            raise ValueError(f"its arrays do not fit {steps} steps of trajectories {batch}")
         if not (isinstance(counts["stats"], dict) and isinstance(counts["noted"], dict)):
-            raise ValueError("its counts are none")
+            raise ValueError("its counts are missing")
         return place
 
 
@@ -185,7 +185,7 @@ class RunStore:
         try:
             place = Place.read(arrays, self.store.fields["status"].shape)
         except (KeyError, TypeError, ValueError) as error:
-            raise self.store.damaged(f"its state is none of a run ({error})") from None
+            raise self.store.damaged(f"its state is not that of a run ({error})") from None
         self.noted = dict(place.counts["noted"])
         return place
 

@@ -73,7 +73,7 @@ class Field:
         if not len(self.dims) == len(self.shape) == len(self.chunks or self.shape):
             raise ValueError(f"`dims` {self.dims}, `shape` {self.shape} and `chunks` {self.chunks} must agree.")
         if np.dtype(self.dtype).kind not in STORABLE:
-            raise TypeError(f"`dtype` {np.dtype(self.dtype)} is none of numbers, which a store takes: convert them.")
+            raise TypeError(f"`dtype` {np.dtype(self.dtype)} is not numeric, and a store takes numbers: convert them.")
         if not all(isinstance(n, int | np.integer) and n >= 0 for n in (*self.shape, *(self.chunks or ()))):
             raise ValueError(f"`shape` {self.shape} and `chunks` {self.chunks} must be whole numbers, 0 or more.")
         chunks = self.shape if self.chunks is None else self.chunks
@@ -227,7 +227,7 @@ class Store:
         """Check that the arrays are those of the call that opens the store."""
         for name in {**fields, **self.fields}:
             if name in self.fields and not (name in fields and fields[name].is_like(self.fields[name])):
-                raise self.damaged(f"its array {name!r} is none that the call makes")
+                raise self.damaged(f"its array {name!r} is not one that the call makes")
             if name not in self.fields or not (self.path / name).is_dir():
                 raise self.damaged(f"its array {name!r} is missing")
 

@@ -150,7 +150,7 @@ def test_a_pickle_does_not_grow_with_the_lattice():
         ({"bond": None}, "`onsite` or `bond`"),
         ({"bond": {}}, "`onsite` or `bond`"),
         ({"onsite": "p"}, "`onsite` holds p"),
-        ({"onsite": "q*cos(t)"}, "`onsite` holds t, and systems by one piece do not depend on the time"),
+        ({"onsite": "q*cos(t)"}, "`onsite` holds t, and such systems do not depend on the time"),
         ({"kinetic": "p**2/2 + q"}, "`kinetic` holds q"),
         ({"fields": ("u", "u")}, "`fields`"),
         ({"fields": ("u", "r_u"), "bond": "r_u**2", "kinetic": "p_u**2 + p_r_u**2"}, "`fields`"),
@@ -281,7 +281,7 @@ class TestPoles:
         y0[1, 4] = 4.0
         sol = sf.solve(HamiltonianSystem.lattice(bond="log(3 + r)", shape=6), "verlet", (0, 1), y0, dt=0.1)
         np.testing.assert_array_equal(sol.status, [0, -1])
-        assert "H of trajectory 1 is infinite, or no number, at `y0`" in sol.message
+        assert "H of trajectory 1 is infinite, or NaN, at `y0`" in sol.message
 
     def test_a_start_at_one_is_named(self):
         system = HamiltonianSystem.lattice(bond="1/(1 + r)", shape=(4, 4), boundary=("fixed", "periodic"))

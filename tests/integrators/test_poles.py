@@ -1,4 +1,4 @@
-"""Runs over places at which H is infinite or no number, and runs near them."""
+"""Runs over places at which H is infinite or NaN, and runs near them."""
 
 import warnings
 
@@ -71,7 +71,7 @@ def test_a_run_over_a_pole_ends_before_it(V):
     sol, _ = solved(system, "verlet", (0, t1), y0, dt=dt)
     last, _ = solved(system, "verlet", (0, t1), y0, dt=dt, t_eval=[t1])
     assert sol.status == last.status == -1
-    assert "where H is infinite or no number: no solution does. Reduce `dt`" in sol.message
+    assert "where H is infinite or NaN: no solution does. Reduce `dt`" in sol.message
     assert sol.stats["failed_at"] == pytest.approx(last.stats["failed_at"])
     assert sol.t[-1] == sol.stats["failed_at"]
     assert last.t.size == 0
@@ -213,7 +213,7 @@ def test_a_start_without_h_is_told():
     system = HamiltonianSystem.from_sympy("p**2/2 + log(q)")
     sol = sf.solve(system, "verlet", (0, 1), [[1.0, 0.0], [-1.0, 0.0]], dt=0.03)
     np.testing.assert_array_equal(sol.status, [0, -1])
-    assert sol.message == "H of trajectory 1 is infinite, or no number, at `y0`: start elsewhere."
+    assert sol.message == "H of trajectory 1 is infinite, or NaN, at `y0`: start elsewhere."
     assert sf.solve(system, "verlet", (0, 1), [-1.0, 0.0], dt=0.03, diagnose=False).success
 
 

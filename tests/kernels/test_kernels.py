@@ -230,13 +230,6 @@ def test_runs_without_outputs_reach_their_end(systems):
     assert np.isfinite(carry.running).all()
 
 
-def test_forth_and_back(systems):
-    system, loops = systems["henon_heiles"], splitting_loops(systems["henon_heiles"])
-    end, *_ = loops.kernel(KAHAN_LI8).run(0.1, system.y0, 500, np.array([500]))
-    back, *_ = loops.kernel(KAHAN_LI8).run(-0.1, end[0], 500, np.array([500]))
-    assert np.abs(back[0] - system.y0).max() < 1e-12
-
-
 def test_compensated_summation_lowers_the_round_off(systems):
     system, loops = systems["henon_heiles"], splitting_loops(systems["henon_heiles"])
     save = np.arange(0, 100_001, 100)

@@ -125,35 +125,3 @@ def test_tables_follow_the_weights():
         expected = flow.kernel_for(system).step(np.array([0.6]), expected[None]).states[0]
     assert np.abs(after - before).max() > 1e-4
     assert np.abs(after[0] - expected).max() < 1e-13
-
-
-def test_the_curvature_without_symbols():
-    """By automatic differentiation of tensors, and by differences of arrays and of Numba functions."""
-    import torch
-    from numba import njit
-
-    plain = HamiltonianSystem(potential=lambda q: (q**4).sum(-1) / 4 + q[..., 0] * q[..., 1] ** 2, ndof=2)
-
-    @njit
-    def potential(q):
-        return (q[0] ** 4 + q[1] ** 4) / 4 + q[0] * q[1] ** 2
-
-    @njit
-    def gradient(q, out):
-        out[0], out[1] = q[0] ** 3 + q[1] ** 2, q[1] ** 3 + 2 * q[0] * q[1]
-
-    @njit
-    def product(q, v, out):
-        out[0] = 3 * q[0] ** 2 * v[0] + 2 * q[1] * v[1]
-        out[1] = 2 * q[1] * v[0] + (3 * q[1] ** 2 + 2 * q[0]) * v[1]
-
-    compiled = HamiltonianSystem(potential=potential, gradient=gradient, hessian_vector=product, ndof=2)
-    symbolic = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/2 + (q1**4 + q2**4)/4 + q1*q2**2")
-    q = np.random.default_rng(2).normal(size=(5, 2))
-    W, expected = symbolic.curvature(q), symbolic.curvature_gradient(q)
-    for system in (plain, compiled):
-        for x, accuracy in ((torch.as_tensor(q), 1e-13 if system is plain else 1e-9), (q, 1e-9)):
-            np.testing.assert_allclose(np.asarray(system.curvature(x)), W, rtol=1e-12)
-            found = np.asarray(system.curvature_gradient(x).detach() if x is not q else system.curvature_gradient(x))
-            np.testing.assert_allclose(found, expected, rtol=accuracy, atol=accuracy * np.abs(expected).max())
-        assert system.curvature_gradient(q[:0]).shape == (0, 2)

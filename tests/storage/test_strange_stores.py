@@ -118,9 +118,9 @@ STRANGE = {
     "empty name": (renamed(""), "not a store of sympflow"),
     "another's state": (told(sympflow_state="../other/.state-1.npz"), "../other"),
     "state that is no text": (told(sympflow_state=3), "not a store of sympflow"),
-    "one array too many": (renamed("mine"), "its array 'mine' is none that the call makes"),
-    "huge shape": (array("q", shape=[2, 10**15]), "its array 'q' is none that the call makes"),
-    "huge chunk": (array("q", chunks=[2, 10**12]), "its array 'q' is none that the call makes"),
+    "one array too many": (renamed("mine"), "its array 'mine' is not one that the call makes"),
+    "huge shape": (array("q", shape=[2, 10**15]), "its array 'q' is not one that the call makes"),
+    "huge chunk": (array("q", chunks=[2, 10**12]), "its array 'q' is not one that the call makes"),
     "negative shape": (array("q", shape=[2, -1]), "not a store of sympflow"),
     "objects": (array("q", dtype="|O"), "not a store of sympflow"),
     "another order": (array("q", order="F"), "not a store of sympflow"),
@@ -140,10 +140,10 @@ OF_RUNS = {
     "packed state": (state(lambda arrays: None, packed=True), "its state cannot be read .*is packed"),
     "pickles": (state(of_objects), "its state cannot be read"),
     "state longer than its file": (longer, "its state cannot be read .*has another length"),
-    "state of another size": (state(lambda a: a.update(state=np.zeros((7, 4)))), "its state is none of a run"),
+    "state of another size": (state(lambda a: a.update(state=np.zeros((7, 4)))), "its state is not that of a run"),
     "running state cut": (state(lambda a: a.update(running=a["running"][:1], steps=3)), "is damaged"),
-    "no finite": (state(lambda arrays: arrays.pop("finite")), "its state is none of a run"),
-    "no counts": (state(lambda arrays: arrays.update(counts=np.array("[]"))), "its state is none of a run"),
+    "no finite": (state(lambda arrays: arrays.pop("finite")), "its state is not that of a run"),
+    "no counts": (state(lambda arrays: arrays.update(counts=np.array("[]"))), "its state is not that of a run"),
     "no message": (described(lambda found: found[".zattrs"].pop("message")), "its message is missing"),
     "more outputs": (
         described(lambda f: [f[f"{n}/.zarray"]["shape"].__setitem__(-1, 10**12) for n in ("q", "p", "time")]),
@@ -151,7 +151,7 @@ OF_RUNS = {
     ),
 }
 OF_ENSEMBLES = {
-    "shape of chunks": (told(chunk_shape=[10**12]), "its chunk_shape .* is none of"),
+    "shape of chunks": (told(chunk_shape=[10**12]), "its chunk_shape .* does not fit"),
     "no shape of chunks": (told(chunk_shape="all"), "its chunk_shape is missing"),
     "messages linked": (linked("messages"), "'messages' is a link to elsewhere"),
 }
@@ -239,6 +239,6 @@ class Objects(Final):
 def test_a_store_takes_numbers(tmp_path):
     with pytest.raises(TypeError, match="`reduce` returns 'things' of object, and a `store` takes numbers"):
         sympflow.ensemble(SYSTEM, "verlet", (0, 1), STATES, store=tmp_path / "a", reduce=Objects())
-    with pytest.raises(TypeError, match="`dtype` object is none of numbers"):
+    with pytest.raises(TypeError, match="`dtype` object is not numeric"):
         Store.create(tmp_path / "b", {"a": Field(("x",), (2,), object)}, {})
     assert not os.listdir(tmp_path)
