@@ -189,6 +189,166 @@ PEERS = {
 }
 
 
+# gradients ---------------------------------------------------------------------------------------------------------
+
+TEXT = "(p1**2 + p2**2)/2 + k*(q1**2 + q2**2)/2 + g*(q1**2*q2 - q2**3/3)"
+PARAMS = {"k": 1.1, "g": 0.9}
+
+
+def of_gradients() -> list[list[Any]]:
+    """Σy at the end of Verlet steps of Hénon–Heiles, and its derivatives by y0 and two parameters."""
+    rows = []
+    for n in (1_000, STEPS):
+        for name, make in GRADIENTS.items():
+            try:
+                run = make(n)
+            except ImportError as error:
+                rows.append([n, name, None, str(error)])
+                continue
+            run()
+            rows.append([n, name, 1e3 * least(run, 9 if "sympflow" in name else 3)[0], ""])
+    return rows
+
+
+def ours_alone(n: int) -> Callable[[], Any]:
+    system = HamiltonianSystem.from_sympy(TEXT, params=PARAMS)
+    return lambda: solve(system, "verlet", (0.0, n * DT), Y0, t_eval=[n * DT], dt=DT)
+
+
+def ours_with_gradient(n: int) -> Callable[[], Any]:
+    import torch
+
+    system = HamiltonianSystem.from_sympy(TEXT, params=PARAMS)
+
+    def run() -> Any:
+        y0, k, g = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (Y0, *PARAMS.values()))
+        sol = solve(system, "verlet", (0.0, n * DT), y0, t_eval=[n * DT], dt=DT, params={"k": k, "g": g})
+        return torch.autograd.grad(sol.y.sum(), (y0, k, g))
+
+    return run
+
+
+def slopes(x: Any, k: Any, g: Any) -> tuple[Any, Any]:
+    return k * x[0] + 2 * g * x[0] * x[1], k * x[1] + g * (x[0] ** 2 - x[1] ** 2)
+
+
+def by_eager_torch(n: int) -> Callable[[], Any]:
+    import torch
+
+    def run() -> Any:
+        y0, k, g = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (Y0, *PARAMS.values()))
+        q, p = y0[:2], y0[2:]
+        for _ in range(n):
+            p = p - DT / 2 * torch.stack(slopes(q, k, g))
+            q = q + DT * p
+            p = p - DT / 2 * torch.stack(slopes(q, k, g))
+        return torch.autograd.grad(q.sum() + p.sum(), (y0, k, g))
+
+    return run
+
+
+def by_torchdiffeq_gradient(n: int) -> Callable[[], Any]:
+    import torch
+    from torchdiffeq import odeint
+
+    times = torch.tensor([0.0, n * DT], dtype=torch.float64)
+
+    def run() -> Any:
+        y0, k, g = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (Y0, *PARAMS.values()))
+
+        def moved(t: Any, y: Any) -> Any:
+            return torch.cat([y[2:], -torch.stack(slopes(y[:2], k, g))])
+
+        end = odeint(moved, y0, times, method="midpoint", options={"step_size": DT})[-1]
+        return torch.autograd.grad(end.sum(), (y0, k, g))
+
+    return run
+
+
+def by_scan_gradient(n: int) -> Callable[[], Any]:
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+    def end(y0: Any, k: Any, g: Any) -> Any:
+        def step(state: Any, _: Any) -> Any:
+            q, p = state
+            p = p - DT / 2 * jax.numpy.stack(slopes(q, k, g))
+            q = q + DT * p
+            return (q, p - DT / 2 * jax.numpy.stack(slopes(q, k, g))), None
+
+        q, p = jax.lax.scan(step, (y0[:2], y0[2:]), None, n)[0]
+        return q.sum() + p.sum()
+
+    run = jax.jit(jax.value_and_grad(end, (0, 1, 2)))
+    return lambda: jax.block_until_ready(run(Y0, *PARAMS.values()))
+
+
+def by_diffrax_gradient(n: int) -> Callable[[], Any]:
+    import diffrax
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+
+    def end(y0: Any, k: Any, g: Any) -> Any:
+        terms = (
+            diffrax.ODETerm(lambda t, p, _: p),
+            diffrax.ODETerm(lambda t, q, _: -jax.numpy.stack(slopes(q, k, g))),
+        )
+        start, solver = (y0[:2], y0[2:]), diffrax.SemiImplicitEuler()
+        q, p = diffrax.diffeqsolve(terms, solver, 0.0, n * DT, DT, start, max_steps=2 * n).ys
+        return q.sum() + p.sum()
+
+    run = jax.jit(jax.value_and_grad(end, (0, 1, 2)))
+    return lambda: jax.block_until_ready(run(Y0, *PARAMS.values()))
+
+
+GRADIENTS = {
+    "sympflow, the run alone": ours_alone,
+    "sympflow, value and gradient": ours_with_gradient,
+    "`jax.lax.scan`, by hand": by_scan_gradient,
+    "diffrax, semi-implicit Euler, recursive checkpoint": by_diffrax_gradient,
+    "torch, by hand": by_eager_torch,
+    "torchdiffeq, `midpoint`": by_torchdiffeq_gradient,
+}
+
+BATCH, UNROLLED = 256, 20
+
+
+def of_networks() -> list[list[Any]]:
+    """An iteration of training V_θ, two layers of 32, through 20 steps of Verlet: value and gradient by the weights."""
+    import torch
+
+    torch.manual_seed(0)
+    linear, tanh = torch.nn.Linear, torch.nn.Tanh
+    net = torch.nn.Sequential(linear(2, 32), tanh(), linear(32, 32), tanh(), linear(32, 1, bias=False)).double()
+    y0 = torch.randn(BATCH, 4, dtype=torch.float64) * 0.3
+    system = HamiltonianSystem(lambda q: net(q)[..., 0], ndof=2)
+
+    def by_solve() -> Any:
+        sol = solve(system, "verlet", (0.0, 2.0), y0, t_eval=[2.0], dt=0.1)
+        return torch.autograd.grad((sol.y**2).mean(), list(net.parameters()))
+
+    def force(q: Any) -> Any:
+        q = q if q.requires_grad else q.detach().requires_grad_()
+        return torch.autograd.grad(net(q).sum(), q, create_graph=True)[0]
+
+    def by_hand() -> Any:
+        q, p = y0[:, :2], y0[:, 2:]
+        f = force(q)
+        for _ in range(UNROLLED):
+            p = p - 0.05 * f
+            q = q + 0.1 * p
+            f = force(q)
+            p = p - 0.05 * f
+        return torch.autograd.grad((torch.cat([q, p], -1) ** 2).mean(), list(net.parameters()))
+
+    for found, expected in zip(by_solve(), by_hand(), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-13)
+    named = {"sympflow, `verlet`": by_solve, "torch, by hand": by_hand}
+    return [[name, 1e3 * least(run, REPEATS)[0]] for name, run in named.items()]
+
+
 def shown_functions(rows: list[list[Any]]) -> str:
     titles = ["H", "method", "traced and compared, ms", "first run, ms", "a step, ns", "by text, ns", "ratio"]
     cells = [[n, f"`{m}`", f"{a:.1f}", f"{b:.0f}", f"{c:.0f}", f"{d:.0f}", f"{e:.2f}"] for n, m, a, b, c, d, e in rows]
@@ -201,9 +361,22 @@ def shown_peers(rows: list[list[Any]]) -> str:
     return fragments.table(["10,000 steps of Hénon–Heiles", "ms", "of ours"], cells)
 
 
+def shown_gradients(rows: list[list[Any]]) -> str:
+    alone = {n: t for n, name, t, _ in rows if name.endswith("alone")}
+    cells = [[f"{n:,}", k, f"{t:.3f}" if t else why, f"{t / alone[n]:.1f}" if t else ""] for n, k, t, why in rows]
+    return fragments.table(["steps", "value and gradient", "ms", "of the run"], cells)
+
+
+def shown_networks(rows: list[list[Any]]) -> str:
+    cells = [[name, f"{t:.1f}", f"{t / rows[0][1]:.1f}"] for name, t in rows]
+    return fragments.table(["an iteration, a batch of 256", "ms", "of ours"], cells)
+
+
 ROWS: dict[str, tuple[Callable[[], list[list[Any]]], Callable[[list[list[Any]]], str]]] = {
     "function": (of_functions, shown_functions),
     "libraries": (of_peers, shown_peers),
+    "gradients": (of_gradients, shown_gradients),
+    "networks": (of_networks, shown_networks),
 }
 
 

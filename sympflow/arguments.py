@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import reprlib
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -237,6 +238,19 @@ def floats(name: str, value: Any) -> np.ndarray:
     if array.dtype.kind not in "fiu":
         raise TypeError(f"`{name}` must be made of real numbers; got {value!r}.")
     return array.astype(float)
+
+
+def real_array(name: str, values: Any) -> np.ndarray:
+    """Return an array of floats of the numbers that a system keeps; a TypeError where they are none."""
+    check_kept(name, values)
+    try:
+        array = to_numpy(values)
+        if array.dtype.kind not in "biufO":
+            raise TypeError(f"of {array.dtype}")
+        return array.astype(float)
+    except (TypeError, ValueError, OverflowError) as error:
+        shown = reprlib.repr(values)
+        raise TypeError(f"`{name}` must be real numbers; got {shown}: pass a number or an array of them.") from error
 
 
 def real_number(value: Any) -> bool:

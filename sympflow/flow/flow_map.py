@@ -22,6 +22,7 @@ from sympflow.flow.files import write
 from sympflow.flow.known import KnownFlow
 from sympflow.flow.records import MAX_DT, MIN_DT, Provenance
 from sympflow.flow.weights import checksum
+from sympflow.hamiltonian.doubling import doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.show.cards import Card, Shown
 from sympflow.show.pictures import trajectory_figure
@@ -379,9 +380,12 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         if system is None and told is not None and told.get("own_hamiltonian"):
             system = self.mean_system(name="learned", domain=self.domain, dt=self.dt)
         if system is None and told is not None and self.identity is not None and self.identity.expression is not None:
-            expression, damping = self.identity.expression, told.get("damping")
-            name = self.system_name or "learned"
-            system = HamiltonianSystem.from_sympy(expression, damping=damping, name=name, domain=self.domain)
+            name, scene = self.system_name or "learned", {key: told.get(key) for key in ("damping", "time", "period")}
+            if told.get("drag") is None:
+                system = HamiltonianSystem.from_sympy(self.identity.expression, name=name, domain=self.domain, **scene)
+            else:
+                physical = HamiltonianSystem.from_sympy(told["physical"], name=name, **scene)
+                system = doubled(physical, told["drag"], name=name, domain=self.domain)
             self.check_system(system)
         if system is not None:
             self.learned = system

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from itertools import combinations
@@ -12,11 +11,11 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import check_kept, checked_count, checked_number, plain
+from sympflow.arguments import check_kept, checked_count, checked_number, plain, real_array
 from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
-from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, named_values, parsed
+from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, named_values, numbered, parsed
 from sympflow.hamiltonian.poles import PairsPoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, without_deltas
 
@@ -104,8 +103,8 @@ class PairsHamiltonian(LocalHamiltonian):
 
     def _read(self, potential: Any, columns: Mapping[str, np.ndarray]) -> None:
         r, self.s = sp.Symbol("r", positive=True), sp.Symbol("s", positive=True)
-        first, second = letters("a", tuple(columns)), letters("b", tuple(columns))
-        c = letters("c", tuple(self.params))
+        first, second = numbered("a", tuple(columns)), numbered("b", tuple(columns))
+        c = numbered("c", tuple(self.params))
         names: dict[str, sp.Symbol] = {"r": r}
         for name, a, b in zip(columns, first, second, strict=True):
             names |= {f"{name}1": a, f"{name}2": b}
@@ -147,10 +146,10 @@ class PairsHamiltonian(LocalHamiltonian):
     def _check_continuous(self) -> None:
         """Refuse a V that jumps."""
         columns = [*self.columns, *self.columns, *self.params.values()]
-        letters_of = (*self.first, *self.second, *self.c[: len(self.params)])
+        symbols = (*self.first, *self.second, *self.c[: len(self.params)])
         names = dict(zip(self.c, self.params, strict=False))
         distance = [s for s in self.of_distance.free_symbols if s.name == "r"]
-        check_continuous("potential", self.of_distance, distance, dict(zip(letters_of, columns, strict=True)), names)
+        check_continuous("potential", self.of_distance, distance, dict(zip(symbols, columns, strict=True)), names)
 
     def identity_parts(self) -> Any:
         made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
@@ -198,7 +197,7 @@ class PairsHamiltonian(LocalHamiltonian):
         c: Mapping[sp.Symbol, sp.Expr],
         box: Sequence[sp.Expr] = (),
     ) -> sp.Expr:
-        """V of all pairs, in letters of positions, ε², columns of bodies, parameters and the sides of the box."""
+        """V of all pairs, in symbols of positions, ε², columns of bodies, parameters and the sides of the box."""
         terms = []
         for i, j in combinations(range(self.n_bodies), 2):
             d = [q[self.dim * i + k] - q[self.dim * j + k] for k in range(self.dim)]
@@ -305,18 +304,18 @@ class PairsHamiltonian(LocalHamiltonian):
         return PairsPoles(self) or None
 
     def met(self, q: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]]:
-        """The ends i, j (P,) of pairs, their distances, or differences on a line, (..., P), and values of letters."""
+        """The ends i, j (P,) of pairs, their distances, or differences on a line, (..., P), and values of symbols."""
         for pairs in self._pairs(q):
             x = pairs.x[0][..., 0] if self.on_a_line else np.sqrt(pairs.s)
-            yield pairs.i, pairs.j, x, pairs.letters
+            yield pairs.i, pairs.j, x, pairs.symbol_values
 
     def values_of(
-        self, key: str, expressions: list[sp.Expr], x: sp.Symbol, distances: np.ndarray, letters: list[Any]
+        self, key: str, expressions: list[sp.Expr], x: sp.Symbol, distances: np.ndarray, symbol_values: list[Any]
     ) -> list[Any]:
-        """The values of expressions in a distance and the letters of two bodies."""
+        """The values of expressions in a distance and the symbols of two bodies."""
         names = (x, *self.first, *self.second, *self.c)
         with np.errstate(all="ignore"):
-            values = self._values(f"potential {key}", lambda: expressions, names, distances, *letters)
+            values = self._values(f"potential {key}", lambda: expressions, names, distances, *symbol_values)
         return [np.broadcast_to(value, distances.shape) for value in values]
 
     @property
@@ -339,8 +338,8 @@ class PairsHamiltonian(LocalHamiltonian):
         before, after = ((self._of_bodies(x[self.ndof :]) ** 2).sum(-1) / self.inertia for x in (start, y))
         i, j = sorted(np.argsort(after - before)[-2:].tolist())
         return (
-            f"the bodies {i} and {j} have gained most: they met between two steps, which saw nothing of it. Take "
-            "shorter steps, `softening`, or a method with a clock of its own, such as 'log_leapfrog'"
+            f"the bodies {i} and {j} have gained most: they met within one step. Reduce `dt`, take `softening`, or "
+            "a method with a clock of its own, such as 'log_leapfrog'"
         )
 
     def remark(self, q: np.ndarray) -> str:
@@ -441,14 +440,14 @@ class Pairs:
         self.s = _dot(x[0], x[0]) + local.softening**2
 
     @property
-    def letters(self) -> list[Any]:
-        """The values of the letters of V: (P,) of the bodies, and numbers."""
+    def symbol_values(self) -> list[Any]:
+        """The values of the symbols of V: (P,) of the bodies, and numbers."""
         return [*(column[ends] for ends in (self.i, self.j) for column in self.local.columns), *self.local.constants]
 
     def values(self, k: int) -> Array:
         """2ᵏ times the k-th derivative of V by s, 0 beyond the cut-off: (..., P)."""
         local, s = self.local, self.s
-        given = [like(x, s) for x in self.letters]
+        given = [like(x, s) for x in self.symbol_values]
         variables = (local.s, *local.first, *local.second, *local.c)
         with np.errstate(all="ignore"):  # bodies at one place
             value = local._values(f"potential {k}", lambda: [local.slopes[k]], variables, s, *given)[0] + 0 * s
@@ -485,13 +484,8 @@ def _added(out: Array, ends: np.ndarray, values: Array) -> Array:
 
 
 def checked_column(name: str, values: Any) -> np.ndarray:
-    check_kept(name, values)
-    values = to_numpy(values) if is_tensor(values) else values
-    check_memory(float(np.size(values)), f"`{name}`")
-    try:
-        array = np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise TypeError(f"`{name}` must be an array (n,) of numbers; got {reprlib.repr(values)}.") from None
+    check_memory(float(math.prod(getattr(values, "shape", ()))), f"`{name}`")  # before any is taken
+    array = real_array(name, values)
     if array.ndim != 1:
         raise ValueError(f"`{name}` must have shape (n,), one number for each body; got {array.shape}.")
     if not np.isfinite(array).all():
@@ -511,11 +505,9 @@ def _checked_length(name: str, value: Any) -> float | None:
 def _checked_box(box: Any, dim: int) -> np.ndarray | None:
     if box is None:
         return None
-    check_kept("box", box)
     try:
-        lengths = np.array(to_numpy(box), dtype=float)
-        lengths = np.broadcast_to(lengths, (dim,)).copy()
-    except (TypeError, ValueError):
+        lengths = np.broadcast_to(real_array("box", box), (dim,)).copy()
+    except ValueError:
         raise ValueError(f"`box` must be a length, or {dim} of them, one along each axis; got {box!r}.") from None
     if not (np.isfinite(lengths) & (lengths > 0)).all():
         raise ValueError(f"`box` must have positive, finite lengths; got {box!r}.")

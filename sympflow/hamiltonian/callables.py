@@ -207,7 +207,7 @@ class CallableHamiltonian(Definition):
                     )
                     value = np.nan
                 if is_tensor(value) != (name == "torch"):
-                    failure, value = failure or "its result is none of NumPy's", np.nan
+                    failure, value = failure or "its result is not a NumPy array", np.nan
                 try:
                     found.append(float(value))
                 except (TypeError, ValueError, RuntimeError):
@@ -544,6 +544,11 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
             f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}){traced}. Write it with NumPy's or "
             "torch's functions of (..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
         ) from error
+    if untraced and not is_tensor(value) and hasattr(value, "dtype"):
+        raise TypeError(
+            f"`{name}` could not be traced, for {untraced}, and torch cannot differentiate what it returns. Write it "
+            "with functions that have a rule, or pass `gradient` as well, as spline(q, 1) of a spline of SciPy."
+        )
     if tensor._version != version:
         raise ValueError(f"`{name}` writes into its argument, the state of the run: let it work on a copy, q.clone().")
     value = _checked(value, tensor, name, tail)

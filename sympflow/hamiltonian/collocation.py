@@ -89,7 +89,8 @@ def _solved_stages(
     before = y[..., 0] * 0 + xp.inf
     done = before < 0
     for iteration in range(1, MOST_ITERATIONS + 1):
-        M, residual = _equations(system, y, K, h, times, A, scale)
+        M, _ = newton_matrix(system, y[..., None, :] + A @ K, h, times, A, scale)
+        residual = _residual(system, y, K, h, times, A, scale)
         change = solved(M, residual[..., None], variable_sizes(y, K, residual))[..., 0].reshape(K.shape)
         K = xp.where(done[..., None, None], K, K - change)
         size = _relative_size(change, y, K, system.ndof)
@@ -107,14 +108,6 @@ def stage_nodes(tableau: Tableau) -> tuple[float, ...]:
     """The nodes c_i of the stages, in steps."""
     A, _, scale = tableau
     return tuple(float(np.dot(row, scale)) for row in A)
-
-
-def _equations(
-    system: HamiltonianSystem, y: Array, K: Array, h: Any, times: Any, A: Array, scale: Array
-) -> tuple[Array, Array]:
-    """Newton's matrix (..., s·2d, s·2d) and the residuals of `_residual`."""
-    M, _ = newton_matrix(system, y[..., None, :] + A @ K, h, times, A, scale)
-    return M, _residual(system, y, K, h, times, A, scale)
 
 
 def _residual(system: HamiltonianSystem, y: Array, K: Array, h: Any, times: Any, A: Array, scale: Array) -> Array:

@@ -171,7 +171,7 @@ def doubled(
                 f"`force` is given by symbols, but `system` {system.name!r} by functions: give it as a function "
                 "F(q, p), written with torch."
             )
-        F: ExternalForce = GivenForce(force if given else _no_force)
+        F: ExternalForce = GivenForce(force if given else lambda q, p: 0 * p)
         made = DoubledSystem(hamiltonian=_DoubledFunctions(system, F), ndof=2 * system.ndof, check=False, **scene)
     else:
         from sympflow.hamiltonian.forces import SymbolicForce, doubled_hamiltonian
@@ -187,10 +187,6 @@ def doubled(
     made.physical = system if force is None else system.with_force(F)
     made.y0 = None if system.y0 is None else made.lift(system.y0)
     return made
-
-
-def _no_force(q: Array, p: Array) -> Array:
-    return 0 * p
 
 
 class GivenForce:

@@ -210,11 +210,11 @@ def sampled_parameter(name: str, samples: Samples, time: sp.Symbol) -> sampled:
     return sampled(Str(f"{name}_{samples.digest}"), sp.S.Zero, time)
 
 
-def with_letters(f: list[sp.Expr]) -> tuple[list[sp.Expr], dict[sampled, sp.Symbol]]:
-    """Expressions with a letter for each value of samples in them, and these letters."""
+def with_symbols(f: list[sp.Expr]) -> tuple[list[sp.Expr], dict[sampled, sp.Symbol]]:
+    """Expressions with a symbol for each value of samples in them, and these symbols."""
     found = sorted({a for each in f for a in each.atoms(sampled)}, key=str)
-    letters = {a: sp.Symbol(f"sample_{i}", real=True) for i, a in enumerate(found)}
-    return ([each.xreplace(letters) for each in f] if letters else f), letters
+    symbols = {a: sp.Symbol(f"sample_{i}", real=True) for i, a in enumerate(found)}
+    return ([each.xreplace(symbols) for each in f] if symbols else f), symbols
 
 
 # drifts of T(p, t) ---------------------------------------------------------------------------------
@@ -225,11 +225,8 @@ DURATION = sp.Symbol("duration", real=True)
 
 def drift(slope: tuple[sp.Expr, ...], time: sp.Symbol | None) -> tuple[sp.Expr, ...]:
     """∫_t^{t+s} ∇T(p, u) du, an expression in p, t and s, which is `DURATION`, for each entry of the slope ∇T(p, t)."""
-    return tuple(sp.Add(*[_integrated(term, time) for term in sp.Add.make_args(_sum_of(f, time))]) for f in slope)
-
-
-def _sum_of(f: sp.Expr, time: sp.Symbol | None) -> sp.Expr:
-    return f if time is None or not f.has(time) else sp.expand(f)
+    sums = [f if time is None or not f.has(time) else sp.expand(f) for f in slope]
+    return tuple(sp.Add(*[_integrated(term, time) for term in sp.Add.make_args(f)]) for f in sums)
 
 
 def _integrated(term: sp.Expr, time: sp.Symbol | None) -> sp.Expr:

@@ -81,6 +81,33 @@ def read(text: str, names: Collection[str] = ()) -> sp.Expr:
     return value
 
 
+COORDINATE = re.compile(r"[qp]([1-9][0-9]{0,15})?")
+
+
+def stated(
+    argument: str,
+    expression: Any,
+    names: Collection[str] = (),
+    remedy: str = "Write it with these, or pass a SymPy expression",
+) -> sp.Expr:
+    """The expression that an argument states, as text or SymPy's, in real symbols; refused where it cannot be read."""
+    try:
+        if isinstance(expression, str):
+            coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", expression) if COORDINATE.fullmatch(w))
+            return of_sympy(read(expression, {*names, *coordinates}), names)
+        return of_sympy(sp.sympify(expression, strict=True), names)
+    except sp.SympifyError:
+        raise ValueError(
+            f"`{argument}` must be a scalar expression; got {type(expression).__name__}: pass a string or a SymPy "
+            "expression."
+        ) from None
+    except Unreadable as error:
+        if isinstance(expression, str):
+            shown = expression if len(expression) <= 200 else expression[:200] + "..."
+            raise ValueError(f"`{argument}` cannot be parsed: {shown!r} ({error}). {remedy}.") from None
+        raise ValueError(f"`{argument}` must be a scalar expression: {error}.") from None
+
+
 def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
     """A SymPy expression as `read` gives one of a text: a number, its symbols real; of a matrix with one entry that."""
     shape = getattr(expression, "shape", ())

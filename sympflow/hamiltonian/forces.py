@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +9,12 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arrays import Array, concatenate
-from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
+from sympflow.hamiltonian.expression import COORDINATE, complex_part, stated
 from sympflow.hamiltonian.jumps import refuse_deltas
 from sympflow.hamiltonian.symbolic import checked_params, exact, printable
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
-
-_COORDINATE = re.compile(r"([qp])([1-9]\d*)?")
 
 
 class SymbolicForce:
@@ -36,7 +33,9 @@ class SymbolicForce:
                 f"`force` must have {d} components, one for each momentum of {system.name!r}; got {len(written)}."
             )
         values = {**system.params, **checked_params(params)}
-        read_ones = [_read(each, values) for each in written]
+        read_ones = [stated("force", each, values) for each in written]
+        if any(complex_part(f) is not None for f in read_ones):
+            raise TypeError("`force` must be real expressions, texts or SymPy's, or a function F(q, p).")
         for name in params or {}:
             if not any(sp.Symbol(name, real=True) in f.free_symbols for f in read_ones):
                 raise ValueError(f"`params` has {name!r}, which the force does not use: remove it.")
@@ -52,7 +51,7 @@ class SymbolicForce:
             known |= {sp.Symbol("q", real=True): self.q[0], sp.Symbol("p", real=True): self.p[0]}
         f = f.xreplace(known)
         unknown = sorted(s.name for s in f.free_symbols - {*self.q, *self.p, self.time})
-        beyond = [name for name in unknown if _COORDINATE.fullmatch(name)]
+        beyond = [name for name in unknown if COORDINATE.fullmatch(name)]
         if beyond:
             raise ValueError(
                 f"`force` holds {', '.join(beyond)}, but the system has the coordinates {self.q[0]} … {self.p[-1]}: "
@@ -97,24 +96,3 @@ def doubled_hamiltonian(system: HamiltonianSystem, force: SymbolicForce) -> sp.E
         terms.append(p[i] * sp.diff(symbols.H, symbols.p[i]).xreplace(mean))
         terms.append(q[d + i] * (sp.diff(symbols.H, symbols.q[i]) + drag - F).xreplace(mean))
     return printable(sp.Add(*terms))
-
-
-def _read(f: Any, names: Mapping[str, float]) -> sp.Expr:
-    """One component in real symbols."""
-    try:
-        if isinstance(f, str):
-            coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", f) if _COORDINATE.fullmatch(w))
-            value = of_sympy(read(f, {*names, *coordinates}), names)
-        else:
-            value = of_sympy(sp.sympify(f, strict=True), names)
-    except Unreadable as error:
-        raise ValueError(
-            f"`force` cannot be parsed: {str(f)[:200]!r} ({error}). Write it with these, or pass a SymPy expression."
-        ) from None
-    except sp.SympifyError:
-        value = sp.I
-    if complex_part(value) is not None:
-        raise TypeError(
-            f"`force` must be real expressions, texts or SymPy's, or a function F(q, p); got {type(f).__name__}."
-        )
-    return value

@@ -1,4 +1,4 @@
-"""Formulas: functions of letters that programs are recorded of, whether H was given by symbols or by Python functions.
+"""Formulas: functions of variables that programs are recorded of, of an H by symbols or by Python functions.
 
 A form says what H is made of. That of symbols is `SymbolicHamiltonian`, whose expressions are SymPy's; that of Python
 functions is `TracedHamiltonian`, whose expressions are programs. Kernels take either, and no more than they share.
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Formula",
-    "Letter",
     "TracedDriving",
     "TracedHamiltonian",
     "TracedLetters",
     "TracedPoles",
+    "Variable",
     "evaluator",
     "recorded",
 ]
@@ -43,17 +43,17 @@ _AS_THEIR_ARGUMENTS = {"abs", "neg", "sqrt", "pow", "mul", "times"}
 _POLYNOMIAL = {"add", "sub", "mul", "times", "neg", "fma"}
 
 
-class Letter(NamedTuple):
+class Variable(NamedTuple):
     """A variable of a formula."""
 
     name: str
 
 
 class Formula:
-    """A function of letters, those of the inputs of a program of one output."""
+    """A function of variables, those of the inputs of a program of one output."""
 
-    def __init__(self, program: Program, letters: Sequence[Letter]) -> None:
-        self.program, self.letters = program, tuple(letters)
+    def __init__(self, program: Program, variables: Sequence[Variable]) -> None:
+        self.program, self.variables = program, tuple(variables)
 
     @cached_property
     def _text(self) -> str:
@@ -72,16 +72,16 @@ class Formula:
         return len(self.program)
 
     def value(self, known: Mapping[Any, Any]) -> Any:
-        """The value, of numbers for the letters."""
-        return self.program(*(known[s] for s in self.letters))[0]
+        """The value, of numbers for the variables."""
+        return self.program(*(known[s] for s in self.variables))[0]
 
-    def diff(self, letter: Letter) -> Formula:
-        """The derivative by a letter."""
+    def diff(self, variable: Variable) -> Formula:
+        """The derivative by a variable."""
         program = self.program
-        (slope,) = gradient(program.outputs[0], [program.inputs[self.letters.index(letter)]])
-        return Formula(Program(program.inputs, [slope]), self.letters)
+        (slope,) = gradient(program.outputs[0], [program.inputs[self.variables.index(variable)]])
+        return Formula(Program(program.inputs, [slope]), self.variables)
 
-    def is_polynomial(self, *letters: Letter) -> bool:
+    def is_polynomial(self, *variables: Variable) -> bool:
         """True if the program has sums and products alone."""
 
         def is_simple(x: Traced) -> bool:
@@ -111,7 +111,7 @@ class TracedHamiltonian:
     The program is V of q, if it is `separable`, or H of q and p; of a driven system the time comes first.
     """
 
-    parameters: tuple[Letter, ...] = ()
+    parameters: tuple[Variable, ...] = ()
     values: tuple[float, ...] = ()
     samples: Mapping[str, Any] = MappingProxyType({})
 
@@ -119,9 +119,9 @@ class TracedHamiltonian:
         self, ndof: int, program: Program, separable: bool, inverse_mass: np.ndarray | None = None, timed: bool = False
     ) -> None:
         self.ndof, self.program, self.separable = ndof, program, separable
-        self.q = tuple(Letter(f"q{i + 1}") for i in range(ndof))
-        self.p = tuple(Letter(f"p{i + 1}") for i in range(ndof))
-        self.time = Letter("t") if timed else None
+        self.q = tuple(Variable(f"q{i + 1}") for i in range(ndof))
+        self.p = tuple(Variable(f"p{i + 1}") for i in range(ndof))
+        self.time = Variable("t") if timed else None
         times = (self.time,) if self.time else ()
         self.V: Formula | None = None
         self.T: Formula | None = None
@@ -136,11 +136,11 @@ class TracedHamiltonian:
         self._set_potential(Formula(program, (*times, *self.q)))
 
     def _set_potential(self, V: Formula) -> None:
-        T, n = self.T, len(V.letters)
+        T, n = self.T, len(V.variables)
         assert T is not None
-        letters = (*V.letters, *self.p)
-        H = traced(lambda *x: [V.program(*x[:n])[0] + T.program(*x[n:])[0]], *(s.name for s in letters))
-        self.V, self.H = V, Formula(H, letters)
+        variables = (*V.variables, *self.p)
+        H = traced(lambda *x: [V.program(*x[:n])[0] + T.program(*x[n:])[0]], *(s.name for s in variables))
+        self.V, self.H = V, Formula(H, variables)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "written"}
@@ -181,13 +181,13 @@ class TracedHamiltonian:
 
     @cached_property
     def driving(self) -> TracedDriving:
-        """The form with letters for what depends on the time alone."""
+        """The form with coefficients for what depends on the time alone."""
         assert self.V is not None
-        (V,), letters = without_time([self.V], self.time)
+        (V,), coefficients = without_time([self.V], self.time)
         form = copy.copy(self)
-        form.time, form.parameters = None, tuple(letters)
+        form.time, form.parameters = None, tuple(coefficients)
         form._set_potential(V)
-        return TracedDriving(form, letters)
+        return TracedDriving(form, coefficients)
 
     # arrays, of V in q or of H in [q, p] --------------------------------------------------------------------------
 
@@ -317,7 +317,7 @@ POSITIVE, NOT_NEGATIVE, ANY = 2, 1, 0
 
 
 def _least(x: Any) -> int:
-    """The sign that a number has whatever the letters are, as 1 + q² has."""
+    """The sign that a number has whatever the variables are, as 1 + q² has."""
     if isinstance(x, float):
         return POSITIVE if x > 0 else NOT_NEGATIVE if x == 0 else ANY
     if x.name in ("exp", "cosh"):
@@ -341,72 +341,72 @@ class TracedDriving:
 
     means: tuple[()] = ()
 
-    def __init__(self, form: TracedHamiltonian, letters: Mapping[Letter, Formula]) -> None:
-        self.form, self._letters = form, letters
+    def __init__(self, form: TracedHamiltonian, coefficients: Mapping[Variable, Formula]) -> None:
+        self.form, self._coefficients = form, coefficients
 
     @property
     def key(self) -> tuple[Any, ...]:
-        return tuple(self._letters.items())
+        return tuple(self._coefficients.items())
 
     def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
-        """The letters at a time."""
-        return _at_time(self._letters, time)
+        """The coefficients at a time."""
+        return _at_time(self._coefficients, time)
 
     def check(self) -> None:
         """Do nothing: all that was traced has a compiled form."""
 
 
 class TracedLetters:
-    """Formulas with letters for what depends on the time alone, `given` those of parameters too."""
+    """Formulas with coefficients for what depends on the time alone, `given` those of parameters too."""
 
     def __init__(self, form: TracedHamiltonian, expressions: Sequence[Formula]) -> None:
-        self.symbols, self.expressions, self.letters = form, list(expressions), dict[Letter, Formula]()
+        self.symbols, self.expressions, self.letters = form, list(expressions), dict[Variable, Formula]()
         if form.time is not None:
             self.expressions, self.letters = without_time(expressions, form.time)
         self.given = (*form.parameters, *self.letters)
 
     def at(self, t: Any, parameters: Sequence[Any]) -> list[Any]:
-        """The letters at times t, numbers of compiled code."""
+        """The coefficients at times t, numbers of compiled code."""
         return [t.code.operand(x, t.type) for x in _at_time(self.letters, t)]
 
 
-def _at_time(letters: Mapping[Letter, Formula], time: Any) -> list[Any]:
-    """Values of letters at a time, common operations once."""
-    together = traced(lambda t: [f.program(t)[0] for f in letters.values()], "t")
+def _at_time(coefficients: Mapping[Variable, Formula], time: Any) -> list[Any]:
+    """Values of coefficients at a time, common operations once."""
+    together = traced(lambda t: [f.program(t)[0] for f in coefficients.values()], "t")
     return together(time)
 
 
-def without_time(formulas: Sequence[Formula], time: Any) -> tuple[list[Formula], dict[Letter, Formula]]:
-    """Formulas with letters for the largest parts that depend on the time alone; these as formulas of it."""
-    found: dict[Letter, Formula] = {}
+def without_time(formulas: Sequence[Formula], time: Any) -> tuple[list[Formula], dict[Variable, Formula]]:
+    """Formulas with coefficients for the largest parts that depend on the time alone; these as formulas of it."""
+    found: dict[Variable, Formula] = {}
     return [_without_time(f, time, found) for f in formulas], found
 
 
-def _without_time(f: Formula, time: Letter, found: dict[Letter, Formula]) -> Formula:
-    program, place = f.program, f.letters.index(time)
+def _without_time(f: Formula, time: Variable, found: dict[Variable, Formula]) -> Formula:
+    program, place = f.program, f.variables.index(time)
     t = program.inputs[place]
     moving = {x.order for x in program.inputs if x is not t}
     for x in program.operations:
         if any(isinstance(a, Traced) and a.order in moving for a in x.args):
             moving.add(x.order)
     used = [a for x in program.operations if x.order in moving for a in x.args] + list(program.outputs)
-    own: dict[int, Letter] = {}
+    own: dict[int, Variable] = {}
     for a in used:
         if isinstance(a, Traced) and a.order not in moving and a.order not in own:
-            own[a.order] = Letter(f"letter_{len(found)}")
+            own[a.order] = Variable(f"letter_{len(found)}")
             found[own[a.order]] = Formula(Program([t], [a]), (time,))
-    others = [(s, x) for s, x in zip(f.letters, program.inputs, strict=True) if x is not t]
+    others = [(s, x) for s, x in zip(f.variables, program.inputs, strict=True) if x is not t]
     recording = Recording()
     inputs = [recording.input(s.name) for s, _ in others]
     of: dict[int, Any] = {x.order: new for (_, x), new in zip(others, inputs, strict=True)}
-    of |= {order: recording.input(letter.name) for order, letter in own.items()}
+    of |= {order: recording.input(coefficient.name) for order, coefficient in own.items()}
     for x in program.operations:
         if x.order in moving:
             of[x.order] = apply(x.name, *(of[a.order] if isinstance(a, Traced) else a for a in x.args))
     (y,) = program.outputs
-    letters = [of[order] for order in own]
+    coefficients = [of[order] for order in own]
     return Formula(
-        Program([*inputs, *letters], [of[y.order] if isinstance(y, Traced) else y]),
+        Program([*inputs, *coefficients], [of[y.order] if isinstance(y, Traced) else y]),
         (*(s for s, _ in others), *own.values()),
     )
 
@@ -429,20 +429,19 @@ def evaluator(numbers: Mapping[Any, Any]) -> Callable[[Any], Any]:
         if isinstance(f, float):
             return f
         if f not in known:
-            known[f] = f.value(known) if isinstance(f, Formula) else _of_symbols()(f, value)
+            if isinstance(f, Formula):
+                known[f] = f.value(known)
+            else:
+                from sympflow.hamiltonian.recorded import calculated
+
+                known[f] = calculated(f, value)
         return known[f]
 
     return value
 
 
-def _of_symbols() -> Callable[[Any, Callable[[Any], Any]], Any]:
-    from sympflow.hamiltonian.recorded import calculated
-
-    return calculated
-
-
 def recorded(expressions: Sequence[Any], inputs: Sequence[Any]) -> Program:
-    """Expressions as a program of letters or symbols."""
+    """Expressions as a program of variables or symbols."""
 
     def values(*numbers: Any) -> list[Any]:
         return list(map(evaluator(dict(zip(inputs, numbers, strict=True))), expressions))

@@ -25,7 +25,7 @@ NEWTON, FOUND = 20, 1e-12  # steps at most, and the error of a velocity relative
 
 
 class ExternalForce(Protocol):
-    """F(q, p) in p' = −∂H/∂q + F, that no H has; of a driven system t, a number or (...), follows p."""
+    """F(q, p) in p' = −∂H/∂q + F, not the force of any H; of a driven system t, a number or (...), follows p."""
 
     @property
     def expressions(self) -> Sequence[Any]:
@@ -145,7 +145,7 @@ class Hamiltonian:
                 p = p + library(left).linalg.solve(self.hessian(y, t)[..., d:, d:], left[..., None])[..., 0]
             except (np.linalg.LinAlgError, RuntimeError):  # the latter of torch
                 break
-        raise ValueError("`v` are velocities of no momenta that Newton's method finds: give p itself.")
+        raise ValueError("`v`: Newton's method finds no momenta for these velocities; give p itself.")
 
     def time_derivative(self, y: Array, t: Any = None) -> Array:
         """∂H/∂t of a driven system, 0 of another: (..., 2d) to (...)."""
@@ -257,18 +257,18 @@ class Hamiltonian:
         return self.conservative and self.autonomous
 
     def check_conservative(self, what: str, remedy: str) -> None:
-        """Refuse a system with friction where it would be left out, or what is asked does not hold with it.
+        """Refuse a system with friction, for what leaves it out or does not hold with it.
 
         With an external force the remedy is always the same: the vector field, or the doubled system.
 
         Raises
         ------
         ValueError
-            With `what` is asked, as a clause that follows the reason, and the remedy.
+            With the reason, `what` is asked as a clause, and the remedy.
         """
         if self.external_force is not None:
             raise ValueError(
-                f"`system` {self.name!r} has a force that is none of H, p' = −∂H/∂q + F, {what}: solve it by a "
+                f"`system` {self.name!r} has an external force, p' = −∂H/∂q + F, {what}: solve it by a "
                 "Runge–Kutta method such as 'dop853', or its doubled system by any method, and judge the physical "
                 "solution by sympflow.reference_error(sol)."
             )
@@ -276,12 +276,12 @@ class Hamiltonian:
             raise ValueError(f"`system` {self.name!r} has friction, p' = −∂H/∂q − Γp, {what}: {remedy}.")
 
     def check_autonomous(self, what: str, remedy: str) -> None:
-        """Refuse a driven system, H(t, q, p), where the time would be left out, or what is asked does not hold with it.
+        """Refuse a driven system, H(t, q, p), for what leaves the time out or does not hold with it.
 
         Raises
         ------
         ValueError
-            With `what` is asked, as a clause that follows the reason, and the remedy.
+            With the reason, `what` is asked as a clause, and the remedy.
         """
         if not self.autonomous:
             raise ValueError(f"`system` {self.name!r} is driven, H depends on t, {what}: {remedy}.")
@@ -297,9 +297,9 @@ class Hamiltonian:
     def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
         """The times (n,) between two others at which H jumps: of samples, and of functions of t that jump.
 
-        These are `Heaviside`, `sign`, `floor`, `acot`, `atan2`, the absolute value in a quotient, the conditions of
-        pieces, and their like. Zeros of their arguments that are neither linear nor periodic are not told apart where
-        they are nearer to each other than `step`. In a long interval with many jumps the first ones alone are given.
+        Functions that jump are `Heaviside`, `sign`, `floor`, `acot`, `atan2`, an absolute value in a quotient, the
+        conditions of pieces, and similar ones. Zeros of arguments that are neither linear nor periodic are resolved to
+        `step`. In a long interval with many jumps only the first ones are returned.
         """
         return self.definition.jump_times(low, high, step)
 
@@ -314,12 +314,12 @@ class Hamiltonian:
         return between
 
     def check_impulses(self, what: str, remedy: str) -> None:
-        """Refuse a system with impulses, DiracDelta in t, where they would be left out.
+        """Refuse a system with impulses, DiracDelta in t, for what leaves them out.
 
         Raises
         ------
         ValueError
-            With `what` is asked, as a clause that follows the reason, and the remedy.
+            With the reason, `what` is asked as a clause, and the remedy.
         """
         if self.between_impulses is not self:
             raise ValueError(f"`system` {self.name!r} has impulses, DiracDelta in H, {what}: {remedy}.")
@@ -355,7 +355,7 @@ class Hamiltonian:
     def __call__(self, t: float, y: Array) -> Array:
         """The right-hand side fun(t, y) of `scipy.integrate.solve_ivp` and `torchdiffeq.odeint`.
 
-        Beyond the samples of a parameter it goes on as SciPy's spline does, for solvers may look past the end of a run.
+        Beyond the samples of a parameter its spline is extrapolated: solvers may evaluate past the end of a run.
         """
         if isinstance(y, int | float):
             raise TypeError(f"`y` must be a state; got the number {y}: the time comes first, as in system(t, y).")

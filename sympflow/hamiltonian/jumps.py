@@ -18,7 +18,7 @@ import numpy as np
 import sympy as sp
 from sympy.core.relational import Relational
 
-from sympflow.hamiltonian.driving import JUMP, MOST_TURNS, Samples, sampled, with_letters
+from sympflow.hamiltonian.driving import JUMP, MOST_TURNS, Samples, sampled, with_symbols
 
 MISMATCH = 1e-6
 """Share of the values on both sides of a border by which pieces that are joined may differ there: their constants are
@@ -150,7 +150,7 @@ def check_continuous(
     """Refuse an expression that jumps in some of its symbols, where a force would be infinite for no time at all."""
     states = set(states)
     refuse_deltas(argument, f, names)
-    [f], _ = with_letters([f])
+    [f], _ = with_symbols([f])
     for border in borders(f, states):
         try:
             found = _jump_in_states(border, states, values or {})
@@ -296,15 +296,12 @@ class Zeros:
 
     @cached_property
     def _of_time(self) -> Callable[..., np.ndarray]:
-        return _values([self.time], [self.g])
-
-    @cached_property
-    def _slope(self) -> Callable[..., np.ndarray]:
-        return _values([self.time], [sp.diff(self.g, self.time)])
+        """g and g' as a function of times."""
+        return _values([self.time], [self.g, sp.diff(self.g, self.time)])
 
     def slopes(self, t: np.ndarray, step: float) -> np.ndarray:
         """Return g' at zeros (n,), 0 at those that are not simple, near which g changes by far more."""
-        [slope], near = self._slope(t), 1e-3 * step
+        slope, near = self._of_time(t)[1], 1e-3 * step
         return np.where(np.abs(slope) * near > 1e-6 * np.abs(self._of_time(t + near)[0]), slope, 0.0)
 
     def within(self, low: float, high: float, step: float, most: int = MOST_TURNS) -> np.ndarray:
@@ -336,22 +333,22 @@ class Switch:
 
     def __init__(self, border: Border, time: sp.Symbol, samples: Mapping[str, Samples]) -> None:
         self.zeros, self.time, self.samples = Zeros(border.g, time), time, samples
-        terms, letters = with_letters([*border.above, *border.below])
+        terms, symbols = with_symbols([*border.above, *border.below])
         n = len(border.above)
         self._border = Border(border.g, tuple(terms[:n]), tuple(terms[n:]))
-        self._letters = letters
+        self._symbols = symbols
 
     @cached_property
     def _across(self) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """The jump at times (n,), and the size of what jumps, (n, m) at m values of the states."""
         rng = np.random.default_rng(0)
-        letters = self._letters
-        states = sorted(self._border.symbols - {self.time} - set(letters.values()), key=str)
+        symbols = self._symbols
+        states = sorted(self._border.symbols - {self.time} - set(symbols.values()), key=str)
         tried = [_tried(s, (1, 32), rng) for s in states]
-        across = _across(self._border, [self.time, *letters.values(), *states])
+        across = _across(self._border, [self.time, *symbols.values(), *states])
 
         def at(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return across(t[:, None], *(_sampled_at(a, self.time, self.samples, t)[:, None] for a in letters), *tried)
+            return across(t[:, None], *(_sampled_at(a, self.time, self.samples, t)[:, None] for a in symbols), *tried)
 
         return at
 
@@ -431,9 +428,9 @@ def split_impulses(
             refuse_deltas(argument, delta)
         if delta.args[1:] not in ((), (0,)):
             raise ValueError(f"`{argument}` holds {delta}, a derivative of a delta function: use DiracDelta itself.")
-    letters = {delta: sp.Dummy() for delta in H.atoms(sp.DiracDelta)}  # whose arguments stay as they are
-    deltas_of = {letter: delta for delta, letter in letters.items()}
-    summands = [each.xreplace(letters) for each in sp.Add.make_args(H)]
+    dummies = {delta: sp.Dummy() for delta in H.atoms(sp.DiracDelta)}  # whose arguments stay as they are
+    deltas_of = {dummy: delta for delta, dummy in dummies.items()}
+    summands = [each.xreplace(dummies) for each in sp.Add.make_args(H)]
     terms = [term for each in summands for term in sp.Add.make_args(sp.expand(each) if each.has(sp.Dummy) else each)]
     terms = [term.xreplace(deltas_of) for term in terms]
     for term in terms:
@@ -523,13 +520,13 @@ def has_period(
             if (np.round(turns) > 0).all() and (np.abs(turns - np.round(turns)) <= PERIOD_TOLERANCE * turns).all():
                 continue
         factor, rest = sp.factor_terms(term).as_independent(*states, as_Add=False)
-        [f], letters = with_letters([term if time in rest.free_symbols else factor])
-        variables = sorted(f.free_symbols - {time} - set(letters.values()), key=str)
-        values = _values([time, *letters.values(), *variables], [f])
+        [f], symbols = with_symbols([term if time in rest.free_symbols else factor])
+        variables = sorted(f.free_symbols - {time} - set(symbols.values()), key=str)
+        values = _values([time, *symbols.values(), *variables], [f])
         tried = [_tried(s, (64,), rng)[:, None] for s in variables]
         t = period * rng.uniform(-50, 50, 400)
         before, after = (
-            values(s[None], *(_sampled_at(a, time, samples, s)[None] for a in letters), *tried)[0]
+            values(s[None], *(_sampled_at(a, time, samples, s)[None] for a in symbols), *tried)[0]
             for s in (t, t + period)
         )
         with np.errstate(all="ignore"):

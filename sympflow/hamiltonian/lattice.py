@@ -16,8 +16,8 @@ from sympflow.arguments import plain
 from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
-from sympflow.hamiltonian.linear_part import quadratic_terms
-from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, letters, parsed
+from sympflow.hamiltonian.linear_part import RestOfPotential, quadratic_terms
+from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, numbered, parsed
 from sympflow.hamiltonian.poles import LatticePoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, exact
 
@@ -62,7 +62,8 @@ class LatticeHamiltonian(LocalHamiltonian):
         check_memory(float(n_sites) * len(self.fields), "`shape`")
         self.ndof = n_sites * len(self.fields)
         self.params = checked_params(params, self.shape)
-        self._set_letters()
+        self.x, self.p, self.r, self.v, self.w = (numbered(kind, self.fields) for kind in "xprvw")
+        self.c = numbered("c", tuple(self.params))
         self._read(onsite, bond, kinetic)
         self._check_continuous()
         self._check_sizes()
@@ -236,11 +237,6 @@ class LatticeHamiltonian(LocalHamiltonian):
                     terms.append(self.bonds[k].xreplace(at(self.r, r, line[0] if first is None else first)))
         return sp.Add(*terms)
 
-    def _set_letters(self) -> None:
-        fields = self.fields
-        self.x, self.p, self.r, self.v, self.w = (letters(kind, fields) for kind in "xprvw")
-        self.c = letters("c", tuple(self.params))
-
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
         """Names of the positions, momenta and differences of the fields."""
@@ -258,7 +254,9 @@ class LatticeHamiltonian(LocalHamiltonian):
             if name in values:
                 raise ValueError(f"`params` gives a value to {name!r}, which is a coordinate: rename the parameter.")
         if len(set(written)) < len(written):
-            raise ValueError(f"`fields` are {self.fields}, of which the names {', '.join(written)} follow: rename one.")
+            raise ValueError(
+                f"`fields` {self.fields} give the names {', '.join(written)}, not all different: rename one."
+            )
 
         def expression(argument: str, given: Any, kind: str, example: str) -> sp.Expr:
             own = dict(zip(names[kind], getattr(self, kind), strict=True))
@@ -354,8 +352,8 @@ class LatticeHamiltonian(LocalHamiltonian):
                 bonds[k] = V
         if not onsite.any() and not any(kappa.any() for kappa in couplings.values()):
             raise ValueError(
-                "`onsite` and `bond` have no quadratic terms that are written as such, so that there is no linear "
-                "part: take a method that splits into T and V, such as 'srkn6b'."
+                "`onsite` and `bond` have no quadratic terms that are written out, so there is no linear part: "
+                "take a method that splits into T and V, such as 'srkn6b'."
             )
         transform = Transform(self.shape, self.boundary)
         waves = [dispersion(couplings, transform.angles(axis)) for axis in range(len(self.shape))] if couplings else []
@@ -363,7 +361,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         linear = SpectralPart.of_matrices(transform, inverse_mass, np.ascontiguousarray(K), interval)
         rest = bare_copy(self)
         rest.U, rest.bonds = U if U.free_symbols & set(self.x) else sp.S.Zero, bonds
-        return linear, [RestOfLattice(rest)] if rest.U != 0 or bonds else []
+        return linear, [RestOfPotential(rest)] if rest.U != 0 or bonds else []
 
     def _quadratic(self, f: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[np.ndarray, sp.Expr]:
         """K (F, F) of the terms ½ xᵀKx of a site or bond, with numbers and means of arrays; and what remains."""
@@ -495,7 +493,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     def _site_values(
         self, key: str, expressions: Expressions, variables: Sequence[sp.Symbol], *arrays: Sequence[Array]
     ) -> list[Array]:
-        return self._of_letters(key, expressions, variables, [x for row in arrays for x in row], list(self._sites))
+        return self._of_symbols(key, expressions, variables, [x for row in arrays for x in row], list(self._sites))
 
     def _bond_values(
         self,
@@ -507,9 +505,9 @@ class LatticeHamiltonian(LocalHamiltonian):
         *arrays: Sequence[Array],
     ) -> list[Array]:
         given = [x for row in arrays for x in row]
-        return self._of_letters(f"bond {k} {order}", expressions, variables, given, self._of_bonds(axis, k))
+        return self._of_symbols(f"bond {k} {order}", expressions, variables, given, self._of_bonds(axis, k))
 
-    def _of_letters(
+    def _of_symbols(
         self,
         key: str,
         expressions: Expressions,
@@ -536,26 +534,6 @@ class LatticeHamiltonian(LocalHamiltonian):
             return _cut(values, at, 0, n - k)
         before = [_cut(values, at, n - k, n)] if boundary == "periodic" else [_cut(values, at, 0, 1)] * k
         return concatenate([*before, values], at)
-
-
-class RestOfLattice:
-    """U(q) of a lattice, the potential without its linear part, as `sympflow.hamiltonian.parts` has them."""
-
-    of_positions, turns, timed = True, False, False
-
-    def __init__(self, lattice: LatticeHamiltonian) -> None:
-        self.lattice, self.ndof = lattice, lattice.ndof
-
-    def hamiltonian(self, y: Array) -> Array:
-        return self.lattice.potential(y[..., : self.ndof])
-
-    def gradient(self, y: Array) -> Array:
-        q = y[..., : self.ndof]
-        return concatenate([self.lattice.potential_gradient(q), 0 * q])
-
-    def hessian_vector(self, y: Array, v: Array) -> Array:
-        """∇²U(q)·v: (..., 2d), (..., d) to (..., d)."""
-        return self.lattice.hessian_vector(y[..., : self.ndof], v)
 
 
 def _slopes(f: sp.Expr, x: Sequence[sp.Symbol], *along: Sequence[sp.Symbol]) -> list[sp.Expr]:

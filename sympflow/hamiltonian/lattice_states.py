@@ -105,7 +105,7 @@ class LatticeStates:
         Raises
         ------
         ValueError
-            If the system is of another kind.
+            If the system is not a lattice.
         """
         if self.system is not None and system.symbols is not None and system.ndof == self.system.ndof:
             return self
@@ -120,7 +120,7 @@ class LatticeStates:
     def checked(cls, system: Hamiltonian) -> Any:
         if system.local is None or not system.local.shape:
             raise ValueError(
-                f"`domain` LatticeStates is of lattices, and the system {system.name!r} is none: take a sympflow.Box."
+                f"`domain` LatticeStates is for lattices, and {system.name!r} is not one: take a sympflow.Box."
             )
         return system.local
 

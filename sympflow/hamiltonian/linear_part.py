@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arrays import Array, like
+from sympflow.arrays import Array, concatenate, like
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -163,6 +163,37 @@ class LinearPart(NormalModes):
         return np.array(labels)
 
 
+class RestOfPotential:
+    """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a definition by functions; V, where the linear part is left out of that."""
+
+    of_positions, turns = True, False
+
+    def __init__(self, definition: Any, linear: LinearPart | None = None) -> None:
+        self.definition, self.ndof, self.timed = definition, definition.ndof, definition.timed
+        self.K: np.ndarray | None = None if linear is None else linear.stiffness_matrix
+        self.center: Any = 0.0 if linear is None else linear.center
+
+    def hamiltonian(self, y: Array, *t: Any) -> Array:
+        q = y[..., : self.ndof]
+        V = self.definition.potential(q, *t)
+        if self.K is None:
+            return V
+        x = q - like(self.center, q)
+        return V - (x * (x @ like(self.K, q))).sum(-1) / 2
+
+    def gradient(self, y: Array, *t: Any) -> Array:
+        q = y[..., : self.ndof]
+        slope = self.definition.potential_gradient(q, *t)
+        if self.K is not None:
+            slope = slope - (q - like(self.center, q)) @ like(self.K, q)
+        return concatenate([slope, 0 * q])
+
+    def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
+        """∇²U(q)·v: (..., 2d), (..., d) to (..., d)."""
+        product = self.definition.hessian_vector(y[..., : self.ndof], v, *t)
+        return product if self.K is None else product - v @ like(self.K, v)
+
+
 def check_parts_conservative(system: Any) -> None:
     """Refuse a system with friction, which the exact flows of parts of H leave out."""
     remedy = "use the splitting 'kinetic', as of 'verlet'"
@@ -205,7 +236,7 @@ def linear_part(system: Any) -> LinearPart:
     if part is None and not system.autonomous:
         raise ValueError(
             f"`system` {system.name!r} has no linear part: no coordinate has quadratic terms, in q and in p, that do "
-            "not depend on t, and the flow of those that do is not known. Use a scheme on the splitting 'kinetic', "
+            "not depend on t, and terms that do have no known flow. Use a scheme on the splitting 'kinetic', "
             "such as 'srkn11b' or 'kahan_li8', or an implicit method."
         )
     if part is None:
@@ -384,8 +415,8 @@ def turning(system: Any, part: LinearPart | None) -> str | None:
             "state of low potential, without what is not stiff in it"
         )
     return (
-        f"its stiff directions do not turn, but they are none of its quadratic terms, from the stiffest of which "
-        f"they are {np.degrees(angle):.0f}° away. Give the system by functions, Hamiltonian(V, ndof=…, "
+        f"its stiff directions do not turn, but its quadratic terms do not hold them: the stiffest of these is "
+        f"{np.degrees(angle):.0f}° away. Give the system by functions, Hamiltonian(V, ndof=…, "
         "stiffness_matrix=K) with K the curvature ∇²V of the stiff directions"
     )
 

@@ -1,6 +1,6 @@
 """Hamiltonians of any size that are symbolic in one piece, a site and a bond or a pair; vectors stay arrays.
 
-A subclass states the pieces as expressions in a few letters, and adds their values up over the system by array
+A subclass states the pieces as expressions in a few symbols, and adds their values up over the system by array
 operations. Nothing that it holds, but what depends on sites, is as long as the system.
 """
 
@@ -17,13 +17,13 @@ from typing import Any, Self
 import numpy as np
 import sympy as sp
 
-from sympflow.arguments import as_float, check_kept, plain, real_number
+from sympflow.arguments import as_float, check_kept, plain, real_array, real_number
 from sympflow.arrays import Array, is_tensor, like
 from sympflow.hamiltonian.definition import Definition
-from sympflow.hamiltonian.expression import Unreadable, complex_part, of_sympy, read
+from sympflow.hamiltonian.expression import complex_part, stated
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
-__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "letters", "named_values", "parsed"]
+__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "named_values", "numbered", "parsed"]
 
 MOST_SPELLED = 128  # degrees of freedom
 MOST_DENSE = 50_000_000
@@ -84,7 +84,7 @@ class LocalHamiltonian(Definition, ABC):
     def linear_and_rest(self, interval: float) -> tuple[Any, list[Any]]:
         """The quadratic part of H, in its normal modes, and the part that remains, if there is one."""
         raise ValueError(
-            f"`system` is made of {self.loops}, of which no linear part is known: take a method that splits into T and "
+            f"`system` is made of {self.loops}, which have no known linear part: take a method that splits into T and "
             "V, such as 'srkn6b'."
         )
 
@@ -156,7 +156,7 @@ class LocalHamiltonian(Definition, ABC):
         """Refuse a matrix with more than 5e7 entries: ∇²V, or that of the equations of an implicit step."""
         if entries > MOST_DENSE:
             raise ValueError(
-                f"`system` has {self.ndof:,} degrees of freedom, of which {what} is dense, with {entries:.3g} entries: "
+                f"`system` has {self.ndof:,} degrees of freedom, and {what} is dense, with {entries:.3g} entries: "
                 "take a splitting method such as 'srkn6b', which needs no matrix, or a subsystem."
             )
 
@@ -186,7 +186,7 @@ class LocalHamiltonian(Definition, ABC):
         return {}
 
 
-def letters(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
+def numbered(kind: str, names: Sequence[str]) -> tuple[sp.Symbol, ...]:
     """Real symbols kind_0, kind_1, … for things of these names."""
     return tuple(sp.Symbol(f"{kind}_{i}", real=True) for i in range(len(names)))
 
@@ -197,22 +197,16 @@ def parsed(argument: str, expression: str | sp.Expr, symbols: Mapping[str, sp.Sy
         raise TypeError(
             f"`{argument}` must be a string or a SymPy expression such as {example!r}; got {type(expression).__name__}."
         )
-    try:
-        f = read(expression, symbols) if isinstance(expression, str) else sp.sympify(expression)
-        f = of_sympy(f, symbols)
-    except Unreadable as error:
-        raise ValueError(
-            f"`{argument}` cannot be parsed: {str(expression)[:200]!r} ({error}). Write it as {example!r}."
-        ) from None
+    f = stated(argument, expression, symbols, f"Write it as {example!r}")
     unknown = sorted(s.name for s in f.free_symbols if s.name not in symbols)
     if "t" in unknown:
         raise ValueError(
-            f"`{argument}` holds t, and systems by one piece do not depend on the time: give t a value in `params`, or "
+            f"`{argument}` holds t, and such systems do not depend on the time: give t a value in `params`, or "
             "write H out by from_sympy(..., time='t')."
         )
     if unknown:
         raise ValueError(
-            f"`{argument}` holds {', '.join(unknown)}, and its names are {', '.join(symbols)}: give other ones a value "
+            f"`{argument}` holds {', '.join(unknown)}, and its names are {', '.join(symbols)}: give all others a value "
             "in `params`."
         )
     if f.has(sp.zoo, sp.nan, sp.oo) or complex_part(f) is not None:
@@ -241,11 +235,7 @@ def checked_params(params: Any, shape: tuple[int, ...] = (), remedy: str = "") -
                 raise ValueError(f"`params` has {name} = {shown}: give a finite real number{remedy}.")
             checked[name] = value
             continue
-        try:
-            array = np.array(value, dtype=float)
-        except (TypeError, ValueError):
-            shown = reprlib.repr(value)
-            raise TypeError(f"`params` has {name} = {shown}: give a number or an array of them.") from None
+        array = real_array(f"params[{name!r}]", value)
         if array.shape != shape:
             raise ValueError(
                 f"`params` has {name} of shape {array.shape}, and that of the lattice is {shape}: give one value for "

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_kept
+from sympflow.arguments import real_array
 
 
 def inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
     """M⁻¹ in its simplest form for a mass M: a number, (d,) or (d, d)."""
-    M = _real("mass", 1.0 if mass is None else mass)
+    M = real_array("mass", 1.0 if mass is None else mass)
     if M.shape not in ((), (ndof,), (ndof, ndof)):
         raise ValueError(f"`mass` must be a number or have shape ({ndof},) or ({ndof}, {ndof}); got {M.shape}.")
     if M.ndim < 2:
@@ -32,7 +32,7 @@ def inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None
 
 def stiffness_matrix(matrix: ArrayLike, ndof: int) -> np.ndarray:
     """K (d, d), exactly symmetric."""
-    K = _real("stiffness_matrix", matrix)
+    K = real_array("stiffness_matrix", matrix)
     if K.shape != (ndof, ndof):
         raise ValueError(
             f"`stiffness_matrix` must be finite, symmetric and of shape ({ndof}, {ndof}); got shape {K.shape}."
@@ -47,7 +47,7 @@ def damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
         return None
     if isinstance(values, bool | np.bool_):
         raise TypeError(f"`damping` must be a rate, or several; got {values!r}: pass a number such as 0.1.")
-    G = _real("damping", values)
+    G = real_array("damping", values)
     if G.shape not in ((), (ndof,), (ndof, ndof)):
         raise ValueError(
             f"`damping` must be a number, one for each p, of shape ({ndof},), or a matrix of shape ({ndof}, {ndof}); "
@@ -74,18 +74,6 @@ def damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
     if not G.any():
         return None
     return np.array(abs(G)) if G.ndim < 2 else G  # −0.0 is 0
-
-
-def _real(name: str, values: ArrayLike) -> np.ndarray:
-    """The values as an array of floats."""
-    check_kept(name, values)
-    try:
-        array = np.asarray(values)
-        if array.dtype.kind not in "biufO":
-            raise TypeError(f"of {array.dtype}")
-        return array.astype(float)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise TypeError(f"`{name}` must be real numbers; got {values!r}: pass a number or an array of them.") from error
 
 
 def _check_symmetric(name: str, matrix: np.ndarray) -> None:

@@ -31,7 +31,7 @@ def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:
         raise ValueError(_too_many(degree, d))
     kept = _generated(symbols, degree) if symbols.V.is_polynomial(*symbols.q) else _as_even(symbols, degree)
     if not kept:
-        raise ValueError(f"`polynomial` {degree!r} leaves no monomial of those that suit V: take a higher degree.")
+        raise ValueError(f"`polynomial` {degree!r} leaves no monomial that suits V: take a higher degree.")
     if len(kept) > MOST_MONOMIALS:
         raise ValueError(_too_many(degree, d))
     return tuple(sorted(kept, key=lambda m: (sum(m), m)))
@@ -64,8 +64,10 @@ def _product(f: Sequence[int], g: Sequence[int], i: int, j: int) -> tuple[int, .
 def _as_even(symbols: SymbolicHamiltonian, degree: int) -> list[tuple[int, ...]]:
     """The monomials that are as even as V."""
     mirrored = [signs for signs in _signs(symbols.ndof) if _is_even(symbols, signs)]
-    all_of_them = itertools.product(range(degree + 1), repeat=symbols.ndof)
-    return [m for m in all_of_them if 1 <= sum(m) <= degree and all(_sign(signs, m) == 1 for signs in mirrored)]
+    found = [m for m in itertools.product(range(degree + 1), repeat=symbols.ndof) if 1 <= sum(m) <= degree]
+    for signs in mirrored:
+        found = [m for m in found if math.prod(sign**e for sign, e in zip(signs, m, strict=True)) == 1]
+    return found
 
 
 def _too_many(degree: int, d: int) -> str:
@@ -90,10 +92,6 @@ def _is_even(symbols: SymbolicHamiltonian, signs: Sequence[int]) -> bool:
     assert symbols.V is not None
     mirrored = symbols.V.xreplace({s: sign * s for s, sign in zip(symbols.q, signs, strict=True)})
     return sp.expand(mirrored - symbols.V) == 0
-
-
-def _sign(signs: Sequence[int], exponents: Sequence[int]) -> int:
-    return math.prod(sign**e for sign, e in zip(signs, exponents, strict=True))
 
 
 def in_monomials(f: Any, symbols: SymbolicHamiltonian, of: Monomials) -> np.ndarray | None:

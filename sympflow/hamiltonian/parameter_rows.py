@@ -83,12 +83,12 @@ class ParameterRows:
             system = self._formed(tuple(float(kind[index[0] if len(kind) > 1 else 0]) for kind in kinds), int(index[0]))
             assert system.symbols is not None
             form = system.symbols.parametric
-            letters = [rows._part(part) for part in form.meanings]
+            parameters = [rows._part(part) for part in form.meanings]
             swept = any(self._swept(part) for part in form.meanings)
-            if form is system.symbols or not swept or not all(np.isfinite(letter).all() for letter in letters):
+            if form is system.symbols or not swept or not all(np.isfinite(each).all() for each in parameters):
                 yield from (Rows(index[few], own) for few, own, _ in rows.distinct())
                 continue
-            yield Rows(index, system, np.stack([np.broadcast_to(x, index.shape) for x in letters]))
+            yield Rows(index, system, np.stack([np.broadcast_to(x, index.shape) for x in parameters]))
 
     def _formed(self, kinds: tuple[float, ...], row: int) -> HamiltonianSystem:
         """A system of the form of a row, made once; with parameter values of its own the form alone counts."""
@@ -152,8 +152,8 @@ class ParameterRows:
         assert symbols is not None
         H, values = symbols.written
         H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
-        letters = [sp.Symbol(name, real=True) for name in self.values]
-        return generate([printable(H)], [*symbols.q, *symbols.p, *letters], "numpy")
+        parameters = [sp.Symbol(name, real=True) for name in self.values]
+        return generate([printable(H)], [*symbols.q, *symbols.p, *parameters], "numpy")
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""

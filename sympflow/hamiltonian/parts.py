@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, detached, is_tensor, library, like, stack
-from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative, linear_part, read_off
+from sympflow.hamiltonian.linear_part import (
+    LinearPart,
+    RestOfPotential,
+    check_parts_conservative,
+    linear_part,
+    read_off,
+)
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 from sympflow.hamiltonian.times import stage_time
 
@@ -63,28 +69,6 @@ class PartFunctions(SymbolicHamiltonian):
     def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
         """∇²_q H_k(y)·v: (..., 2d), (..., d) to (..., d)."""
         return (self.hessian(y, *t)[..., : self.ndof, : self.ndof] @ v[..., None])[..., 0]
-
-
-class RestOfPotential:
-    """U(q) = V(q) − ½ (q − c)ᵀK(q − c) of a system given by functions."""
-
-    of_positions, turns = True, False
-
-    def __init__(self, system: HamiltonianSystem, linear: LinearPart) -> None:
-        self.system, self.K, self.center, self.ndof = system, linear.stiffness_matrix, linear.center, system.ndof
-        self.timed = system.definition.timed
-
-    def hamiltonian(self, y: Array, *t: Any) -> Array:
-        q = y[..., : self.ndof]
-        x = q - like(self.center, q)
-        return self.system.potential(q, *t) - (x * (x @ like(self.K, q))).sum(-1) / 2
-
-    def gradient(self, y: Array, *t: Any) -> Array:
-        q = y[..., : self.ndof]
-        return concatenate([-self.system.force(q, *t) - (q - like(self.center, q)) @ like(self.K, q), 0 * q])
-
-    def hessian_vector(self, y: Array, v: Array, *t: Any) -> Array:
-        return self.system.hessian_vector(y[..., : self.ndof], v, *t) - v @ like(self.K, v)
 
 
 class ExactParts:
@@ -369,7 +353,7 @@ def exact_parts(system: HamiltonianSystem, expressions: Sequence[str] | None = N
             local, rest = system.local.linear_and_rest(abs(system.t_span[1] - system.t_span[0]))
             return ExactParts(local, rest, system.ndof)
         linear = system.linear_part
-        return ExactParts(linear, [RestOfPotential(system, linear)], system.ndof)
+        return ExactParts(linear, [RestOfPotential(system.definition, linear)], system.ndof)
     if expressions is None:
         return _detected(system)
     return _given(system, tuple(expressions))

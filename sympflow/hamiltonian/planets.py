@@ -22,7 +22,7 @@ from sympflow.hamiltonian.bodies import Pairs, PairsHamiltonian, checked_column
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
-from sympflow.hamiltonian.local import checked_params, letters, parsed
+from sympflow.hamiltonian.local import checked_params, numbered, parsed
 from sympflow.hamiltonian.recorded import NotRecorded
 
 COORDINATES = ("jacobi", "democratic")
@@ -336,7 +336,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
             if more:
                 raise ValueError("`params` are those of `extra`, which is not given: leave them out.")
             return
-        self._letters = dict(zip(("G", "m", *more), letters("c", ("G", "m", *more)), strict=True))
+        self._letters = dict(zip(("G", "m", *more), numbered("c", ("G", "m", *more)), strict=True))
         names = {**{name: sp.Symbol(name, real=True) for name in PLACE}, **self._letters}
         if len(names) < len(PLACE) + 2 + len(more):
             taken = next(name for name in more if name in (*PLACE, "G", "m"))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import reduce
+from operator import add
 from typing import Any
 
 import sympy as sp
@@ -125,7 +127,7 @@ def calculated(f: sp.Basic, value: Callable[[sp.Basic], Any]) -> Any:
     if f.is_number and f.is_extended_real:
         return float(f)
     if f.is_Add:
-        return _sum([value(x) for x in f.args])
+        return reduce(add, map(value, f.args))
     if f.is_Mul:
         return _product(f, value)
     if f.is_Pow:
@@ -169,13 +171,6 @@ def _as_number(f: Any) -> Any:
     """1 and 0 for a condition that is calculated with."""
     conditions = Relational | sp.logic.boolalg.BooleanFunction | sp.logic.boolalg.BooleanAtom
     return sp.Piecewise((1, f), (0, True)) if isinstance(f, conditions) else f
-
-
-def _sum(terms: Sequence[Any]) -> Any:
-    total = terms[0]
-    for x in terms[1:]:
-        total = total + x
-    return total
 
 
 def _product(f: sp.Mul, value: Callable[[sp.Basic], Any]) -> Any:

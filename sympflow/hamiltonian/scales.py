@@ -98,7 +98,8 @@ def fastest_rate(system: Any) -> float | None:
     """The largest |λ| of J∇²H at y0, or the median over the domain; `SLOW`/dt where that is 0, None without states."""
     if system.y0 is None and system.domain is None:
         return None
-    return max(_median_rate(system, t) for t in system.probe_times(system.period)) or SLOW / system.dt
+    rates = [_rates(system, t) for t in system.probe_times(system.period)]
+    return max(float(np.median(each)) if len(each) else 0.0 for each in rates) or SLOW / system.dt
 
 
 def default_step(scene: Any, y: np.ndarray | None = None) -> float:
@@ -131,12 +132,6 @@ def _hessians(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
     with np.errstate(all="ignore"):
         S = np.asarray(system.hessian(y, t))
     return S[np.isfinite(S).all((-1, -2))]
-
-
-def _median_rate(system: Any, t: float) -> float:
-    """The median over the states of the largest |λ| of J∇²H; 0 where none is finite."""
-    rates = _rates(system, t)
-    return float(np.median(rates)) if len(rates) else 0.0
 
 
 def known_scale(system: Any, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:

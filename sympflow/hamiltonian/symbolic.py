@@ -7,7 +7,7 @@ import numbers
 import re
 import reprlib
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from itertools import islice
@@ -30,9 +30,9 @@ from sympflow.hamiltonian.driving import (
     is_spline,
     sampled,
     sampled_parameter,
-    with_letters,
+    with_symbols,
 )
-from sympflow.hamiltonian.expression import FUNCTIONS, Unreadable, complex_part, of_sympy, read
+from sympflow.hamiltonian.expression import COORDINATE, FUNCTIONS, complex_part, of_sympy, stated
 from sympflow.hamiltonian.jumps import (
     MOST_IMPULSES,
     MOST_POINTS,
@@ -186,15 +186,15 @@ class SymbolicHamiltonian(Definition):
             return self
         written, values = self._written
         samples = {s: value for s, value in values.items() if isinstance(value, sampled)}
-        letters = _Letters({s: value for s, value in values.items() if s not in samples})
+        symbols = _ParameterSymbols({s: value for s, value in values.items() if s not in samples})
         try:
-            H = letters.put_into(written.xreplace(samples))
+            H = symbols.put_into(written.xreplace(samples))
         except (TypeError, OverflowError):  # a value that is no real number
             return self
         states = {*self.q, *self.p}
         form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
         used = form.H.free_symbols - states - {self.time}
-        kept = [(part, *letter) for part, letter in letters.found.items() if letter[0] in used]
+        kept = [(part, *symbol) for part, symbol in symbols.found.items() if symbol[0] in used]
         form.meanings, form.parameters, form.values = (tuple(row[i] for row in kept) for i in range(3))
         alike = (
             used == {*form.parameters}
@@ -208,12 +208,12 @@ class SymbolicHamiltonian(Definition):
         key = tuple(names)
         if key not in self._named:
             written, values = self.written
-            letters = {name: sp.Symbol(f"parameter_{i}", real=True) for i, name in enumerate(names)}
-            H = written.xreplace({s: letters.get(s.name, value) for s, value in values.items()})
+            symbols = {name: sp.Symbol(f"parameter_{i}", real=True) for i, name in enumerate(names)}
+            H = written.xreplace({s: symbols.get(s.name, value) for s, value in values.items()})
             states = {*self.q, *self.p}
             form = self.like(sp.Add(*[term for term in sp.Add.make_args(H) if term.free_symbols & states]))
             known = {s.name: s for s in values}
-            form.parameters, form.meanings = tuple(letters.values()), tuple(known[name] for name in names)
+            form.parameters, form.meanings = tuple(symbols.values()), tuple(known[name] for name in names)
             form.values = tuple(float(values[s]) for s in form.meanings)
             self._named[key] = form
         return self._named[key]
@@ -229,10 +229,10 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def parametric_parts(self) -> tuple[list[sp.Expr], set[sp.Symbol]]:
-        """Parts of H that are letters or 0, ±1 in the `parametric` form, and parameters that stay numbers."""
-        letters = _Letters(self.written[1])
-        letters.put_into(self.written[0])
-        return [*letters.found, *letters.numbers], letters.replaced
+        """Parts of H that are symbols or 0, ±1 in the `parametric` form, and parameters that stay numbers."""
+        symbols = _ParameterSymbols(self.written[1])
+        symbols.put_into(self.written[0])
+        return [*symbols.found, *symbols.numbers], symbols.replaced
 
     @property
     def symbols(self) -> SymbolicHamiltonian:
@@ -433,10 +433,10 @@ class SymbolicHamiltonian(Definition):
         def function(x: Array, *times: Array, numbers: Sequence[Any] = ()) -> Array:
             library = library_name(x)
             if library not in generated:
-                wanted, letters = with_letters([printable(f) for f in expressions()])
-                values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in letters]
+                wanted, sample_symbols = with_symbols([printable(f) for f in expressions()])
+                values_of_samples[:] = [(a, sp.lambdify(moving, a.at, modules=[])) for a in sample_symbols]
                 generated[library] = generate(
-                    wanted, (*variables, *moving, *self.parameters, *letters.values()), library
+                    wanted, (*variables, *moving, *self.parameters, *sample_symbols.values()), library
                 )
             columns = [x[..., i] for i in range(n)]
             times = times[: len(moving)]
@@ -487,7 +487,7 @@ def renamed(expression: str | sp.Expr, q: Any, p: Any) -> sp.Expr:
     if len(rows[0]) != len(rows[1]) or len(set(names)) < len(names) or not names:
         raise ValueError(f"`q` and `p` must name d coordinates each, all different; got {q!r} and {p!r}.")
     if isinstance(expression, str):
-        f = _read_text(expression, names)
+        f = stated("expression", expression, {*names, *_AMBIGUOUS})
     else:
         functions = {x: sp.Symbol(str(x.func)) for row in rows for x in row if isinstance(x, sp.Function)}
         f = of_sympy(expression.xreplace(functions), names)
@@ -534,37 +534,13 @@ def parse(expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol 
     return _valued(*_read(expression, checked_params(params), time), time)
 
 
-def _read_text(text: str, names: Collection[str]) -> sp.Expr:
-    coordinates = (w for w in re.findall(r"[A-Za-z_]\w*", text) if _is_coordinate(w))
-    try:
-        return read(text, {*names, *_AMBIGUOUS, *coordinates})
-    except Unreadable as error:
-        shown = text if len(text) <= 200 else text[:200] + "..."
-        raise ValueError(
-            f"`expression` cannot be parsed: {shown!r} ({error}). Write it with these, or pass a SymPy expression."
-        ) from None
-
-
 def _read(
     expression: str | sp.Expr, params: Mapping[str, Any], time: sp.Symbol | None
 ) -> tuple[sp.Expr, dict[sp.Symbol, sp.Expr]]:
     """The expression in real symbols, and the numbers, or functions of t, for those that are parameters."""
     names = {name: sp.Symbol(name, real=True) for name in params}
     meant = {*params, *(() if time is None else (time.name,))}
-    if isinstance(expression, str):
-        H = _read_text(expression, meant)
-    else:
-        try:
-            H = sp.sympify(expression, strict=True)
-        except sp.SympifyError:
-            raise ValueError(
-                f"`expression` must be a scalar expression; got {type(expression).__name__}: pass a string or a SymPy "
-                "expression."
-            ) from None
-    try:
-        H = of_sympy(H, meant)
-    except Unreadable as error:
-        raise ValueError(f"`expression` must be a scalar expression: {error}.") from None
+    H = stated("expression", expression, {*meant, *_AMBIGUOUS} if isinstance(expression, str) else meant)
     _check_real(H)
     for name in params:
         if names[name] not in H.free_symbols:
@@ -592,15 +568,14 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
     if "t" in unknown:
         raise TypeError('`expression` depends on the time t: name it by time="t", for a system that is driven.')
     if unknown:
+        shown = [name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…" for name in unknown]
         meant = "".join(f" {_AMBIGUOUS[name]}." for name in unknown if name in _AMBIGUOUS)
         if any(COORDINATE_LIKE.fullmatch(name) for name in unknown):
             meant += (
                 " Coordinates are q and p, or q1 … qd and p1 … pd: other names are given by "
                 "from_sympy(H, q=['x', 'y'], p=['px', 'py'])."
             )
-        raise ValueError(
-            f"`expression` holds {', '.join(map(_short, unknown))} without a value: give it in `params`.{meant}"
-        )
+        raise ValueError(f"`expression` holds {', '.join(shown)} without a value: give it in `params`.{meant}")
     return H
 
 
@@ -630,7 +605,7 @@ def _check_samples(written: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> Non
             )
 
 
-class _Letters:
+class _ParameterSymbols:
     """Symbols for the parts of H that depend on parameters alone, with the values of these parts."""
 
     def __init__(self, values: Mapping[sp.Symbol, sp.Expr]) -> None:
@@ -712,12 +687,8 @@ def checked_params(params: Mapping[str, Any] | None) -> dict[str, Any]:
     return checked
 
 
-def _short(name: str) -> str:
-    return name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]}…"
-
-
 def _is_coordinate(name: str) -> bool:
-    return re.fullmatch(r"[qp]([1-9][0-9]{0,15})?", name) is not None
+    return COORDINATE.fullmatch(name) is not None
 
 
 def _index(symbol: sp.Symbol) -> int:
@@ -760,15 +731,13 @@ _MAX_POWER = 16  # integer powers up to this are made of products
 _INTEGER_POWER = sp.Function("integer_power", real=True)
 
 
-def _of_machine_numbers(f: sp.Expr) -> sp.Expr:
-    """f with integers that no 64 bits hold, as of a system in SI units, as floating-point numbers."""
-    return f.xreplace({n: sp.Float(int(n)) for n in f.atoms(sp.Integer) if abs(n) >= 2**63})
-
-
 def generate(expressions: Sequence[sp.Expr], variables: Sequence[sp.Symbol], library: str) -> Callable[..., list[Any]]:
     """The values of the expressions, as a function of the variables' arrays of "numpy" or "torch"."""
-    written = _by_products if library == "numpy" else _with_tensor_functions
-    code = [written(_by_reciprocals(_of_machine_numbers(f))) for f in expressions]
+    code = []
+    for f in expressions:
+        large = [n for n in f.atoms(sp.Integer) if abs(n) >= 2**63]  # which no 64 bits hold
+        written = _by_reciprocals(f.xreplace({n: sp.Float(int(n)) for n in large}))
+        code.append(_by_products(written) if library == "numpy" else written.replace(sp.erfc, tensor_erfc))
     sums = [_in_pieces(f) for f in code]
     pieces = [piece for f in sums for piece in f]
     try:
@@ -831,10 +800,6 @@ def _by_reciprocals(f: sp.Expr) -> sp.Expr:
         if f.has(function):
             f = f.replace(function, written)
     return f
-
-
-def _with_tensor_functions(f: sp.Expr) -> sp.Expr:
-    return f.replace(sp.erfc, tensor_erfc)
 
 
 def _integer_power(x: np.ndarray, n: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, check_positive, warn
+from sympflow.arguments import check_flag, check_positive, checked_count, warn
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, domain_of
@@ -54,7 +54,7 @@ class Parameters(dict[str, Any]):
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
         raise TypeError(
-            "`params` of a system are to be read only, for its forces would not change: make a system with other "
+            "`params` of a system are read-only, because its forces would not change: make a system with other "
             "parameters, by its scene's function or by HamiltonianSystem.from_sympy(..., params=...)."
         )
 
@@ -75,7 +75,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         It is traced once, differentiated exactly and compiled; `program` is what was traced. A function that cannot be
         traced, such as one that branches on a value, runs as it is, and `repr` says why: then it must be written with
         torch, or have a `gradient`. With Numba functions (`potential`, `gradient` and `hessian_vector`) the system runs
-        compiled. A function that writes into q is a ValueError; so is a gradient that is none of V: see
+        compiled. A function that writes into q is a ValueError; so is a gradient that is not that of V: see
         `check_functions`.
     hamiltonian : callable, optional
         H(q, p), for a system that is not separable. Give this or `potential`.
@@ -91,7 +91,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         A symmetric K, part ½ qᵀKq of the potential, that methods with an exact linear flow take as their `linear_part`.
         Only with `potential`; of a symbolic system it is read off.
     time : bool
-        True for a driven system: every function has the time t, a number, as its first argument, before q: V(t, q),
+        True for a driven system: the first argument of every function is the time t, a number: V(t, q),
         gradient(t, q), hessian_vector(t, q, v), H(t, q, p); as Numba functions gradient(t, q, out) and
         hessian_vector(t, q, v, out). Functions of the system then take the time after the states.
     period : float, optional
@@ -115,7 +115,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         What energy errors are relative to; the default is |H(y0)|.
     exact : callable, optional
         The solution that starts from `y0` at the beginning of `t_span`, where it is known: exact(t), times (...) to
-        states (..., 2d). Nothing computes with it; it is there to compare with.
+        states (..., 2d). It is for comparison only; no method uses it.
     check : bool
         False leaves out the test of the functions, see `check_functions`, that the first use of the system makes.
 
@@ -171,17 +171,14 @@ class HamiltonianSystem(Hamiltonian, Shown):
                 raise TypeError(
                     f"`{argument}` must be a function; got the text {H!r}: HamiltonianSystem.from_sympy takes it."
                 )
-        number = isinstance(ndof, int | float | np.number) and not isinstance(ndof, bool) and 1 <= ndof <= MOST_DEGREES
-        if ndof is None or not number or int(ndof) != ndof:
-            raise ValueError(
-                f"`ndof` must be a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom; got {ndof!r}."
-            )
+        what = f"a positive integer, at most {MOST_DEGREES:,}, the degrees of freedom"
+        d = checked_count("ndof", ndof, 1, MOST_DEGREES, what)
         if isinstance(time, str):
             raise TypeError(f"`time` must be True for functions with t first; got {time!r}: names are for from_sympy.")
         check_flag("time", time)
-        definition = CallableHamiltonian(int(ndof), potential, hamiltonian, gradient, hessian_vector, check, bool(time))
+        definition = CallableHamiltonian(d, potential, hamiltonian, gradient, hessian_vector, check, bool(time))
         if definition.separable:
-            super().__init__(settled.name, definition, matrices.inverse_mass(mass, int(ndof)), True)
+            super().__init__(settled.name, definition, matrices.inverse_mass(mass, d), True)
         elif mass is not None:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
@@ -215,7 +212,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         Parameters
         ----------
         expression : str or sympy.Expr
-            In a text `pi` is a constant and every other name that is no function a symbol: so are `E` and `I`;
+            In a text `pi` is a constant, and every other name is a symbol or a function: `E` and `I` are symbols;
             Euler's number is exp(1).
         q, p : sequence of str, sympy.Symbol or functions of the time, optional
             The names that coordinates and momenta have in the expression, such as ``q=["x", "y"], p=["px", "py"]`` or
@@ -280,7 +277,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         """A lattice of any size, H = Σ_sites [T(p) + U(q)] + Σ_bonds V(r), by expressions for one site and one bond.
 
         r is the difference along a bond, that of the site with the higher index along its axis less that of the lower:
-        r = q[i + k] − q[i], around the end of a periodic axis too. V need be no even function of it. Compiled loops
+        r = q[i + k] − q[i], around the end of a periodic axis too. V need not be even. Compiled loops
         over sites are generated, whose code does not depend on the size.
 
         Parameters
@@ -458,9 +455,9 @@ class HamiltonianSystem(Hamiltonian, Shown):
     def subsystem(
         self, sites: int | Sequence[int] | None = None, boundary: str | Sequence[str] = "periodic"
     ) -> HamiltonianSystem:
-        """A few sites of a lattice with the same terms: what a flow for a large one is fitted on.
+        """A lattice of a few sites with the same terms, to which flows for large lattices are fitted.
 
-        A ring has as many bonds for each site as the inside of a large lattice, whatever the ends of that are.
+        A ring has as many bonds per site as the inside of a large lattice with any ends.
 
         Parameters
         ----------
@@ -607,8 +604,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
         known = self.definition.has_period(float(period))
         if known is False:
             raise ValueError(
-                f"`period` {period!r} is none of H, which differs a period later: give the period of the drive, such "
-                "as 2*pi/w."
+                f"`period` {period!r} is not a period of H, which differs one period later: give the period of the "
+                "drive, such as 2*pi/w."
             )
         if known is None:
             check_period(self.hamiltonian, self.ndof, self.y0, float(period))
@@ -663,7 +660,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
 
     @property
     def params(self) -> Mapping[str, float]:
-        """The values of the parameters, to be read only: they are part of H, from which all code is generated.
+        """The values of the parameters, read-only: they are part of H, from which all code is generated.
 
         A system with others is made by `HamiltonianSystem.from_sympy`, or by the function of its scene.
         """
@@ -696,11 +693,11 @@ class HamiltonianSystem(Hamiltonian, Shown):
             if name not in known:
                 has = f"which has {', '.join(known)}" if known else "which has none: write H with symbols for them"
                 if name == "damping" and self.damping is not None:
-                    has += "; its friction is none: make a system for each `damping`"
+                    has += "; `damping` is not one: make a system for each value"
                 raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
 
     def with_params(self, **values: float) -> HamiltonianSystem:
-        """The same system with other values of some parameters: what is compiled, in most methods, serves both.
+        """The same system with other values of some parameters. Most methods reuse the compiled code.
 
         The scene stays as it is: `y0`, `t_span`, `dt`, the domain and the friction; of a driven system the `period`
         where H still has it.
@@ -737,8 +734,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
 
         At a few states, y0 (the system's if it is None), near these and of the domain, the gradient, given or
         automatic, is compared with differences of H, and `hessian_vector` with those of the gradient; a batch with
-        single states; a value with the same once more. Nothing is said of states where H is not finite, and of those
-        next to a kink. It costs milliseconds; `check=False` of the system leaves it out.
+        single states; a value with itself. States where H is not finite, or next to a kink, are left out. It takes
+        milliseconds; `check=False` of the system omits it.
 
         Parameters
         ----------
@@ -819,12 +816,12 @@ class HamiltonianSystem(Hamiltonian, Shown):
 
     @cached_property
     def linear_part(self) -> LinearPart:
-        """The quadratic part of H, with K, its frequencies, what remains (U) and the `stiffness`.
+        """The quadratic part of H: K, its frequencies, the remaining potential U, and the `stiffness`.
 
         Raises
         ------
         ValueError
-            If there is none, or its stiff direction turns, with the reason.
+            If there is no such part, or its stiff direction turns.
         """
         from sympflow.hamiltonian.linear_part import linear_part
 

@@ -95,6 +95,6 @@ def check_period(H: Callable[[np.ndarray, float], Any], ndof: int, y0: np.ndarra
     if (change > 0).any():
         i, j = np.unravel_index(change.argmax(), change.shape)
         raise ValueError(
-            f"`period` {period!r} is none of H, which differs by {abs(after - before)[i, j]:.3g} a period after t = "
-            f"{times[i]:.6g} at a state: give the period of the drive, such as 2*pi/w."
+            f"`period` {period!r} is not a period of H, which differs by {abs(after - before)[i, j]:.3g} a period "
+            f"after t = {times[i]:.6g} at a state: give the period of the drive, such as 2*pi/w."
         )

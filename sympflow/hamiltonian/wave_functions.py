@@ -15,7 +15,7 @@ from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.lattice import checked_shape
-from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, checked_params, letters, parsed
+from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, checked_params, numbered, parsed
 from sympflow.hamiltonian.normal_modes import SpectralPart, Transform
 
 
@@ -42,7 +42,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         check_memory(float(self.ndof), "`shape`")
         self.length = _checked_length(length, self.grid)
         self.params = checked_params(params, self.grid)
-        self.c = letters("c", tuple(self.params))
+        self.c = numbered("c", tuple(self.params))
         self.rho, self.k = (sp.Symbol(name, real=True) for name in ("rho", "k"))
         values = dict(zip(self.params, self.c, strict=True))
         for name in ("rho", "k"):
@@ -109,7 +109,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         d = self.ndof
         if np.prod(y.shape, dtype=float) * 2 * d > MOST_DENSE:
             raise ValueError(
-                f"`system` has {d:,} sites, of which a dense ∇²H has {4.0 * d * d:.3g} entries for each state: take a "
+                f"`system` has {d:,} sites, and its dense ∇²H has {4.0 * d * d:.3g} entries for each state: take a "
                 "method with the exact linear flow, such as 'linear_kahan_li6', or fewer sites."
             )
         q, p = self._fields(y)

@@ -175,13 +175,13 @@ class GridRun(Run):
 
     def report_failures(self, outcome: Outcome, finite: np.ndarray, n_run: int) -> None:
         """Set status −1, the time and the message where a trajectory cannot go on; cut a single trajectory there."""
-        grid, reason = self.grid, self.integrator.breakdown
         done = bool((finite >= n_run).all()) if finite.ndim else int(finite) >= n_run
         outcome.finite = done and (outcome.finite or known_finite(outcome.y))
         if outcome.finite:
             if finite.ndim:
                 outcome.status = np.zeros(finite.shape, dtype=int)
             return
+        grid, reason = self.grid, self.integrator.breakdown
         ok = finite_states(outcome.y)  # (n, ...): shorter steps may overflow too
         if lanes(outcome.y):
             if not ok.all():

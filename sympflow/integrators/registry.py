@@ -68,6 +68,8 @@ KINDS = {
     "trained": ("sympflow", "mlp"),
     "Runge–Kutta": ("rk4", "rk45", "dop853"),
 }
+PLAIN = {bool, int, float, str}
+"""Types of options with which a method is made once."""
 _registered: dict[str, type[Integrator]] = {}
 _loaded: dict[type[Integrator], EntryPoint] = {}
 
@@ -207,7 +209,7 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
         )
     if not own:
         return _made(method, lambda: cls(**options))
-    plain = all(type(value) in (bool, int, float, str) for value in options.values())
+    plain = PLAIN.issuperset(map(type, options.values()))
     return _configured(cls, **options) if plain else cls(**options)  # type: ignore[arg-type]
 
 

@@ -191,7 +191,7 @@ def compiled_loops(
     if reason is None:
         try:
             loops = make()
-            if differentiable(y0):
+            if is_tensor(y0) and differentiable(y0):
                 loops.check_reverse()
             return loops
         except ValueError as error:

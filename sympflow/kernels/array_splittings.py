@@ -18,7 +18,7 @@ from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, POINTER, Rows, Value
 from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
-from sympflow.hamiltonian.formulas import Letter
+from sympflow.hamiltonian.formulas import Variable
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.splittings import Splitting, SplittingCode
@@ -159,7 +159,7 @@ class FunctionSplitting(Splitting):
 
     @property
     def parameters(self) -> Sequence[Any]:
-        return [Letter("time")] if self.timed else []
+        return [Variable("time")] if self.timed else []
 
     def values_at(self, time: Any, length: Any, fixed: Sequence[Any]) -> list[Any]:
         return [time]

@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.compiler.control import DOUBLE, POINTER, Code, Module, Rows, Value
 from sympflow.compiler.machine import compiled, host
 from sympflow.compiler.program import Program, adjoint, gradient, traced
-from sympflow.hamiltonian.formulas import Letter, recorded
+from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
 from sympflow.kernels.runs import Numbers, Room, reverse_function
@@ -90,7 +90,7 @@ class Field:
     def program(self) -> Program:
         """f, from q, p, the parameters, the letters and the numbers of Γ."""
         symbols, d, n = self.lettered.symbols, self.ndof, 2 * self.ndof
-        rates = [Letter(f"rate_{i}") for i in range(len(self.rates))]
+        rates = [Variable(f"rate_{i}") for i in range(len(self.rates))]
         inputs = (*symbols.q, *symbols.p, *self.lettered.given, *rates)
         found = recorded([*self.lettered.expressions, *rates], inputs)
         slope = gradient(found.outputs[0], found.inputs[:n])

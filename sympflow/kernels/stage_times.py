@@ -16,7 +16,7 @@ import sympy as sp
 
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import apply, where
-from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled, with_letters
+from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled, with_symbols
 from sympflow.hamiltonian.formulas import evaluator, recorded
 from sympflow.hamiltonian.recorded import check_recorded
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -61,7 +61,7 @@ class Driving:
     def check(self) -> None:
         """Refuse what has no compiled form, by a ValueError."""
         letters = [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
-        for f in (self.form.V, self.form.T, *with_letters(letters)[0]):
+        for f in (self.form.V, self.form.T, *with_symbols(letters)[0]):
             check_recorded(f)
         for samples in self.samples.values():
             check_samples(samples)
@@ -111,7 +111,7 @@ class SymbolicLetters:
     def __init__(self, symbols: SymbolicHamiltonian, expressions: Sequence[sp.Expr]) -> None:
         for samples in symbols.samples.values():
             check_samples(samples)
-        for f in with_letters(list(expressions))[0]:
+        for f in with_symbols(list(expressions))[0]:
             check_recorded(f)
         found: dict[sp.Expr, sp.Symbol] = {}
         time, fixed = symbols.time, {*symbols.parameters}
@@ -124,7 +124,7 @@ class SymbolicLetters:
     def at(self, t: Value, parameters: Sequence[Value]) -> list[Value]:
         """The letters at times t."""
         symbols = self.symbols
-        expressions, sampled = with_letters(list(self.letters.values()))
+        expressions, sampled = with_symbols(list(self.letters.values()))
         of_time = evaluator({symbols.time: t, **dict(zip(symbols.parameters, parameters, strict=True))})
         values = [sampled_value(symbols.samples[f.name_of_samples], f.order, of_time(f.at)) for f in sampled]
         program = recorded(expressions, (symbols.time, *symbols.parameters, *sampled.values()))

@@ -59,7 +59,7 @@ class TableLoops:
         self.kicks, self.friction = np.array(kicks, dtype=np.int64), friction
         self.values = np.array([*form.values, 0.0], dtype=np.float64)
         self._driven = symbols.time is not None
-        mass = form.inverse_mass
+        mass = symbols.inverse_mass
         assert mass is not None
         self._inverse_mass = np.array([[mass[i, j] for j in range(d)] for i in range(d)], dtype=np.float64)
         damping = tuple(tuple(map(float, row)) for row in friction.matrix(d)) if friction else None

@@ -625,9 +625,16 @@ class Search:
             dt=self.data.time_scale,
             **options,
         )
-        p = [f"p{i + 1}" if len(rates) > 1 else "p" for i in range(len(rates))]
-        pushes = [f"-{float(c)!r}*abs({x})*{x}" for c, x in zip(rates, p, strict=True)]
-        return doubled(system, pushes, name=name) if drag else system
+        return doubled(system, self._drag, name=name) if drag else system
+
+    @property
+    def _drag(self) -> list[str] | None:
+        """The forces of quadratic drag that were learned, in words; None without."""
+        model, rates = self.winner[0].model, self.final.theta
+        if model.forces == 0 or model.force is not drags:
+            return None
+        p = [f"p{i + 1}" if model.ndof > 1 else "p" for i in range(model.ndof)]
+        return [f"-{float(c)!r}*abs({x})*{x}" for c, x in zip(rates[-model.forces :], p, strict=True)]
 
     def flow(self, dt: float | None, name: str, session: Session) -> Any:
         """A flow of the H that was learned, or the flow that was fitted itself."""
@@ -654,9 +661,15 @@ class Search:
                 stacklevel=4,
             )
         flow.history = self.history
-        model, theta = self.winner[0].model, self.final.theta
-        damping = theta[model.n - model.forces :].tolist() if model.forces else None
-        flow.recipe = {**flow.recipe, "learned": {**self._learned, "damping": damping}}
+        physical = system.physical if isinstance(system, DoubledSystem) else system
+        scene = {
+            "damping": None if physical.damping is None else physical.damping.tolist(),
+            "time": None if physical.autonomous else "t",
+            "period": physical.period,
+            "drag": self._drag,
+            "physical": physical.expression,
+        }
+        flow.recipe = {**flow.recipe, "learned": {**self._learned, **scene}}
         flow.take_learned(system)
         return flow
 

@@ -113,7 +113,6 @@ def toda_lattice(n: int = 3) -> HamiltonianSystem:
         name="toda_lattice",
         domain=Ball(np.zeros(2 * n), 2.0),
         y0=y0,
-        t_span=(0.0, 100.0),
         dt=0.05,
     )
 

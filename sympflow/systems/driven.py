@@ -45,7 +45,6 @@ def driven_pendulum(amplitude: float = 0.3, frequency: float = 2.7) -> Hamiltoni
         name="driven_pendulum",
         domain=Box([-2.0, -1.6], [2.0, 1.6]),
         y0=[1.0, 0.0],
-        t_span=(0.0, 100.0),
         dt=_dividing(period, 0.05),
     )
 
@@ -82,7 +81,6 @@ def paul_trap(a: float = 0.0, q: float = 0.4) -> HamiltonianSystem:
         name="paul_trap",
         domain=Box([-2.0] * 4, [2.0] * 4),
         y0=[1.0, 0.5, 0.0, 0.0],
-        t_span=(0.0, 100.0),
         dt=math.pi / 64,
         energy_scale=1.0,
     )
@@ -131,7 +129,6 @@ def duffing(
         name="duffing",
         domain=Box([-1.8, -1.3], [1.8, 1.3]),
         y0=[1.0, 0.0],
-        t_span=(0.0, 100.0),
         dt=_dividing(period, 0.05),
         energy_scale=1.0,
     )
@@ -265,7 +262,6 @@ def kicked(K: float = 0.97, modes: int = 3) -> HamiltonianSystem:
         name="kicked",
         domain=Box([0.0, -math.pi], [2 * math.pi, math.pi]),
         y0=[2.0, 0.0],
-        t_span=(0.0, 100.0),
         dt=1 / (2 * modes + 1),
     )
 

@@ -23,20 +23,7 @@ def harmonic_oscillator(omega: float = 1.0) -> HamiltonianSystem:
     The domain is the ellipse H < ω²·1.7²/2, that is |q| < 1.7: with ω = 1 it contains [−1.2, 1.2]². The default
     interval is 100 units of 1/ω and the default step 0.05/ω.
     """
-    _check_frequency(omega)
-    amplitude = 1.7
-    return HamiltonianSystem.from_sympy(
-        "(p**2 + omega**2*q**2)/2",
-        params={"omega": omega},
-        name="harmonic_oscillator",
-        domain=EnergySublevel(
-            (omega * amplitude) ** 2 / 2,
-            Box([-amplitude, -omega * amplitude], [amplitude, omega * amplitude]),
-        ),
-        y0=[1.0, 0.0],
-        t_span=(0.0, 100.0 / omega),
-        dt=0.05 / omega,
-    )
+    return _oscillator("harmonic_oscillator", omega)
 
 
 def damped_oscillator(omega: float = 1.0, damping: float = 0.1) -> HamiltonianSystem:
@@ -58,20 +45,22 @@ def damped_oscillator(omega: float = 1.0, damping: float = 0.1) -> HamiltonianSy
     ----------
     .. [1] L. D. Landau, E. M. Lifshitz, "Mechanics", 3rd ed., Pergamon 1976, § 25.
     """
-    _check_frequency(omega)
+    return _oscillator("damped_oscillator", omega, damping)
+
+
+def _oscillator(name: str, omega: float, damping: float = 0.0) -> HamiltonianSystem:
+    checked_number("omega", omega, "positive and finite, from 1e-100 to 1e100", lambda x: 1e-100 <= x <= 1e100)
+    high = [1.7, 1.7 * omega]
     return HamiltonianSystem.from_sympy(
         "(p**2 + omega**2*q**2)/2",
         params={"omega": omega},
         damping=checked_number("damping", damping, NOT_NEGATIVE, not_negative),
-        name="damped_oscillator",
-        domain=harmonic_oscillator(omega).domain,
+        name=name,
+        domain=EnergySublevel(high[1] ** 2 / 2, Box([-x for x in high], high)),
         y0=[1.0, 0.0],
         t_span=(0.0, 100.0 / omega),
         dt=0.05 / omega,
     )
-
-
-_H = "p**2/2 + 1 - cos(q)"
 
 
 def damped_pendulum(damping: float = 0.1) -> HamiltonianSystem:
@@ -91,32 +80,25 @@ def damped_pendulum(damping: float = 0.1) -> HamiltonianSystem:
     ----------
     .. [1] R. McLachlan, M. Perlmutter, "Conformal Hamiltonian systems", J. Geom. Phys. 39 (2001) 276–300.
     """
+    return _pendulum("damped_pendulum", 1.8, [1.5, 0.0], damping)
+
+
+def _pendulum(name: str, energy: float, y0: list[float], damping: float = 0.0) -> HamiltonianSystem:
+    """A pendulum in the domain below an energy."""
+    q, p = math.acos(max(1 - energy, -1.0)), math.sqrt(2 * energy)
     return HamiltonianSystem.from_sympy(
-        _H,
+        "p**2/2 + 1 - cos(q)",
         damping=checked_number("damping", damping, NOT_NEGATIVE, not_negative),
-        name="damped_pendulum",
-        domain=pendulum().domain,
-        y0=[1.5, 0.0],
-        t_span=(0.0, 100.0),
+        name=name,
+        domain=EnergySublevel(energy, Box([-q, -p], [q, p])),
+        y0=y0,
         dt=0.05,
     )
-
-
-def _check_frequency(omega: float) -> None:
-    checked_number("omega", omega, "positive and finite, from 1e-100 to 1e100", lambda x: 1e-100 <= x <= 1e100)
 
 
 def pendulum() -> HamiltonianSystem:
     """H = p²/2 + 1 − cos q, libration: the domain is H < 1.8 around q = 0 (the separatrix is H = 2)."""
-    q, p = math.acos(1 - 1.8), math.sqrt(2 * 1.8)
-    return HamiltonianSystem.from_sympy(
-        _H,
-        name="pendulum",
-        domain=EnergySublevel(1.8, Box([-q, -p], [q, p])),
-        y0=[1.5, 0.0],
-        t_span=(0.0, 100.0),
-        dt=0.05,
-    )
+    return _pendulum("pendulum", 1.8, [1.5, 0.0])
 
 
 def pendulum_separatrix(energy: float = 2.0) -> HamiltonianSystem:
@@ -137,15 +119,7 @@ def pendulum_separatrix(energy: float = 2.0) -> HamiltonianSystem:
     .. [1] V. I. Arnold, "Mathematical Methods of Classical Mechanics", 2nd ed., Springer 1989, § 4.
     """
     check_positive("energy", energy)
-    p = math.sqrt(5.0)
-    return HamiltonianSystem.from_sympy(
-        _H,
-        name="pendulum_separatrix",
-        domain=EnergySublevel(2.5, Box([-math.pi, -p], [math.pi, p])),
-        y0=[0.0, math.sqrt(2 * energy)],
-        t_span=(0.0, 100.0),
-        dt=0.05,
-    )
+    return _pendulum("pendulum_separatrix", 2.5, [0.0, math.sqrt(2 * energy)])
 
 
 def double_well(energy: float = 0.25) -> HamiltonianSystem:
@@ -174,7 +148,6 @@ def double_well(energy: float = 0.25) -> HamiltonianSystem:
         name="double_well",
         domain=EnergySublevel(0.5, Box([-q, -p], [q, p])),
         y0=[math.sqrt(1 + 2 * math.sqrt(energy)), 0.0],
-        t_span=(0.0, 100.0),
         dt=0.05,
         energy_scale=0.25,
     )
@@ -198,7 +171,6 @@ def quartic() -> HamiltonianSystem:
         name="quartic",
         domain=EnergySublevel(energy, Box([-q1, -q2, -p, -p], [q1, q2, p, p])),
         y0=[0.8, 0.5, 0.3, -0.4],
-        t_span=(0.0, 100.0),
         dt=0.05,
     )
 
@@ -243,7 +215,6 @@ def _scene(name: str, y0: list[float]) -> HamiltonianSystem:
         name=name,
         domain=EnergySublevel(1 / 6, Box([-q1, -0.5, -p, -p], [q1, 1.0, p, p])),
         y0=y0,
-        t_span=(0.0, 100.0),
         dt=0.05,
     )
 
@@ -332,7 +303,6 @@ def nonseparable(amplitude: float = 3.0) -> HamiltonianSystem:
         name="nonseparable",
         domain=EnergySublevel((1 + widest**2) / 2, Box([-widest] * 2, [widest] * 2)),
         y0=[-amplitude, 0.0],
-        t_span=(0.0, 100.0),
         dt=0.05 / math.sqrt(1 + amplitude**2),
     )
 
@@ -358,7 +328,6 @@ def double_pendulum() -> HamiltonianSystem:
         name="double_pendulum",
         domain=EnergySublevel(-2.0, box),
         y0=[0.6, 0.8, 0.0, 0.0],
-        t_span=(0.0, 100.0),
         dt=0.05,
     )
 

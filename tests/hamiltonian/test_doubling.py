@@ -138,13 +138,7 @@ class TestPhysicalSolution:
 
     @pytest.mark.parametrize(
         "metric",
-        [
-            "energy_error",
-            "max_energy_error",
-            "volume_error",
-            "symplecticity_defect",
-            "conformal_defect",
-        ],
+        ["energy_error", "max_energy_error", "volume_error", "symplecticity_defect", "conformal_defect"],
     )
     def test_what_is_not_kept_names_the_metric_that_holds(self, pendulum, metric):
         sol = solve(pendulum, "gauss_legendre6", (0, 1), dt=0.1).physical()
@@ -164,9 +158,9 @@ class TestPhysicalSolution:
 
     def test_a_system_that_is_no_doubled_one_refuses(self):
         sol = solve(systems.pendulum(), "verlet", (0, 1))
-        with pytest.raises(ValueError, match="no doubled one"):
+        with pytest.raises(ValueError, match="is not doubled"):
             sol.physical()
-        with pytest.raises(ValueError, match="no doubled one"):
+        with pytest.raises(ValueError, match="is not doubled"):
             solve(systems.pendulum(), "projected", (0, 1), of="verlet")
 
 

@@ -17,10 +17,12 @@ from sympflow.studies.reports import described
 from sympflow.systems.user_files import from_toml
 from sympflow.testing.checks import CHECKS
 
+made = HamiltonianSystem.from_sympy
+
 W = 1.7
 PERIOD = 2 * np.pi / W
 TEXT = "p**2/2 - cos(q)*(1 + a*cos(w*t))"
-DRIVEN = HamiltonianSystem.from_sympy(
+DRIVEN = made(
     TEXT, time="t", params={"a": 0.3, "w": W}, period=PERIOD, y0=[1, 0], t_span=(0, 10), name="driven_pendulum"
 )
 Y, T = np.array([[0.3, 0.2], [0.5, -0.1]]), np.array([0.3, 4.1])
@@ -64,9 +66,7 @@ SAME = {
     "numba": HamiltonianSystem(
         numba_potential, gradient=numba_gradient, hessian_vector=numba_product, ndof=1, time=True, period=PERIOD
     ),
-    "another name of t": HamiltonianSystem.from_sympy(
-        TEXT.replace("t)", "tau)"), time="tau", params={"a": 0.3, "w": W}
-    ),
+    "another name of t": made(TEXT.replace("t)", "tau)"), time="tau", params={"a": 0.3, "w": W}),
 }
 
 
@@ -99,7 +99,7 @@ def test_derivatives_are_those_of_h_at_each_time():
 
 
 def test_a_force_of_the_time_alone_is_that_of_each_state():
-    pushed = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + q1*cos(t) + q2**2", time="t")
+    pushed = made("(p1**2 + p2**2)/2 + q1*cos(t) + q2**2", time="t")
     y = np.arange(12.0).reshape(3, 4)
     for function in ("gradient", "vector_field", "hessian"):
         found = getattr(pushed, function)(torch.tensor(y), 0.3)
@@ -120,7 +120,7 @@ SPLINES = {
 @pytest.mark.parametrize("kind", SPLINES)
 def test_a_parameter_may_be_a_function_of_t_by_its_samples(kind):
     spline = SPLINES[kind]
-    system = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + 0.3*a)", params={"a": spline}, y0=[1, 0], t_span=(0, 9))
+    system = made("p**2/2 - cos(q)*(1 + 0.3*a)", params={"a": spline}, y0=[1, 0], t_span=(0, 9))
     t = np.array([1.3, 8.7])
     expected = Y[:, 1] ** 2 / 2 - np.cos(Y[:, 0]) * (1 + 0.3 * spline(t))
     np.testing.assert_allclose(system.hamiltonian(Y, t), expected, rtol=1e-14)
@@ -142,16 +142,14 @@ def test_a_parameter_may_be_a_function_of_t_by_its_samples(kind):
 
 def test_other_samples_are_another_system():
     splines = SPLINES["cubic"], CubicSpline(TIMES, np.cos(W * TIMES) * (TIMES < 5))
-    one, two = (HamiltonianSystem.from_sympy("p**2/2 - a*cos(q)", params={"a": a}, t_span=(0, 9)) for a in splines)
+    one, two = (made("p**2/2 - a*cos(q)", params={"a": a}, t_span=(0, 9)) for a in splines)
     assert one.expression != two.expression
     assert not same_system(one.fingerprint, two.fingerprint)
 
 
 def test_the_drift_of_t_dependent_kinetic_energy_is_its_integral():
     text = "(p1 - A*cos(w*t) - a)**2/2 + (1 + t**2/10)*sqrt(1 + p2**2) - cos(q1)*cos(q2)"
-    system = HamiltonianSystem.from_sympy(
-        text, time="t", params={"A": 0.3, "w": W, "a": SPLINES["periodic"]}, t_span=(0, 9)
-    )
+    system = made(text, time="t", params={"A": 0.3, "w": W, "a": SPLINES["periodic"]}, t_span=(0, 9))
     p, s = np.array([0.4, -0.3]), np.array([0.7, -5.0])
     nodes, weights = np.polynomial.legendre.leggauss(400)
     for t, duration in zip(T, s, strict=True):
@@ -170,7 +168,7 @@ def test_the_drift_of_t_dependent_kinetic_energy_is_its_integral():
 
 
 def test_another_drive_is_another_system():
-    others = [HamiltonianSystem.from_sympy(TEXT, time="t", params={"a": 0.3, "w": w}) for w in (1.71, W * (1 + 1e-6))]
+    others = [made(TEXT, time="t", params={"a": 0.3, "w": w}) for w in (1.71, W * (1 + 1e-6))]
     for other in (*others, sympflow.systems.pendulum()):
         assert not same_system(DRIVEN.fingerprint, other.fingerprint)
 
@@ -218,7 +216,6 @@ def test_events_find_the_time():
 SOL = solve(DRIVEN, "rk45", (0, 3), t_eval=np.linspace(0, 3, 40))
 SUBLEVEL = sympflow.EnergySublevel(1.0, sympflow.Box([-1, -1], [1, 1]))
 AW, SAMPLED = {"a": 1, "w": W}, {"a": SPLINES["cubic"]}
-made = HamiltonianSystem.from_sympy
 HERE = "^`system` 'driven_pendulum' is driven"
 
 
@@ -232,7 +229,7 @@ HERE = "^`system` 'driven_pendulum' is driven"
         (lambda: made("p**2/2 + a*q**2", params=AW, time="a"), ValueError, "^`time` 'a' is a"),
         (lambda: made("p**2/2 + t*q**2", time=1), TypeError, "^`time` must be the name"),
         (lambda: made("p**2/2 + q**2", period=1), TypeError, "^`period` only goes with `time`"),
-        (lambda: made(TEXT, time="t", params=AW, period=3.7), ValueError, "^`period` 3.7 is none"),
+        (lambda: made(TEXT, time="t", params=AW, period=3.7), ValueError, "^`period` 3.7 is not a period"),
         (lambda: made(TEXT, time="t", params=AW, period=-1), ValueError, "^`period` must be"),
         (lambda: made("p**2/2 + q**2", params=SAMPLED), ValueError, "^`params` has 'a'"),
         (

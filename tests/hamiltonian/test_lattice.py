@@ -150,7 +150,7 @@ def test_a_pickle_does_not_grow_with_the_lattice():
         ({"bond": None}, "`onsite` or `bond`"),
         ({"bond": {}}, "`onsite` or `bond`"),
         ({"onsite": "p"}, "`onsite` holds p"),
-        ({"onsite": "q*cos(t)"}, "`onsite` holds t, and systems by one piece do not depend on the time"),
+        ({"onsite": "q*cos(t)"}, "`onsite` holds t, and such systems do not depend on the time"),
         ({"kinetic": "p**2/2 + q"}, "`kinetic` holds q"),
         ({"fields": ("u", "u")}, "`fields`"),
         ({"fields": ("u", "r_u"), "bond": "r_u**2", "kinetic": "p_u**2 + p_r_u**2"}, "`fields`"),

@@ -10,6 +10,8 @@ from sympflow.hamiltonian.linear_part import LinearPart
 from sympflow.hamiltonian.parts import ExactParts, SubFlow, exact_parts
 from sympflow.systems import fput, harmonic_oscillator, henon_heiles, pendulum, spring_pendulum, toda_lattice
 
+made = HamiltonianSystem.from_sympy
+
 
 def test_fput_is_read_off():
     part = fput(omega=50.0).linear_part
@@ -31,7 +33,7 @@ def test_the_parts_add_up_to_the_hamiltonian():
 
 
 def test_terms_linear_in_q_move_the_center():
-    part = HamiltonianSystem.from_sympy("p**2/4 + 8*(q - 3)**2 + cos(q)").linear_part
+    part = made("p**2/4 + 8*(q - 3)**2 + cos(q)").linear_part
     assert part.center == pytest.approx([3.0])
     assert part.frequencies == pytest.approx([np.sqrt(8)])
 
@@ -55,7 +57,7 @@ def test_no_quadratic_terms_is_a_clear_error():
 def test_by_hand_it_is_the_same_as_read_off():
     K = np.diag([0.0, 400.0])
     U = "q1**4/4 + (q1 - q2)**4/4"
-    symbolic = HamiltonianSystem.from_sympy(f"(p1**2 + p2**2)/2 + 200*q2**2 + {U}", y0=[1, 0.01, 0.3, 0.2])
+    symbolic = made(f"(p1**2 + p2**2)/2 + 200*q2**2 + {U}", y0=[1, 0.01, 0.3, 0.2])
     by_hand = HamiltonianSystem(
         lambda q: 200 * q[..., 1] ** 2 + q[..., 0] ** 4 / 4 + (q[..., 0] - q[..., 1]) ** 4 / 4,
         ndof=2,
@@ -116,7 +118,7 @@ def test_the_compiled_rotation_does_not_drift(z):
 
 
 def test_hyperbolic_and_free_modes_compiled():
-    system = HamiltonianSystem.from_sympy("(p1**2 + p2**2 + p3**2)/2 + 2*q1**2 - q2**2/2", y0=[1, 0.5, 0.2, 0, 0.3, 1])
+    system = made("(p1**2 + p2**2 + p3**2)/2 + 2*q1**2 - q2**2/2", y0=[1, 0.5, 0.2, 0, 0.3, 1])
     sol = solve(system, "impulse", (0, 3), dt=1.0)
     t = sol.t
     expected = np.array([np.cos(2 * t), 0.5 * np.cosh(t) + 0.3 * np.sinh(t), 0.2 + t])
@@ -124,7 +126,7 @@ def test_hyperbolic_and_free_modes_compiled():
 
 
 def test_an_exponential_is_no_monomial():
-    morse = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 + (1 - exp(-q1))**2 + 200*q2**2", y0=[0.3, 0.01, 0, 0])
+    morse = made("(p1**2 + p2**2)/2 + (1 - exp(-q1))**2 + 200*q2**2", y0=[0.3, 0.01, 0, 0])
     part = morse.linear_part
     assert part.stiffness_matrix.tolist() == [[0, 0], [0, 400]]
     sol = solve(morse, "linear_srkn6b", (0, 5), dt=0.05)
@@ -141,7 +143,7 @@ def displaced(symbolic):
     V = "5000*(q1 - 1)**2 + q2**4/4 + q1*q2"
     y0 = [1.01, 0.5, 0.3, 0.2]
     if symbolic:
-        return HamiltonianSystem.from_sympy(f"(p1**2 + p2**2)/2 + {V}", y0=y0)
+        return made(f"(p1**2 + p2**2)/2 + {V}", y0=y0)
 
     def potential(q):
         return 5000 * (q[..., 0] - 1) ** 2 + q[..., 1] ** 4 / 4 + q[..., 0] * q[..., 1]
@@ -157,12 +159,10 @@ def test_a_system_of_functions_is_split_about_its_equilibrium():
 
 
 def test_words_for_stiff_directions_that_do_not_turn():
-    system = HamiltonianSystem.from_sympy(
-        "(p1**2 + p2**2)/2 + 1e6*(1 - cos(q1)) + q1*q2**3 + q2**2/2", y0=[1e-3, 0.5, 0, 0]
-    )
-    with pytest.raises(ValueError, match=r"do not turn, but they are none of its quadratic terms.*stiffness_matrix=K"):
+    system = made("(p1**2 + p2**2)/2 + 1e6*(1 - cos(q1)) + q1*q2**3 + q2**2/2", y0=[1e-3, 0.5, 0, 0])
+    with pytest.raises(ValueError, match=r"do not turn, but its quadratic terms do not hold them.*stiffness_matrix=K"):
         _ = system.linear_part
-    magnetic = HamiltonianSystem.from_sympy("(p1 + q2)**2/2 + (p2 - q1)**2/2 + 30*q1**2 + q2**4", y0=[1, 0, 0, 0])
+    magnetic = made("(p1 + q2)**2/2 + (p2 - q1)**2/2 + 30*q1**2 + q2**4", y0=[1, 0, 0, 0])
     with pytest.raises(ValueError, match=r"quadratic terms alone\. Use 'implicit_midpoint'"):
         _ = magnetic.linear_part
 
@@ -171,6 +171,6 @@ def test_words_for_stiff_directions_that_do_not_turn():
 def test_the_quadratic_part_is_the_same_in_any_unit_of_length(unit):
     """H with a linear term, whose centre is taken out, in multiples of a unit."""
     H = f"p**2/2 + q**2/2 + 0.1*q**3/({unit!r}) - 0.3*({unit!r})*q"
-    system = HamiltonianSystem.from_sympy(H, y0=[0.2 * unit, 0.0], t_span=(0, 10), dt=0.1)
+    system = made(H, y0=[0.2 * unit, 0.0], t_span=(0, 10), dt=0.1)
     ends = [solve(system, method).y[0, -1] / unit for method in ("linear_srkn11b", "kahan_li8")]
     assert ends == pytest.approx([0.2910658290115, 0.2910658290115], rel=1e-10)

@@ -279,7 +279,7 @@ class TestBadInput:
             ({"masses": [1.0, np.nan]}, "^`masses` must be finite; that of body 1"),
             ({"masses": [1.0]}, "^`masses` must be those of two bodies or more"),
             ({"masses": [[1.0, 1.0]]}, r"^`masses` must have shape \(n,\)"),
-            ({"masses": "heavy"}, r"^`masses` must be an array \(n,\)"),
+            ({"masses": "heavy"}, r"^`masses` must be real numbers"),
             ({"masses": np.broadcast_to(1.0, 10**13)}, "^`masses` has 1e\\+13 degrees of freedom"),
             ({"dim": 4}, "^`dim` must be 1, 2 or 3"),
             ({"box": 4.0, "cutoff": 2.1}, "^`cutoff` 2.1 is longer than half the box, 2:"),

@@ -14,14 +14,16 @@ from numba import njit
 
 from sympflow import Ball, HamiltonianSystem, solve, systems, volume_error
 
+made = HamiltonianSystem.from_sympy
+
 SYSTEMS = {
     "harmonic": systems.harmonic_oscillator(3.0),
     "henon_heiles": systems.henon_heiles(),
     "pendulum": systems.pendulum(),
-    "masses": HamiltonianSystem.from_sympy("p1**2/4 + p1*p2/5 + p2**2/6 + sin(q1)*exp(q2) + sqrt(2)*q2**2"),
-    "relativistic": HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4"),
-    "not separable": HamiltonianSystem.from_sympy("(p**2 + q**2)**2/4 + q*p"),
-    "constant force": HamiltonianSystem.from_sympy("p**2/2 + 3*q"),
+    "masses": made("p1**2/4 + p1*p2/5 + p2**2/6 + sin(q1)*exp(q2) + sqrt(2)*q2**2"),
+    "relativistic": made("sqrt(1 + p**2) + q**4"),
+    "not separable": made("(p**2 + q**2)**2/4 + q*p"),
+    "constant force": made("p**2/2 + 3*q"),
     "callable": HamiltonianSystem(lambda q: (q**4).sum(-1) / 4 + torch.cos(q[..., 0]), ndof=2, mass=[1.0, 2.0]),
     "general": HamiltonianSystem(hamiltonian=lambda q, p: (p**2).sum(-1) / 2 * (1 + q[..., 0] ** 2), ndof=1),
 }
@@ -75,7 +77,7 @@ def test_structure_is_recognised():
 
 
 def test_separable_after_expansion():
-    system = HamiltonianSystem.from_sympy("(p + q)**2/2 - p*q")
+    system = made("(p + q)**2/2 - p*q")
     assert system.separable
     assert system.inverse_mass is None
 
@@ -127,7 +129,7 @@ class TestNumbaFunctions:
     """They serve tensors too, with the derivatives that they are themselves."""
 
     system = numba_pendulum()
-    symbolic = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/4 + 1 - cos(q1) + q1*q2**2")
+    symbolic = made("p1**2/2 + p2**2/4 + 1 - cos(q1) + q1*q2**2")
 
     @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -198,30 +200,22 @@ class TestNumbaFunctions:
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda: HamiltonianSystem.from_sympy("p**2/2 + k*q**2"), ValueError, "^`expression` holds k without a value"),
-        (lambda: HamiltonianSystem.from_sympy("p**2/2 + t*q"), TypeError, "^`expression` depends on the time"),
-        (lambda: HamiltonianSystem.from_sympy("p**2/2 + ("), ValueError, "^`expression` cannot be parsed"),
-        (lambda: HamiltonianSystem.from_sympy("p1**2 + q + q2"), ValueError, "^`expression` mixes q, p"),
-        (
-            lambda: HamiltonianSystem.from_sympy("p**2 + q99999999999"),
-            ValueError,
-            "^`expression` has coordinates of the",
-        ),
-        (lambda: HamiltonianSystem.from_sympy("p1**2 + q" + "9" * 5000), ValueError, "holds q9{39}… without"),
-        (lambda: HamiltonianSystem.from_sympy("3"), ValueError, "^`expression` must depend on q1"),
-        (lambda: HamiltonianSystem.from_sympy("p**2 + q", params={"k": 1}), ValueError, "^`params` has 'k'"),
-        (
-            lambda: HamiltonianSystem.from_sympy("p**2 + q", params={"q": 1}),
-            ValueError,
-            "^`params` gives a value to 'q'",
-        ),
-        (lambda: HamiltonianSystem.from_sympy("p**2 + k*q", params={"k": np.inf}), ValueError, "k = inf"),
-        (lambda: HamiltonianSystem.from_sympy("p**2 + k*q", params={"k": "a"}), ValueError, "^`params` has k = 'a'"),
-        (lambda: HamiltonianSystem.from_sympy(sympy.I * sympy.Symbol("q")), ValueError, "^`expression` is complex"),
-        (lambda: HamiltonianSystem.from_sympy("p**2 + q", y0=[1, 2, 3]), ValueError, r"^`y0` must have shape \(2,\)"),
-        (lambda: HamiltonianSystem.from_sympy("p**2 + q", dt=0), ValueError, "^`dt` must be positive"),
-        (lambda: HamiltonianSystem.from_sympy("p**2 + q", domain=Ball([0.0] * 4, 1)), ValueError, "^`domain` must be"),
-        (lambda: HamiltonianSystem.from_sympy("p**2 + q", energy_scale=0), ValueError, "^`energy_scale` must be"),
+        (lambda: made("p**2/2 + k*q**2"), ValueError, "^`expression` holds k without a value"),
+        (lambda: made("p**2/2 + t*q"), TypeError, "^`expression` depends on the time"),
+        (lambda: made("p**2/2 + ("), ValueError, "^`expression` cannot be parsed"),
+        (lambda: made("p1**2 + q + q2"), ValueError, "^`expression` mixes q, p"),
+        (lambda: made("p**2 + q99999999999"), ValueError, "^`expression` has coordinates of the"),
+        (lambda: made("p1**2 + q" + "9" * 5000), ValueError, "holds q9{39}… without"),
+        (lambda: made("3"), ValueError, "^`expression` must depend on q1"),
+        (lambda: made("p**2 + q", params={"k": 1}), ValueError, "^`params` has 'k'"),
+        (lambda: made("p**2 + q", params={"q": 1}), ValueError, "^`params` gives a value to 'q'"),
+        (lambda: made("p**2 + k*q", params={"k": np.inf}), ValueError, "k = inf"),
+        (lambda: made("p**2 + k*q", params={"k": "a"}), ValueError, "^`params` has k = 'a'"),
+        (lambda: made(sympy.I * sympy.Symbol("q")), ValueError, "^`expression` is complex"),
+        (lambda: made("p**2 + q", y0=[1, 2, 3]), ValueError, r"^`y0` must have shape \(2,\)"),
+        (lambda: made("p**2 + q", dt=0), ValueError, "^`dt` must be positive"),
+        (lambda: made("p**2 + q", domain=Ball([0.0] * 4, 1)), ValueError, "^`domain` must be"),
+        (lambda: made("p**2 + q", energy_scale=0), ValueError, "^`energy_scale` must be"),
         (lambda: HamiltonianSystem(lambda q: q, ndof=0), ValueError, "^`ndof` must be a positive integer"),
         (lambda: HamiltonianSystem(ndof=1), TypeError, "^`potential` or `hamiltonian` must be given"),
         (lambda: HamiltonianSystem(3, ndof=1), TypeError, "^`potential` must be callable"),
@@ -281,7 +275,7 @@ def test_kinks_and_constants_after_differentiation(q):
         "erf(q5)": 2 / np.sqrt(np.pi) * np.exp(-(q**2)),
     }
     kinetic = "(p1**2 + p2**2 + p3**2 + p4**2 + p5**2)/2"
-    system = HamiltonianSystem.from_sympy(" + ".join([kinetic, *terms]))
+    system = made(" + ".join([kinetic, *terms]))
     y = np.repeat([q, 0.2], 5)
     np.testing.assert_allclose(system.gradient(y)[:5], list(terms.values()), rtol=1e-12)
     np.testing.assert_allclose(system.gradient(torch.tensor(y))[:5], list(terms.values()), rtol=1e-12)
@@ -292,7 +286,7 @@ def test_kinks_and_constants_after_differentiation(q):
 
 
 def test_special_functions_run_on_arrays_and_torch_says_that_it_has_none():
-    system = HamiltonianSystem.from_sympy("p**2/2 - besselj(0, q)")
+    system = made("p**2/2 - besselj(0, q)")
     assert system.force(np.array([0.3]))[0] == pytest.approx(-0.148318816)
     with pytest.raises(TypeError, match=r"^`expression` holds besselj, which torch has not"):
         system.force(torch.tensor([0.3]))
@@ -302,7 +296,7 @@ def test_special_functions_run_on_arrays_and_torch_says_that_it_has_none():
 def test_integer_powers_are_those_of_numpy(n):
     """Made of products: n of them may round n times."""
     q = np.linspace(0.3, 2, 50)[:, None]
-    V = HamiltonianSystem.from_sympy(f"p**2/2 + q**({n})").potential
+    V = made(f"p**2/2 + q**({n})").potential
     np.testing.assert_allclose(V(q), q[:, 0] ** n, rtol=abs(n) * np.finfo(float).eps)
 
 
@@ -340,7 +334,7 @@ def test_states_of_another_width_are_refused(name, width):
 class TestParameters:
     """They are part of H, so that a change of theirs would be one of its name alone."""
 
-    system = HamiltonianSystem.from_sympy("p**2/2 + a*q**4", params={"a": 1.0})
+    system = made("p**2/2 + a*q**4", params={"a": 1.0})
 
     @pytest.mark.parametrize(
         "change",
@@ -380,11 +374,11 @@ class TestParameters:
     @pytest.mark.parametrize("value", [1 + 2j, np.complex128(2), 10**400, math.nan, math.inf, True, "2", [1.0], None])
     def test_that_are_no_finite_real_numbers_are_refused(self, value):
         with pytest.raises(ValueError, match=r"^`params` has a = .*: give a finite real number\.$"):
-            HamiltonianSystem.from_sympy("p**2/2 + a*q**2", params={"a": value})
+            made("p**2/2 + a*q**2", params={"a": value})
 
     @pytest.mark.parametrize("value", [2, np.float32(2), np.array(2.0), Fraction(2), sympy.Integer(2)])
     def test_of_every_kind_of_number_are_numbers_of_python(self, value):
-        system = HamiltonianSystem.from_sympy("p**2/2 + a*q**2/2", params={"a": value})
+        system = made("p**2/2 + a*q**2/2", params={"a": value})
         assert type(system.params["a"]) in (int, float)
         assert system.params["a"] == 2 == -system.force(np.array([1.0]))[0]
 
@@ -395,13 +389,13 @@ class TestParameters:
     def test_may_be_named_as_sympy_names_its_own_things(self, name, hint):
         text = f"p**2/2 + {name}*q**2/2"
         with pytest.raises(ValueError, match=rf"^`expression` holds {name} without a value: give it in `params`") as e:
-            HamiltonianSystem.from_sympy(text)
+            made(text)
         assert hint in str(e.value)
-        assert HamiltonianSystem.from_sympy(text, params={name: 4.0}).force(np.array([1.0])) == -4.0
+        assert made(text, params={name: 4.0}).force(np.array([1.0])) == -4.0
 
     def test_pi_is_a_constant_unless_it_is_given(self):
-        assert HamiltonianSystem.from_sympy("p**2/2 + pi*q").force(np.array([1.0])) == -np.pi
-        assert HamiltonianSystem.from_sympy("p**2/2 + pi*q", params={"pi": 2}).force(np.array([1.0])) == -2.0
+        assert made("p**2/2 + pi*q").force(np.array([1.0])) == -np.pi
+        assert made("p**2/2 + pi*q", params={"pi": 2}).force(np.array([1.0])) == -2.0
 
     @pytest.mark.parametrize(
         ("scene", "error"),
@@ -419,7 +413,7 @@ class TestParameters:
     )
     def test_of_the_scene_are_checked_too(self, scene, error):
         with pytest.raises(error, match=f"^`{next(iter(scene))}` must be"):
-            HamiltonianSystem.from_sympy("p**2/2 + q**2/2", **scene)
+            made("p**2/2 + q**2/2", **scene)
 
 
 def test_a_pickle_of_a_version_that_tested_no_functions_is_read():
@@ -435,7 +429,7 @@ def test_a_pickle_of_a_version_that_tested_no_functions_is_read():
 
 def test_long_sums_are_evaluated_in_pieces(monkeypatch):
     monkeypatch.setattr("sympflow.hamiltonian.symbolic.LONGEST_SUM", 3)
-    system = HamiltonianSystem.from_sympy("p**2/2 + " + " + ".join(f"q**2/(q + {k})" for k in range(1, 9)))
+    system = made("p**2/2 + " + " + ".join(f"q**2/(q + {k})" for k in range(1, 9)))
     q, k = np.array([0.3]), np.arange(1, 9)
     assert math.isclose(system.potential(q), (q**2 / (q + k)).sum(), rel_tol=1e-14)
     assert math.isclose(system.potential(torch.from_numpy(q)).item(), (q**2 / (q + k)).sum(), rel_tol=1e-14)
@@ -456,7 +450,7 @@ def test_long_sums_are_evaluated_in_pieces(monkeypatch):
     ],
 )
 def test_parametric_form(text, params, expected, values):
-    symbols = HamiltonianSystem.from_sympy(text, params=params).symbols
+    symbols = made(text, params=params).symbols
     form = symbols.parametric
     assert form.values == values
     assert form is symbols or not form.H.free_symbols - {*form.q, *form.p, *form.parameters}

@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy import special
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 from sympflow import HamiltonianSystem, lyapunov, solve
 from sympflow.compiler.program import gradient
@@ -319,6 +320,7 @@ def writing(q):
 
 
 STATE = {"k": 1.0}
+SPLINE = CubicSpline([-1.0, 0.0, 1.0], [1.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize(
@@ -330,6 +332,12 @@ STATE = {"k": 1.0}
         (lambda q: (q * q).sum() if q.ndim == 1 else (q * q).sum(-1) / 2, ValueError, "gives a batch other values"),
         (lambda q: np.float32(0.1) * q.astype(np.float32).sum(-1), (TypeError, ValueError), "^`potential`"),
         (lambda q: q.detach().numpy().sum(-1), (TypeError, ValueError), "^`potential`"),
+        (
+            lambda q: np.interp(q[..., 0], [-1.0, 0.0, 1.0], [1.0, 0.0, 1.0]),
+            TypeError,
+            "interp has no rule.*`gradient`",
+        ),
+        (lambda q: SPLINE(q[..., 0]), TypeError, "^`potential` could not be traced.*pass `gradient`.* of a spline"),
     ],
 )
 def test_functions_that_are_none_of_the_state_are_refused(function, error, message):

@@ -310,3 +310,25 @@ def test_rows_that_become_infinite_add_nothing_to_derivatives_by_weights():
         sol = solve(system, "verlet", (0, 2), torch.tensor(y0[rows]), dt=0.1, diagnose=False)
         found.append(torch.autograd.grad(sol.y[0].sum() + sol.y[-1].sum(), net[0].weight)[0])
     torch.testing.assert_close(*found, rtol=1e-13, atol=0)
+
+
+ONE = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda y: solve(CUBIC, "verlet", (0, ONE), y, dt=0.1), TypeError, r"^`t_span`.*pass `\.detach\(\)`"),
+        (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=0.1, t_eval=[ONE]), TypeError, r"^`t_eval`.*`\.detach\(\)`"),
+        (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=ONE / 10), ValueError, "^`dt`"),
+        (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=0.1, store="out"), TypeError, r"^`store`.*y0\.detach"),
+        (lambda y: solve(CUBIC, "verlet", (0, 1), y.to("meta"), dt=0.1), TypeError, "^`y0` must be a dense tensor"),
+        (lambda y: CUBIC.with_params(k=ONE), TypeError, r"^`params\['k'\]`.*params=\{name: tensor\}"),
+        (lambda y: HamiltonianSystem.pairs("-1/r", masses=ONE.expand(3)), TypeError, "^`masses`.*hamiltonian="),
+        (lambda y: HamiltonianSystem(lambda q: q.sum(-1), ndof=2, mass=ONE.expand(2)), TypeError, "^`mass`.*detach"),
+        (lambda y: HamiltonianSystem.from_sympy("p**2/2", damping=ONE), TypeError, "^`damping`.*detach"),
+    ],
+)
+def test_what_no_gradient_flows_to_is_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call(torch.tensor(start(CUBIC, ()), requires_grad=True))

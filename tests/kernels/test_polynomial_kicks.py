@@ -61,7 +61,7 @@ def test_monomials_hold_what_the_formula_of_baker_campbell_and_hausdorff_has(sys
 @pytest.mark.parametrize(
     ("system", "message"),
     [
-        (QUARTIC, "`polynomial` 1 leaves no monomial of those that suit V: take a higher degree"),
+        (QUARTIC, "`polynomial` 1 leaves no monomial that suits V: take a higher degree"),
         (HamiltonianSystem(lambda q: (q**2).sum(-1) / 2, ndof=1), r"^`polynomial` is for symbolic systems"),
     ],
 )

@@ -459,11 +459,13 @@ def test_drives_and_drag_are_named_with_the_remedy(forced):
         search.diagnose(Session())
 
 
-def test_drives_and_drag_are_learned(forced):
-    """The orbits of what was learned are those without noise, to a part of it."""
+def test_drives_and_drag_are_learned(forced, tmp_path):
+    """The orbits of what was learned, and is read from a file, are those without noise, to a part of it."""
     y, data, _, options = forced
     flow = sympflow.learn(data, family="polynomial", time_budget=30, dt=0.25, **options)
     assert flow.figures["noise"] == pytest.approx(0.005, rel=0.1)
+    flow.save(tmp_path / "flow.safetensors")
+    flow = sympflow.load(tmp_path / "flow.safetensors")
     starts = flow.system.lift(y[:, :, 0]) if "damping" in options else y[:, :, 0]
     made = sympflow.solve(flow.system, flow, (0, 5), starts, t_eval=T[:26]).y
     made = made[:, [0, 3]] if "damping" in options else made

@@ -147,7 +147,7 @@ def test_momenta_are_those_of_velocities(system, v):
 
 
 def test_velocities_of_no_momenta_are_refused():
-    with pytest.raises(ValueError, match="`v` are velocities of no momenta"):
+    with pytest.raises(ValueError, match="`v`: Newton's method finds no momenta"):
         sympflow.HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**2").momenta(np.zeros((1, 1)), np.full((1, 1), 2.0))
 
 

@@ -47,10 +47,7 @@ SCENES = {
     ),
 }
 
-PAIR_SCENES = {
-    "outer_solar_system": systems.outer_solar_system,
-    "lennard_jones": systems.lennard_jones,
-}
+PAIR_SCENES = {"outer_solar_system": systems.outer_solar_system, "lennard_jones": systems.lennard_jones}
 ALL = {**{name: make for name, (make, _) in SCENES.items()}, **PAIR_SCENES}
 
 

@@ -32,7 +32,9 @@ CASES = {
     "driven": (HamiltonianSystem.from_sympy(DRIVEN[0], **DRIVEN[1]), 2, ()),
     "driven and damped": (HamiltonianSystem.from_sympy(DRIVEN[0], **DRIVEN[1], damping=0.3), 0, ()),
     "damped by a matrix": (
-        HamiltonianSystem.from_sympy("p1**2/2 + p2**2 + q1**2 + q2**4/4 + q1*q2", damping=[[0.3, 0.1], [0.1, 0.2]]),
+        HamiltonianSystem.from_sympy(
+            "p1**2/(2*m) + p2**2 + q1**2 + q2**4/4 + q1*q2", params={"m": 0.8}, damping=[[0.3, 0.1], [0.1, 0.2]]
+        ),
         1,
         (),
     ),
