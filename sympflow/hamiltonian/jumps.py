@@ -296,12 +296,15 @@ class Zeros:
 
     @cached_property
     def _of_time(self) -> Callable[..., np.ndarray]:
-        """g and g' as a function of times."""
-        return _values([self.time], [self.g, sp.diff(self.g, self.time)])
+        return _values([self.time], [self.g])
+
+    @cached_property
+    def _slope(self) -> Callable[..., np.ndarray]:
+        return _values([self.time], [sp.diff(self.g, self.time)])
 
     def slopes(self, t: np.ndarray, step: float) -> np.ndarray:
         """Return g' at zeros (n,), 0 at those that are not simple, near which g changes by far more."""
-        slope, near = self._of_time(t)[1], 1e-3 * step
+        [slope], near = self._slope(t), 1e-3 * step
         return np.where(np.abs(slope) * near > 1e-6 * np.abs(self._of_time(t + near)[0]), slope, 0.0)
 
     def within(self, low: float, high: float, step: float, most: int = MOST_TURNS) -> np.ndarray:

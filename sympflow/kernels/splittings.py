@@ -580,7 +580,7 @@ class SplittingCode(SplittingRollouts):
 
     def columns(self, table: np.ndarray) -> Columns:
         kinds = self._kinds_of(table)
-        return np.ascontiguousarray(self._entries(table, kinds)), kinds
+        return np.ascontiguousarray(table.T if self.timed else self._entries(table, kinds)), kinds
 
     def _kinds_of(self, table: np.ndarray) -> np.ndarray:
         kinds = np.zeros(table.shape[1], dtype=np.int64)
