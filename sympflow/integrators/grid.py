@@ -157,8 +157,10 @@ class Outputs:
     def counts(self, n: int, last: int) -> tuple[int, int]:
         """Return the number of states that the first n outputs take from steps 1 … last, and of those within steps."""
         if self.t_eval is not None:
+            if n == 1:
+                return int(0 < self.count[0] <= last), int(self.remainder[0] != 0)
             count = self.count[:n]
-            count = count[(count > 0) & (count <= last)]
+            count = count[count.searchsorted(0, "right") : count.searchsorted(last, "right")]
             return len(distinct(count)[0]), int(np.count_nonzero(self.remainder[:n]))
         n_steps, at_end = self.grid.n_steps, n == self.n > 0
         multiples = min(max(n - 1, 0), n_steps // self.every, last // self.every)
