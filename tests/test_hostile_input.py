@@ -311,7 +311,7 @@ CALLABLES = {
         from_potential,
         lambda q: np.sin(q.numpy()).sum(-1),
         TypeError,
-        "`potential` (failed on a torch tensor|must return an array of the library)",
+        "`potential` (could not be traced, for it fails on an array|must return an array of the library)",
     ),
     "H raises": (from_hamiltonian, divide, ZeroDivisionError, DIVISION),
     "H None": (from_hamiltonian, lambda q, p: None, ValueError, f"{H} shape"),
@@ -507,7 +507,7 @@ SCENES = {
     "copies of a function that branches": (
         lambda: solve(HamiltonianSystem(hamiltonian=of_numpy, ndof=1, **SCENE), "tao4"),
         TypeError,
-        "`hamiltonian` (must return an array of the library|failed on a torch tensor)",
+        "`hamiltonian` could not be traced, for it branches on a value: write where",
     ),
     "copies with friction": (lambda: solve(DAMPED, "tao4"), ValueError, "`system` 'damped' has friction, .*'tao4'"),
     "compensated Gauss with friction": (
