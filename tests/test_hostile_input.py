@@ -507,7 +507,7 @@ SCENES = {
     "copies of a function that branches": (
         lambda: solve(HamiltonianSystem(hamiltonian=of_numpy, ndof=1, **SCENE), "tao4"),
         TypeError,
-        "`hamiltonian` could not be traced, for it branches on a value: write where",
+        "`hamiltonian` could not be traced, for it branches on a value: write np.where",
     ),
     "copies with friction": (lambda: solve(DAMPED, "tao4"), ValueError, "`system` 'damped' has friction, .*'tao4'"),
     "compensated Gauss with friction": (
