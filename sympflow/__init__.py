@@ -165,6 +165,8 @@ def __getattr__(name: str) -> Any:
 
         close = [] if name.startswith("_") else get_close_matches(name, (*_HOME, *_MODULES, *_ROOMS), 1)
         hint = f". Did you mean {close[0]!r}?" if close else ""
+        if not name.startswith("_") and name in whole_import("sympflow.systems").__all__:
+            hint = f". It is `sympflow.systems.{name}`"
         raise AttributeError(f"module 'sympflow' has no attribute {name!r}{hint}")
     value = getattr(whole_import(f"sympflow.{_HOME[name]}"), name)
     globals()[name] = value

@@ -223,7 +223,7 @@ class Solution(Shown):
             Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
             p₁, and "energy", which is left out where energy is not kept.
         """
-        y = to_numpy(self.y)
+        y, kinds = to_numpy(self.y), (kinds,) if isinstance(kinds, str) else kinds
         error = None
         if self.system.keeps_energy:
             with warnings.catch_warnings(action="ignore"):

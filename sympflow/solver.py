@@ -199,7 +199,7 @@ def solve(
     """
     if is_tensor(y0):
         check_not_traced("solve")
-    system = given_system(system)
+    system = given_system(system, params)
     given, chosen = options, None
     if tol is not None and isinstance(method, str) and "tol" in get(method).options():
         given = {**options, "tol": tol}
@@ -213,6 +213,10 @@ def solve(
     if integrator is None:
         simple = events is None and store is None and params is None and not dense_output
         integrator, chosen = choose_method(system, y_start, options, tol, simple, flows=params is None)
+    if system.y0 is None and (integrator.in_another_time or integrator.keeps) and readable(y_start):
+        from sympflow.hamiltonian.time_transformation import started
+
+        system = started(system, to_numpy(y_start))
     rows = None
     if params is not None:
         rows, y_start = check_params(system, params, y_start, integrator)

@@ -97,7 +97,6 @@ ANSWERED = {
     "kinds": (lambda: sympflow.get("nothing"), ValueError, r"(?s)unknown.*separable H +'verlet'.*Runge–Kutta .*'rk45'"),
     "args": (lambda: solve(H(SPRING), "verlet", y0=[1, 0], args=(1,)), TypeError, "`args` .* `params`"),
     "q0=": (lambda: solve(H(SPRING), "verlet", q0=[1], p0=[0], y0=[1, 0]), TypeError, r"`q0` .*`y0`, \[q, p\]"),
-    "tao8": (lambda: solve(UNSUITED, "tao8", y0=[1, 0]), ValueError, "coupling .*give `omega`"),
     "rtol": (
         lambda: solve(H(SPRING), "verlet", y0=[1, 0], rtol=1e-9),
         TypeError,
@@ -158,3 +157,38 @@ def test_functions_of_orbits_choose_a_method(call, system):
 def test_a_tolerance_chooses_the_step_of_orbits():
     found = sympflow.poincare_section(H(SPRING), "verlet", (0, 50), [1.0, 0.3], tol=1e-6)
     assert found.integrator.dt == pytest.approx(1.4e-3, rel=0.5)
+
+
+STARTED = [
+    ("p**2/(2*m) + k*q**2/2", None, (0, 1e-12), [1e-10, 0.0], {"params": {"m": 1e-26, "k": 10.0}}),
+    ("p**2/2 + 3e4*q**2/2 + q**4", None, (0, 1), [1.0, 0.0], {}),
+    ("p**2/2 + k*q**2/2", None, (0, 1), [1.0, 0.0], {"params": {"k": 4e4}}),
+    (
+        "(p1**2 + p2**2)/(2*m) - G*m/sqrt(q1**2 + q2**2)",
+        None,
+        (0, 3e7),
+        [1.5e11, 0, 0, 1.8e29],
+        {"params": {"m": 6e24, "G": 1.33e20}},
+    ),
+    ("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", None, (0, 20), [0.1, 0, 0, 4.3588989], {"tol": 1e-9}),
+    ("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2)", "log_kahan_li8", (0, 1), [1.0, 0, 0, 1.8], {}),
+    ("p**2*(1 + q**2)/2 + q**2/2", "tao8", (0, 10), [1.0, 0.0], {"tol": 1e-9}),
+]
+
+
+@pytest.mark.parametrize(("expression", "method", "span", "y0", "options"), STARTED)
+def test_scales_are_those_of_the_states_of_the_call(expression, method, span, y0, options):
+    """A formula has no state of its own: steps and clocks take theirs from y0."""
+    sol = solve(expression, method, span, y0, **options)
+    assert sol.success
+    params = options.get("params")
+    atol = 1e-12 * min(x for x in np.abs(y0) if x)
+    exact = solve(H(expression, params=params, y0=y0), "dop853", span, rtol=1e-12, atol=atol)
+    assert exact.success
+    size = np.abs(exact.y).max(-1)
+    assert (np.abs(sol.y[:, -1] - exact.y[:, -1]) < 1e-6 * size).all()
+
+
+def test_params_of_a_formula_may_be_of_each_trajectory():
+    sol = solve("p**2/2 + k*q**2/2", None, (0, 1), [[1, 0], [1, 0]], params={"k": [1.0, 4.0]})
+    np.testing.assert_allclose(sol.y[:, 0, -1], np.cos([1.0, 2.0]), rtol=1e-9)

@@ -249,7 +249,8 @@ FORMULA = re.compile(r"\*|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
 def _formula(text: str) -> Callable[..., HamiltonianSystem]:
     """The function that makes a system of H as text, by the values of its other symbols."""
     known = {*FUNCTIONS, "pi"}
-    words = dict.fromkeys(w for w in re.findall(r"[A-Za-z_]\w*", text) if w not in known)
+    symbols = re.sub(r"(?<![\w.])(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", " ", text)
+    words = dict.fromkeys(w for w in re.findall(r"[A-Za-z_]\w*", symbols) if w not in known)
 
     def make(**values: float) -> HamiltonianSystem:
         if missing := [f"--{name}" for name in names if name not in values]:
@@ -257,6 +258,11 @@ def _formula(text: str) -> Callable[..., HamiltonianSystem]:
         return HamiltonianSystem.from_sympy(text, params=values)
 
     names = [word for word in words if not re.fullmatch(r"[qp]\d*", word)]
+    if len(names) == len(words) > 0:
+        raise Usage(
+            f"`system` {text!r} has no coordinates: they are q and p, or q1 … qd and p1 … pd. Write it with these in "
+            f"place of {', '.join(names)}."
+        )
     given = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=float) for name in names]
     make.__signature__ = inspect.Signature(given)  # type: ignore[attr-defined]
     return make

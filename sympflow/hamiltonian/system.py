@@ -632,14 +632,17 @@ class HamiltonianSystem(Hamiltonian, Shown):
     @property
     def scene(self) -> Scene:
         """The scene for other parameters: an `exact` solution belongs to those of the system, and is left out."""
-        return Scene(self.name, self.domain, self.y0, self.t_span, self.dt, self.energy_scale)
+        dt = None if self.step_is_open else self.dt
+        return Scene(self.name, self.domain, self.y0, self.t_span, dt, self.energy_scale)
 
     @property
     def dt(self) -> float:
         """The default step of the fixed-step classical methods: the one given, or by the fastest motion."""
         if self._dt is None:
-            from sympflow.hamiltonian.scales import default_step
+            from sympflow.hamiltonian.scales import STEP, default_step
 
+            if self.step_is_open:  # a run chooses it at its own states
+                return STEP
             self._dt = default_step(self)
         return self._dt
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sympflow.arguments import as_float, check_t_span
 from sympflow.arrays import Array, readable, to_numpy
-from sympflow.hamiltonian.scales import default_step, known_scale, smallest_size, weights
+from sympflow.hamiltonian.scales import MOST_DENSE, default_step, known_scale, smallest_size, weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
@@ -73,6 +73,8 @@ def _candidates(
         yield "srkn11b", "the kinetic energy is ½ pᵀM⁻¹p"
     if system.separable:
         yield "kahan_li8", "H is separable"
+    if system.ndof > MOST_DENSE:
+        yield "kahan_li6_parts", "H is a sum of parts that are solved exactly"
     yield "gauss_legendre6", "H is not separable" if not system.separable else "an implicit method applies"
     yield "dop853", "no symplectic method applies"
 
@@ -157,11 +159,12 @@ def choose_step(
     Parameters
     ----------
     system : HamiltonianSystem
-    method : str or Integrator
-        A method of fixed steps, such as "srkn11b".
+    method : str or Integrator, or None
+        A method of fixed steps, such as "srkn11b"; None for the one that suits the system, as for `solve`.
     tol : float
         The largest error: |H − H₀| relative to `system.energy_scale`, else to |H₀|. Where H is not conserved, with
-        friction or a drive, the difference of H from that of a run with half of the step takes its place.
+        friction or a drive, the difference of H from that of a run with half of the step takes its place. The methods
+        on the logarithmic clock may keep H where the time is wrong: their error is that of the states.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
@@ -183,9 +186,13 @@ def choose_step(
     --------
     >>> dt = sympflow.choose_step(sympflow.systems.henon_heiles(), "srkn11b", 1e-9)
     """
-    integrator = build(method, {})
     system = given_system(system)
+    if y0 is None and system.y0 is None:
+        raise ValueError(
+            f"`y0` is needed: {system.title} has no initial state. Pass [q, p], {2 * system.ndof} numbers."
+        )
     y = np.asarray(system.y0 if y0 is None else to_numpy(y0), dtype=float)
+    integrator = build(method, {}) if method is not None else choose_method(system, y, {}, flows=False)[0]
     if y.ndim == 0 or y.shape[-1] != 2 * system.ndof:
         raise ValueError(f"`y0` must have shape (..., {2 * system.ndof}), states [q, p]; got {y.shape}.")
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, False)
@@ -264,7 +271,7 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[fl
     scale = np.where(np.isnan(scale), 1.0, scale)
     factors, size = weights(system), smallest_size(system, y0)
 
-    compiled = False
+    compiled, clock = False, integrator.in_another_time  # on a clock H is kept even where the time is not
 
     def run(h: float, end: float, n: int) -> tuple[np.ndarray, np.ndarray]:
         t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
@@ -282,11 +289,11 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[fl
         end, n = min(n * h, length), -(-n // -(-n // TRIAL_STEPS))
         t, y = run(h, end, n)
         with np.errstate(all="ignore"):
-            if tol_of == "energy" and conserved:
+            if tol_of == "energy" and conserved and not clock:
                 found = np.abs(np.asarray(system.hamiltonian(y)) - np.asarray(system.hamiltonian(y0))) / scale
             else:
                 _, finer = run(h / 2, end, n)
-                if tol_of == "state":
+                if tol_of == "state" or clock:
                     found = np.abs(factors * (y - finer)).max(-1) / (factors.max() * size)
                 else:
                     times = t.reshape(-1, *[1] * (y0.ndim - 1)) if y0.ndim > 1 else t

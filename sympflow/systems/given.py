@@ -5,15 +5,22 @@ from __future__ import annotations
 import difflib
 import re
 import sys
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
 
 
-def given_system(system: Any) -> HamiltonianSystem:
-    """Return the system that an argument means: one, the name of a scene, or H as `from_sympy` takes it."""
+def given_system(system: Any, params: Mapping[str, Any] | None = None) -> HamiltonianSystem:
+    """Return the system that an argument means: one, the name of a scene, or H as `from_sympy` takes it.
+
+    The first values of `params` are those of the symbols of H.
+    """
     if isinstance(system, HamiltonianSystem):
         return system
     if isinstance(system, str):
@@ -29,10 +36,10 @@ def given_system(system: Any) -> HamiltonianSystem:
                 f"`system` {system!r} is the name of no scene. {hint}There are {', '.join(available())}; a formula "
                 "such as 'p**2/2 + q**2/2' is a system too."
             )
-        return HamiltonianSystem.from_sympy(system)
+        return HamiltonianSystem.from_sympy(system, params=_first(params))
     sympy = sys.modules.get("sympy")
     if sympy is not None and isinstance(system, sympy.Basic | sympy.MatrixBase):
-        return HamiltonianSystem.from_sympy(system)
+        return HamiltonianSystem.from_sympy(system, params=_first(params))
     what, remedy = type(system).__name__, "take a scene of sympflow.systems, or H as text, 'p**2/2 + q**2/2'"
     if callable(system):
         of_scene = getattr(system, "__module__", "").startswith("sympflow.systems")
@@ -44,3 +51,12 @@ def given_system(system: Any) -> HamiltonianSystem:
             "HamiltonianSystem(potential=V, ndof=d) for H = ½|p|² + V(q)"
         )
     raise TypeError(f"`system` must be a HamiltonianSystem; got {what}: {remedy}.")
+
+
+def _first(params: Mapping[str, Any] | None) -> dict[str, float] | None:
+    """The first value of each of some parameters, which may be arrays or tensors."""
+    if not isinstance(params, Mapping):
+        return None
+    return {
+        name: to_numpy(x).ravel()[0] if is_tensor(x) else np.ravel(x)[0] for name, x in params.items() if np.size(x)
+    }

@@ -190,6 +190,7 @@ def test_a_blow_up_prints_no_warnings_of_numpy(tmp_path):
         (["train", "pendulum", "--resume", "none.pt"], "is not a file: pass the path that was given as `--checkpoint`"),
         (["learn", "data.csv", "--observed", "p"], "`--observed` must be one of qp, qv, q; got 'p'"),
         (["solve"], "`system` is missing"),
+        (["solve", "px**2/2 + x**2/2", "--y0", "1,0"], "they are q and p, or q1 … qd and p1 … pd"),
         (["solve", "harmonic-oscillator:omega=1:omega=2"], "`omega` is given twice"),
         (["solve", "harmonic-oscillator", "--omega", "1", "--omega", "2"], "`--omega` is given twice"),
         (["solve", "pendulum", "--method", "verlet:"], "behind a colon is not an option with a value"),
@@ -445,6 +446,8 @@ def test_solve_takes_a_formula_and_the_values_of_its_symbols():
     )
     assert result.exit_code == 0
     assert float(re.search(r"largest energy error ([0-9.e-]+)", result.output)[1]) <= 1e-9
+    stiff = run("solve", "p**2/2 + 1e6*q**2/2 + .5e-3*q", "--y0", "1,0", "--t-end", "0.01")
+    assert stiff.exit_code == 0
     missing = run("solve", "p**2/2 + k*q**4/4", "--y0", "1,0")
     assert missing.exit_code == 2
     assert "`--k` is missing" in missing.output
