@@ -376,7 +376,7 @@ def like(values: Any, x: Array) -> Array:
 def beside(t: Any, x: Array) -> Any:
     """Return a time, a number or (...), as it stands beside x: of a tensor as doubles on its device."""
     if not is_tensor(x):
-        return t
+        return np.float64(t) if type(t) is float else t  # whose 1/t at 0 is infinite, and no error
     import torch
 
     return torch.as_tensor(t, dtype=torch.float64, device=x.device)

@@ -214,7 +214,7 @@ def solve(
         simple = events is None and store is None and params is None and not dense_output
         integrator, chosen = choose_method(system, y_start, options, tol, simple, flows=params is None)
     if system.y0 is None and (integrator.in_another_time or integrator.keeps) and readable(y_start):
-        from sympflow.hamiltonian.time_transformation import started
+        from sympflow.hamiltonian.scales import started
 
         system = started(system, to_numpy(y_start))
     rows = None

@@ -8,6 +8,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.hamiltonian.definition import bare_copy
+
 STATES = 64
 """States of a domain at which Hessians are taken, where there is no y0."""
 MOST_DENSE = 200
@@ -132,6 +134,15 @@ def _hessians(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
     with np.errstate(all="ignore"):
         S = np.asarray(system.hessian(y, t))
     return S[np.isfinite(S).all((-1, -2))]
+
+
+def started(system: Any, y0: np.ndarray) -> Any:
+    """Return the system, where it has no initial state a copy with the first of y0 (..., 2d): its scales are those."""
+    if system.y0 is not None:
+        return system
+    other = bare_copy(system)
+    other.y0 = y0.reshape(-1, y0.shape[-1])[0].astype(float)
+    return other
 
 
 def known_scale(system: Any, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:

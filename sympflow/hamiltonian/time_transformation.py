@@ -12,7 +12,7 @@ import numpy as np
 from sympflow.arguments import real_number
 from sympflow.arrays import Array, concatenate, library
 from sympflow.arrays import like as as_like
-from sympflow.hamiltonian.definition import Definition, bare_copy
+from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.scene import Scene
@@ -102,13 +102,6 @@ def time_transformed(
         transformed.dt = system.dt * scale
         transformed.t_span = (0.0, (system.t_span[1] - system.t_span[0]) * scale)
     return transformed
-
-
-def started(system: HamiltonianSystem, y0: np.ndarray) -> HamiltonianSystem:
-    """A copy of a system without an initial state, with the first of the states y0 (..., 2d), for scales of methods."""
-    other = bare_copy(system)
-    other.y0 = y0.reshape(-1, y0.shape[-1])[0].astype(float)
-    return other
 
 
 def default_shift(system: HamiltonianSystem) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import warnings
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,9 +213,22 @@ def of_dataset(data: Any) -> list[Found]:
 
 def opened(path: Path) -> Any:
     """The table or Dataset of a file."""
-    ending = path.suffix.lower()
     if not path.exists():
         raise FileNotFoundError(f"`data` names the file {str(path)!r}, which does not exist: check the path.")
+    try:
+        return _of_file(path)
+    except (ValueError, OSError, MemoryError, EOFError, zipfile.BadZipFile) as error:
+        if str(error).startswith("`data`"):
+            raise
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(
+            f"`data` names the file {str(path)!r}, which cannot be read ({reason}): check that it is whole, "
+            "a text in UTF-8 with as many columns in each row, or arrays of numbers."
+        ) from error
+
+
+def _of_file(path: Path) -> Any:
+    ending = path.suffix.lower()
     if ending in (".csv", ".tsv", ".txt"):
         pandas = imported("pandas", "Reading a table")
         if ending == ".csv":
@@ -224,7 +238,7 @@ def opened(path: Path) -> Any:
             warnings.simplefilter("ignore")
             return pandas.read_csv(path, sep=sep, comment="#", **_header(path))
     if ending == ".npz":
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return dict(arrays)
     if ending in (".parquet", ".pq"):
         pandas = imported("pandas", "Reading a table")

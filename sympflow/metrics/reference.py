@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sympflow.arrays import to_numpy
-from sympflow.hamiltonian.scales import distance, smallest_size
+from sympflow.hamiltonian.scales import distance, smallest_size, started
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.solver import solve
 
@@ -63,6 +63,7 @@ def reference(
         Accuracy that is enough.
     """
     y0 = to_numpy(y0).astype(float)
+    system = started(system, y0)
     if not system.keeps_energy:
         return _dop853(system, t_span, y0, t, target)
     exact = _linear_flow(system, t - t_span[0], y0)

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_counts, check_dt, check_t_eval, check_t_span
+from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.scales import started
 from sympflow.hamiltonian.system import HamiltonianSystem, parameters_text
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.problems import check_y0
@@ -132,6 +134,7 @@ def compare(
     if t0 == t1:
         raise ValueError("`t_span` has length zero, so there is nothing to compare: choose a later end.")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
+    system = started(system, to_numpy(start))
     t = _instants(reference, t0, t1, n_outputs, dt or system.dt)
     attempts.check_progress(progress)
     given = None if reference is None else _given(reference, system, t0, start, t)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_counts, check_t_span, positive_numbers
-from sympflow.hamiltonian.scales import smallest_size
+from sympflow.arrays import to_numpy
+from sympflow.hamiltonian.scales import smallest_size, started
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.problems import check_y0
@@ -111,6 +112,7 @@ def work_precision(
     if t0 == t1:
         raise ValueError("`t_span` has length zero, so there is nothing to measure: choose a later end.")
     starts = [check_y0(system, system.y0 if y0 is None else y0, None)]
+    system = started(system, to_numpy(starts[0]))
     if starts[0].ndim != 1:
         raise ValueError("`y0` must be one state: give several as `batch`.")
     if batch is not None:

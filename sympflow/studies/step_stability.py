@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span, positive_numbers
 from sympflow.arrays import is_tensor, to_numpy
-from sympflow.hamiltonian.scales import smallest_size
+from sympflow.hamiltonian.scales import smallest_size, started
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
 from sympflow.integrators.problems import check_y0
@@ -149,7 +149,8 @@ def stability(
         raise ValueError(f"`dtypes` must be a list of 'float32' and 'float64'; got {dtypes!r}.")
     rows: list[Row] = []
     found: list[StepLimit] = []
-    for one in family:
+    for given in family:
+        one = given if y0 is None else started(given, initial_states(given, y0))
         span = check_t_span(one.t_span if t_span is None else t_span)
         if span[0] == span[1]:
             raise ValueError("`t_span` has length zero, so there is nothing to run: choose a later end.")
@@ -184,6 +185,7 @@ def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarra
         raise ValueError(f"`y0` must have shape (2d,) or (n, 2d); got {given.shape}.")
     if given.ndim == 2:
         return given
+    system = started(system, given)
     times = system.dt * np.array(PHASES)
     sol = solve(
         system,

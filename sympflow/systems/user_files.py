@@ -227,7 +227,7 @@ def _is_number(value: Any) -> bool:
 
 def _text(file: Path) -> str:
     try:
-        return file.read_text(encoding="utf-8")
+        return file.read_text(encoding="utf-8-sig")  # Windows puts a mark at the beginning
     except FileNotFoundError as error:
         raise ValueError(f"`system` {str(file)!r}: there is no such file. Name one that is there.") from error
     except OSError as error:

@@ -331,3 +331,19 @@ def test_the_unit_of_a_column_goes_before_that_of_all():
 def test_what_is_no_data_is_refused(data):
     with pytest.raises((TypeError, FileNotFoundError), match="`data"):
         Trajectories.read(data)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("latin.csv", "t,q,p,é\n0,1,2,3\n".encode("latin-1")),
+        ("empty.csv", b""),
+        ("ragged.csv", b"t,q,p\n0,1,2\n1,2,3,4,5\n"),
+        ("damaged.npz", b"PK\3\4junk"),
+        ("no.npz", b"junk"),
+    ],
+)
+def test_files_that_cannot_be_read_are_named(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=rf"^`data` names the file .*{name}.*cannot be read .*check that it is whole"):
+        Trajectories.read(tmp_path / name)
