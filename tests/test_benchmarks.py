@@ -245,12 +245,12 @@ def test_a_fragment_says_where_it_is_from(tmp_path, monkeypatch):
 
 
 def test_every_fragment_has_a_command_that_writes_it():
-    """The names in the sources; stability, the ideas and driven systems put a prefix before those of their sections."""
+    """The names in the sources; stability, ideas, driven and brought systems put a prefix before their sections."""
     sources = "".join(path.read_text(encoding="utf-8") for path in BENCHMARKS.rglob("*.py"))
     for path in (BENCHMARKS.parent / "docs" / "measured").glob("*.md"):
         if path.stem == "flows":  # the table of `sympflow flows`
             continue
-        section = path.stem.removeprefix("stability-").removeprefix("ideas-").removeprefix("driven-")
+        section = re.sub(r"^(stability|ideas|driven|bring)-", "", path.stem)
         section = re.sub(r"^stiff-fput-\d+", "stiff-fput-", section)
         section = re.sub(r"^peers-(one|batch)", "peers-", section)
         section = re.sub(r"^large-flows-\d+", "large-flows", section)
