@@ -75,6 +75,8 @@ def learn(
         from sympflow.learning.learner import learn as learn_flow
         from sympflow.learning.trajectories import Trajectories
 
+        if damping and drag:
+            raise ValueError("`--drag` is learned in place of `--damping`: leave out one of them.")
         ready_file(to)
         if plot is not None:
             ready_file(plot, "--plot")
