@@ -147,7 +147,7 @@ def frequencies(
     most = max(1, MOST_VALUES // (len(times) * (2 * system.ndof + 4 * n)))
     for start in range(0, len(rows), most):
         sol = solve(
-            system,
+            orbits.system,
             orbits.integrator,
             orbits.t_span,
             rows[start : start + most],

@@ -112,7 +112,7 @@ def poincare_section(
         if not whole_periods(orbits.t_span, T):
             t0, t1 = orbits.t_span
             raise ValueError(f"`t_span` ({t0:g}, {t1:g}) is shorter than the period {T:g}: choose a later end.")
-        seen = stroboscopic(orbits.integrator, system, orbits.t_span, orbits.rows, T)
+        seen = stroboscopic(orbits.integrator, orbits.system, orbits.t_span, orbits.rows, T)
         return _section(orbits, seen, T)
     index = _check_coordinate(0 if coordinate is None else coordinate, system.ndof)
     direction = 1 if direction is None else direction
@@ -130,7 +130,7 @@ def poincare_section(
     sample = system.dt if sample is None else sample
     checked_number("sample", sample, "a positive number, a time", lambda x: x > 0)
     where = Plane(index, float(level), direction)
-    seen = crossings(orbits.integrator, system, orbits.t_span, orbits.rows, where, float(sample))
+    seen = crossings(orbits.integrator, orbits.system, orbits.t_span, orbits.rows, where, float(sample))
     return _section(orbits, seen, where)
 
 
