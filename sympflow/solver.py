@@ -128,7 +128,7 @@ def solve(
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
-        Whether to return `sol`, a function of t. It stores the state after every step.
+        True to return `sol`, a function of t. It stores the state after every step.
     save_every : int, optional
         Report every k-th step instead of each; not together with `t_eval`.
     dtype : "float32" or "float64", optional
