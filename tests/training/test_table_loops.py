@@ -81,8 +81,9 @@ def test_errors_and_their_derivatives_are_those_of_arrays(fits):
         assert not J[:, 2].any()
         assert not J_compiled[:, 2].any()
         np.testing.assert_allclose(compiled.residuals(theta), r_compiled, atol=1e-12)
-        again = pickle.loads(pickle.dumps(compiled))
-        assert all(np.array_equal(a, b) for a, b in zip(again.linearized(theta), (r_compiled, J_compiled), strict=True))
+        for fit, found in ((arrays, (r, J)), (compiled, (r_compiled, J_compiled))):
+            again = pickle.loads(pickle.dumps(fit)).linearized(theta)
+            assert all(np.array_equal(a, b) for a, b in zip(again, found, strict=True))
 
 
 def test_steps_are_those_of_arrays(fits):
