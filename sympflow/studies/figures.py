@@ -289,7 +289,8 @@ def _annotate(ax: Axes, points: Sequence[tuple[float, float, str]], styles: dict
         )
 
 
-LETTER, LINE, BELOW = 4.4, 11.0, 2.0  # points that a letter of a label is wide, a label high, and what is below its line
+LETTER, LINE, BELOW = 4.4, 11.0, 2.0
+"""Points that a letter of a label is wide, that a label is high, and that it reaches below its line."""
 _BESIDE = ((0.0, 7.0, "center", 0.5), (0.0, -13.0, "center", 0.5), (8.0, -3.0, "left", 0.0), (-8.0, -3.0, "right", 1.0))
 """Offsets of a label in points, its alignment, and the share of it that is left of there."""
 
