@@ -155,7 +155,7 @@ def _checked(name: str, kind: str, value: Any) -> Any:
     if kind.startswith("float"):
         return None if value is None and "None" in kind else _number(name, value)
     if type(value).__name__ != kind:
-        raise ValueError(f"`description` has a {name} that is no {kind}: {value!r}.")
+        raise ValueError(f"`description` has a {name} that is not of type {kind}: {value!r}.")
     return value
 
 

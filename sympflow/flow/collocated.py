@@ -140,9 +140,8 @@ class CollocatedFlow(SystemFlow):
         """Return a flow with as many steps as the system needs: see `SympFlow.collocated`."""
         check_system(system)
         check_for_flows(system, cls.takes_friction, cls.takes_driving)
-        flow = cls(
-            system.ndof, stages, 1 if steps is None else steps, like["dt"]
-        )  # all arguments are looked at before work
+        # all arguments are checked before the work of choosing the steps
+        flow = cls(system.ndof, stages, 1 if steps is None else steps, like["dt"])
         if steps is None:
             if states is None and system.domain is not None:
                 states = system.domain.sample(SAMPLED, 0)

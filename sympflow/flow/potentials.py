@@ -646,7 +646,7 @@ def hidden_widths(hidden: Sequence[int]) -> tuple[int, ...]:
 def module_weights(module: nn.Module) -> dict[str, Any]:
     """Return the arguments of `MLPPotential.from_weights` for a `torch.nn.Sequential` of the input [x, t].
 
-    Its activations are recognised by their values. A TypeError says that it is no Sequential of Linear layers and
+    Its activations are recognised by their values. A TypeError says that it is not a Sequential of Linear layers and
     activations in turn, the output linear, a ValueError that an activation is unknown, or that they differ.
     """
     layers = list(module) if isinstance(module, nn.Sequential) else []

@@ -284,8 +284,8 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
         They need not be near the exact flow of that system, with friction for instance. The numbers know the potential
         and dt, not the size: of a lattice they serve any other one of the same terms: `solve` takes the flow as it is.
-        A ValueError if the system has another number of degrees of freedom, unless both are lattices of the same terms,
-        or if it has no such flow.
+        A ValueError if the system has other degrees of freedom, and is not a lattice of the same terms, or has no such
+        flow.
         """
         check_system(system)
         check_for_flows(system, self.takes_friction, self.takes_driving)

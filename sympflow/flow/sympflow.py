@@ -487,8 +487,8 @@ class SympFlow(FlowMap):
         Raises
         ------
         ValueError
-            If this is no flow of networks of a driven system, or the system has other degrees of freedom, or a period
-            where this one has none.
+            If this is not a flow of networks of a driven system, or the system has other degrees of freedom, or only
+            one of them has a period.
         """
         mine = self.drive
         drive = None if mine is None or system.autonomous else Drive.of(system, mine.harmonics)

@@ -204,7 +204,7 @@ def substeps_of(sequence: Sequence[Kind], columns: Columns, sign: int) -> list[S
 
 
 class Memory:
-    """Objects made once for each key; emptied where it would hold more than `most`."""
+    """Objects made of fixed numbers, each once for its key, up to so many."""
 
     def __init__(self, most: int) -> None:
         self._kept: dict[Any, Any] = {}

@@ -236,7 +236,7 @@ def test_a_flow_in_another_precision_is_saved_without_its_certificate(tmp_path):
         (lambda c: c.update(delta=3.0), "delta that is not made of quantiles"),
         (lambda c: c["delta"].update(median="0"), "median that is not a number"),
         (lambda c: c["delta"].update(median=-1.0), "median that is not a number"),
-        (lambda c: c.update(states=True), "states that is no int"),
+        (lambda c: c.update(states=True), "states that is not of type int"),
         (lambda c: c.update(weights="0"), "certificate is one of other weights"),
     ],
 )

@@ -1,6 +1,7 @@
 """The families of flows: laws that all of them obey, and what the rest of the package asks of a flow map."""
 
 import copy
+import itertools
 import pickle
 
 import numpy as np
@@ -17,6 +18,7 @@ from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.kernels.protocol import Kernel
 
+EPS = np.finfo(float).eps
 PENDULUM, KEPLER = systems.pendulum(), systems.kepler()
 TRANSFORMED, DRIVEN = time_transformed(KEPLER), systems.driven_pendulum()
 WHOLE = HamiltonianSystem.from_sympy("p**2*(1 + q**2)/2 + q**2/2", y0=[0.4, 0.3])
@@ -195,11 +197,11 @@ def test_it_is_the_identity_at_zero_and_has_an_exact_inverse(lawful):
     each = flow.dt * torch.tensor([0.4, 1.0, 0.0, 2.3, -1.7]).double()
     for t in (0.4 * flow.dt, 2.3 * flow.dt, -1.7 * flow.dt, each):
         y = flow(t, x, **begun)
-        close = {"rtol": 0, "atol": 2e-11 * float(1 + (y / unit).abs().max())}
+        close = {"rtol": 0, "atol": 1e3 * EPS * float(1 + (y / unit).abs().max())}
         torch.testing.assert_close(flow.inverse(t, y, **begun) / unit, x / unit, **close)
         torch.testing.assert_close(flow(t, flow.inverse(t, x, **begun), **begun) / unit, x / unit, **close)
     alone = torch.stack([flow(float(t), row, **begun) for t, row in zip(each, x, strict=True)])
-    torch.testing.assert_close(y / unit, alone / unit, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(y / unit, alone / unit, rtol=1e-13, atol=1e-13)
 
 
 def test_it_is_symplectic_at_every_t(lawful):
@@ -208,21 +210,24 @@ def test_it_is_symplectic_at_every_t(lawful):
     for t in (0.3 * flow.dt, 2.6 * flow.dt, -1.4 * flow.dt):
         for row in x[:2]:
             A = torch.autograd.functional.jacobian(lambda y, t=t: flow(t, y, **started(flow)), row)
-            assert (A.T @ J @ A - J).abs().max() < 1e-12 * torch.linalg.matrix_norm(A, 2) ** 2
+            assert (A.T @ J @ A - J).abs().max() < 1e-13 * torch.linalg.matrix_norm(A, 2) ** 2
 
 
 def test_its_velocity_is_the_time_derivative_and_that_of_its_hamiltonian(lawful):
     flow, x, unit = lawful
     t, begun = flow.dt * torch.linspace(0.05, 0.95, 5, dtype=torch.float64), started(flow)
+    generated = 1e-10 if flow.system is POLAR else 1e3 * EPS  # its forces of 1e4 r cancel to 1e-4 of their size
     y, velocity = flow.psi_and_velocity(t, x, **begun)
-    torch.testing.assert_close(y, flow.psi(t, x, **begun), rtol=1e-12, atol=1e-12)
+    by_jvp = torch.func.jvp(lambda t: flow.psi(t, x, **begun), (t,), (torch.ones_like(t),))
+    torch.testing.assert_close(y / unit, by_jvp[0] / unit, rtol=0, atol=64 * EPS)
     size = float((velocity / unit).abs().max())
-    h = 1e-3 * flow.dt
+    torch.testing.assert_close(velocity / unit, by_jvp[1] / unit, rtol=0, atol=1e-12 * size)
+    h = 1e-3 * flow.dt  # the differences are right to (h/Δt)⁴ = 1e-12 times the fifth derivative of ψ in t/Δt
     near, far = (flow.psi(t + k * h, x, **begun) - flow.psi(t - k * h, x, **begun) for k in (1, 2))
-    torch.testing.assert_close(velocity / unit, (8 * near - far) / (12 * h) / unit, rtol=0, atol=1e-7 * size)
+    torch.testing.assert_close(velocity / unit, (8 * near - far) / (12 * h) / unit, rtol=0, atol=1e-8 * size)
     y = y.detach().requires_grad_()
     (slope,) = torch.autograd.grad(flow.hamiltonian(t, y, **begun).sum(), y)
-    torch.testing.assert_close(velocity / unit, slope @ canonical(flow.ndof).T / unit, rtol=0, atol=1e-10 * size)
+    torch.testing.assert_close(velocity / unit, slope @ canonical(flow.ndof).T / unit, rtol=0, atol=generated * size)
 
 
 def test_runs_files_and_copies_are_the_flow(lawful, tmp_path):
@@ -235,10 +240,13 @@ def test_runs_files_and_copies_are_the_flow(lawful, tmp_path):
         assert torch.equal(other(t, x, **begun), end)
     if flow.system is None or flow.system is TRANSFORMED:
         return
-    span = (begun.get("t0", 0.0), begun.get("t0", 0.0) + t)
-    for backend in ("auto", "array"):
-        run = solve(flow.system, flow, span, x.numpy(), backend=backend, on_domain_exit="ignore")
-        np.testing.assert_allclose(run.y[..., -1], end, rtol=1e-12, atol=2e-11)
+    t0 = begun.get("t0", 0.0)
+    for span, backend in itertools.product(((t0, t0 + t), (t0, t0 - t)), ("compiled", "array")):
+        run = solve(
+            flow.system, flow, span, x.numpy(), t_eval=np.linspace(*span, 6), backend=backend, on_domain_exit="ignore"
+        )
+        direct = torch.stack([flow(float(s - t0), x, **begun) for s in run.t], -1)
+        np.testing.assert_allclose(run.y, direct, rtol=0, atol=1e3 * EPS * float(1 + direct.abs().max()))
 
 
 def test_a_flow_in_another_time_knows_the_system_that_it_is_for():

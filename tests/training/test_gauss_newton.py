@@ -91,6 +91,10 @@ def test_derivatives_by_the_table(system, force_gradient, first):
     c = np.random.default_rng(0).uniform(0.1, 0.3, (step.n_coefficients, y.shape[1]))
     end, J = step.with_jacobian(c, y)
     np.testing.assert_allclose(end, step(c, y), atol=1e-14)
+    compiled, n = TableStep(system, sequence, force_gradient, compiled=True), len(c)
+    zero = np.zeros((len(y), 16))
+    errors = compiled.errors(y, None, zero, zero + 1, zero[:0], np.tile(np.eye(n), (4, 1, 1)))
+    J_compiled = errors(c[compiled.order].T, linearized=True)[1].reshape(n, 4, len(y), 4)
 
     def executed(c, y):
         q, p = y.chunk(2, -1)
@@ -107,7 +111,9 @@ def test_derivatives_by_the_table(system, force_gradient, first):
 
     for k in range(y.shape[1]):
         expected = torch.func.jacfwd(executed)(torch.tensor(c[:, k]), torch.tensor(y[:, k]))
-        np.testing.assert_allclose(J[:, :, k].T, expected.numpy(), rtol=1e-7, atol=1e-8)  # by differences
+        exact, differences = {"rtol": 1e-12, "atol": 1e-13}, {"rtol": 1e-7, "atol": 1e-8}  # of ∇²V along M⁻¹∇V
+        np.testing.assert_allclose(J[:, :, k].T, expected, **(differences if force_gradient else exact))
+        np.testing.assert_allclose(J_compiled[:, k, :, k].T, expected[:, compiled.order], **exact)
 
 
 FEW = PrimedFit(points=5, label_times=3, frozen_weight=1.0, energy_weight=7.0)
@@ -332,7 +338,7 @@ def test_residuals_of_a_loss_are_those_of_the_flow():
     run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
     theta = Table(flow).parameters() + np.random.default_rng(0).normal(0, 0.02, flow.n_parameters)
     r = check_derivatives(run.whole, theta, 1e-8)
-    run.whole.residuals(theta)
+    Table(flow).assign(theta)
     objective = run.whole.objective
     assert r @ r == pytest.approx(float(objective.loss(flow, objective.points).detach()), rel=1e-12)
 

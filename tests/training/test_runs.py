@@ -31,6 +31,7 @@ ROWS = {
         for optimizer, n in STEPS.items()
     },
 }
+LARGEST = {"primed": ("one_step_error", 1e-4), "split": ("missed_share", 0.1)}  # after half of the starts
 EACH = pytest.mark.parametrize("row", ROWS)
 SOME = pytest.mark.parametrize("row", ["primed", "split", "sympflow by adam"])
 
@@ -81,7 +82,8 @@ def test_an_interrupted_run_returns_its_best_state(row):
     stage = flow.recipe["stages"][-1]
     assert stage.get("steps_taken", stage.get("restarts_taken")) == half
     assert stage["ended_early"] == "it was interrupted"
-    assert math.isfinite(flow.figures["one_step_error"])
+    name, bound = LARGEST.get(row, ("residual_loss", flow.history[0].get("residual_loss")))
+    assert flow.figures[name] < bound
 
 
 @SOME
