@@ -198,7 +198,7 @@ def check_positive(name: str, value: Any, most: float = sys.float_info.max) -> A
 
 def checked_number(name: str, value: Any, what: str = "a finite number", fits: Callable[[Any], bool] = isfinite) -> Any:
     """Return the argument `name`; raise unless it is a real number that fits, which the message says in words."""
-    if not (real_number(value) and fits(value)):
+    if not fits(as_float(value)):
         raise ValueError(f"`{name}` must be {what}; got {value!r}.")
     return value
 
@@ -251,6 +251,15 @@ def real_array(name: str, values: Any) -> np.ndarray:
     except (TypeError, ValueError, OverflowError) as error:
         shown = reprlib.repr(values)
         raise TypeError(f"`{name}` must be real numbers; got {shown}: pass a number or an array of them.") from error
+
+
+def is_number_word(word: str) -> bool:
+    """Return True for text that is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def real_number(value: Any) -> bool:

@@ -38,7 +38,7 @@ from sympflow.arrays import (
 )
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import run_and_search
-from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_step
+from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_start, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
 from sympflow.integrators.diagnosis import diagnose, diagnose_piece, note_poles, note_singularities_of_rows
 from sympflow.integrators.domain_exit import (
@@ -128,7 +128,7 @@ def solve(
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
-        Whether to return `sol`, a function of t. It stores the state after every step.
+        True to return `sol`, a function of t. It stores the state after every step.
     save_every : int, optional
         Report every k-th step instead of each; not together with `t_eval`.
     dtype : "float32" or "float64", optional
@@ -213,10 +213,7 @@ def solve(
     if integrator is None:
         simple = events is None and store is None and params is None and not dense_output
         integrator, chosen = choose_method(system, y_start, options, tol, simple, flows=params is None)
-    if system.y0 is None and (integrator.in_another_time or integrator.keeps) and readable(y_start):
-        from sympflow.hamiltonian.scales import started
-
-        system = started(system, to_numpy(y_start))
+    system = with_start(integrator, system, y_start)
     rows = None
     if params is not None:
         rows, y_start = check_params(system, params, y_start, integrator)

@@ -192,3 +192,20 @@ def test_scales_are_those_of_the_states_of_the_call(expression, method, span, y0
 def test_params_of_a_formula_may_be_of_each_trajectory():
     sol = solve("p**2/2 + k*q**2/2", None, (0, 1), [[1, 0], [1, 0]], params={"k": [1.0, 4.0]})
     np.testing.assert_allclose(sol.y[:, 0, -1], np.cos([1.0, 2.0]), rtol=1e-9)
+
+
+BENT = "p**2*(1 + q**2)/2 + q**2/2"
+OF_ORBITS = {
+    "ensemble": lambda s, y0: sympflow.ensemble(s, "tao8", (0, 2), y0, dt=0.05, reduce="final").final,
+    "section": lambda s, y0: sympflow.poincare_section(s, "tao8", (0, 10), y0, tol=1e-6).states,
+    "frequencies": lambda s, y0: sympflow.frequencies(s, "tao8", (0, 40), y0, dt=0.05).frequencies,
+    "step": lambda s, y0: sympflow.choose_step(s, "tao8", 1e-6, y0=y0, t_span=(0, 5)),
+}
+
+
+@pytest.mark.parametrize("function", OF_ORBITS)
+def test_scales_of_orbits_are_those_of_their_states(function):
+    """The one of several states that has the highest energy counts."""
+    states = np.array([[2.0, 0.0], [1.0, 0.0]])
+    found, expected = (OF_ORBITS[function](H(BENT, y0=y0, dt=0.1), states) for y0 in (None, states[0]))
+    np.testing.assert_array_equal(found, expected)

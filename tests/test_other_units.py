@@ -326,7 +326,7 @@ def test_states_of_lattices(well, units):
         )
         return lattice.domain.sample(8, 0) / np.repeat([a, b], 6)
 
-    np.testing.assert_allclose(drawn(*units), drawn(1.0, 1.0, 1.0), atol=1e-5)
+    np.testing.assert_allclose(drawn(*units), drawn(1.0, 1.0, 1.0), atol=1e-6)  # minima are known to √ε of scales
 
 
 @pytest.mark.parametrize("a", [1e-10, 1.0, 1e11])

@@ -14,7 +14,7 @@ from typing import Annotated, Any, overload
 import numpy as np
 import typer
 
-from sympflow.arguments import check_t_span
+from sympflow.arguments import check_t_span, is_number_word
 from sympflow.commands import completion
 from sympflow.hamiltonian.expression import FUNCTIONS
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -225,7 +225,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     rest = list(words)
     while rest:
         word = rest.pop(0)
-        if not word.startswith("-") or _is_number(word):
+        if not word.startswith("-") or is_number_word(word):
             names.append(word)
             continue
         name, equals, value = word.partition("=")
@@ -373,7 +373,7 @@ def _option(word: str) -> Any:
     try:
         return int(word)
     except ValueError:
-        return float(word) if _is_number(word) else word
+        return float(word) if is_number_word(word) else word
 
 
 def _pairs(words: Sequence[str]) -> list[tuple[str, str]]:
@@ -409,14 +409,6 @@ def widths(words: str) -> tuple[int, ...]:
         return tuple(int(word) for word in words.split(","))
     except ValueError as error:
         raise ValueError(f"`--hidden` must be whole numbers separated by commas; got {words!r}.") from error
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _float(name: str, word: str) -> float:

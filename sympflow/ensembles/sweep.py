@@ -21,7 +21,7 @@ from sympflow.ensembles.orbits import Drawn, Given, initial_states
 from sympflow.ensembles.reductions import Fields, Reduction, reduction
 from sympflow.ensembles.results import Block, Done, Ensemble, Keeper, Layout, Memory, blocks, chunk_shape
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.choosing import integrator_for
+from sympflow.integrators.choosing import integrator_for, with_start
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.problems import check_backend, check_own_parameters
 from sympflow.integrators.provenance import provenance
@@ -150,6 +150,7 @@ def ensemble(
     check_own_parameters(system, {**fixed, **axes}, integrator)
     if fixed:
         system = system.with_params(**fixed)
+    system = with_start(integrator, system, first)
     integrator = integrator.resolved(system, first, abs(t1 - t0), 0 if times is None else len(times))
     check_applies(integrator, system if kept.own_loops else system.between_impulses, first)
     for system_of in _telling(system, axes):

@@ -11,7 +11,7 @@ import numpy as np
 
 from sympflow.arguments import as_float, check_t_span
 from sympflow.arrays import Array, readable, to_numpy
-from sympflow.hamiltonian.scales import MOST_DENSE, default_step, known_scale, smallest_size, weights
+from sympflow.hamiltonian.scales import MOST_DENSE, default_step, known_scale, smallest_size, started, weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
@@ -132,6 +132,13 @@ def integrator_for(
     return with_step(integrator, system, y0)
 
 
+def with_start(integrator: Integrator, system: HamiltonianSystem, y0: Array) -> HamiltonianSystem:
+    """The system; where it has no initial state, and the method takes a scale from that, with one of the states y0."""
+    if system.y0 is not None or not (integrator.in_another_time or integrator.keeps) or not readable(y0):
+        return system
+    return started(system, to_numpy(y0))
+
+
 def with_step(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray) -> Integrator:
     """The integrator, with a step chosen at the states y0 where neither it nor the system has one."""
     if not (system.step_is_open and isinstance(integrator, FixedStep)) or integrator.trained or integrator.dt:
@@ -217,10 +224,10 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
         )
     if integrator.dt is not None:
         raise ValueError(f"`tol` chooses the step, but `dt` is given, {integrator.dt:g}: leave out one of them.")
-    system = problem.system.between_impulses
     states = to_numpy(problem.y0).astype(float)
     if states.ndim > 1:
         states = states.reshape(-1, states.shape[-1])[:MOST_STATES]
+    system = with_start(integrator, problem.system.between_impulses, states)
     length, error = abs(problem.t1 - problem.t0), _error(integrator, replace(problem, system=system, y0=states), tol_of)
     check_applies(integrator, system, states)
     most = min(length, integrator.longest_step(system))

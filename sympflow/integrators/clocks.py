@@ -286,7 +286,8 @@ class PhysicalRun(Run):
             if running.all():
                 states, good = self._steps(x, n)
             else:
-                states, good = x[:, None].repeat(n + 1, axis=1), np.zeros(len(x), dtype=int)
+                states, good = np.zeros((len(x), n + 1, x.shape[1]), x.dtype), np.zeros(len(x), dtype=int)
+                states[:, 0] = x
                 states[running], good[running] = self._steps(x[running], n)
             t = self.sign * states[..., self.d]
             forward = t[:, 1:] >= t[:, :-1]

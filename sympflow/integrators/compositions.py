@@ -667,7 +667,7 @@ class KeplerInteraction(Composition):
             rows = y.reshape(-1, y.shape[-1])
             lengths = np.broadcast_to(h, y.shape[:-1]).astype(float).ravel()
             ends, vectors = kernel.jvp(lengths, rows, W.reshape(*rows.shape, -1))
-        except ValueError:
+        except ValueError:  # no compiled code, as of bodies without mass: `step` is differentiated
             return None
         return ends.reshape(y.shape), vectors.reshape(W.shape)
 

@@ -304,7 +304,7 @@ class SympFlowIntegrator(FlowIntegrator):
         states, is at most this; `sympflow.shipped_flows(system)` lists them, and a T that differs. Where y0 is outside
         the domain of that flow there is no such figure, and a ValueError says so. It says nothing of a smaller `dt`.
     compensated : bool
-        Whether to sum with Kahan's compensation, which slows the growth of round-off. Compiled primed flows only.
+        True to sum with Kahan's compensation, which slows the growth of round-off. Compiled primed flows only.
 
     References
     ----------

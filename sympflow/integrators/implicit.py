@@ -43,7 +43,7 @@ class Gauss(FixedStep):
     dt : float, optional
         Step length; the default is `system.dt`.
     compensated : bool
-        Whether to sum with Kahan's compensation [1]_, which slows the growth of round-off. Compiled only.
+        True to sum with Kahan's compensation [1]_, which slows the growth of round-off. Compiled only.
 
     References
     ----------

@@ -138,13 +138,13 @@ def _pulled(
 
 
 class _Gate:
-    """Closed while derivatives by each input alone are taken, though one input may depend on another."""
+    """Closed while derivatives are taken by each input alone, though one of them may depend on another."""
 
     open = False
 
 
 class _Gated(torch.autograd.Function):
-    """The same tensor, to whose past derivatives go while a gate is open."""
+    """The same tensor, through which derivatives reach its own inputs only while a gate is open."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, gate: _Gate) -> Tensor:

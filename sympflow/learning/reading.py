@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_ASKED_VALUES, floats
+from sympflow.arguments import MAX_ASKED_VALUES, floats, is_number_word
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
 
@@ -271,22 +271,14 @@ def _header(path: Path) -> dict[str, Any]:
                 break
         else:
             return {}
-    if not all(_is_number(word) for word in words) or words == [str(i) for i in range(len(words))]:
+    if not all(is_number_word(word) for word in words) or words == [str(i) for i in range(len(words))]:
         return {}
-    if len(comment) == len(words) and not any(_is_number(word) for word in comment):
+    if len(comment) == len(words) and not any(is_number_word(word) for word in comment):
         return {"names": comment}
     raise ValueError(
         f"`data` names the file {str(path)!r}, whose first row has numbers in place of the names of its columns: write "
         "them above, as t,q1,p1 and so on."
     )
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _loaded(data: Any) -> Any:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_positive, real_number, warn
+from sympflow.arguments import check_positive, checked_number, warn
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -125,8 +125,7 @@ def floquet_multipliers(
     if T is None:
         raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
     check_positive("period", T)
-    if not real_number(t0) or not math.isfinite(t0):
-        raise ValueError(f"`t0` must be a finite number; got {t0!r}.")
+    checked_number("t0", t0)
     if is_tensor(y0):
         raise TypeError("`y0` is a tensor, but multipliers are of NumPy arrays: pass y0.numpy().")
     start = check_y0(system, system.y0 if y0 is None else y0, None)

@@ -64,7 +64,7 @@ class Frequencies(OfOrbits):
         n = self.frequencies.shape[-1]
         lines, sizes = self.frequencies.reshape(-1, n), np.abs(self.amplitudes).reshape(-1, n)
         if not np.isfinite(lines).any():
-            raise ValueError("no line was found: `message` says why.")
+            raise ValueError("`plot` has nothing to draw, for no line was found: `message` says why.")
         return curves_figure(lines, sizes, ("angular frequency", "amplitude"), "Frequencies", bars=True)
 
 
@@ -147,7 +147,7 @@ def frequencies(
     most = max(1, MOST_VALUES // (len(times) * (2 * system.ndof + 4 * n)))
     for start in range(0, len(rows), most):
         sol = solve(
-            system,
+            orbits.system,
             orbits.integrator,
             orbits.t_span,
             rows[start : start + most],

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import check_t_span
 from sympflow.arrays import is_tensor
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.integrators.choosing import integrator_for
+from sympflow.integrators.choosing import integrator_for, with_start
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import check_applies
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class OfOrbits(Shown):
-    """What was found of each orbit: it has a `status`, negative of orbits that failed, and a figure."""
+    """Results of orbits, with a `status`, negative for orbits that failed, and a figure."""
 
     status: Any
 
@@ -61,7 +61,7 @@ def of_many(name: str, values: Any, remedy: str) -> Figure:
     """Return the histogram of a number of each orbit; a ValueError with the remedy where there are fewer than two."""
     values = np.ravel(values)
     if np.count_nonzero(np.isfinite(values)) < 2:
-        raise ValueError(f"there are not two orbits with a finite {name}, and a histogram needs them: {remedy}.")
+        raise ValueError(f"`plot` needs at least two orbits with a finite {name}, for a histogram: {remedy}.")
     return histogram_figure({name: values}, f"{len(values):,} orbits")
 
 
@@ -105,6 +105,7 @@ def checked_orbits(
         raise TypeError(f"`y0` is a tensor, but {purpose} NumPy arrays: pass y0.numpy().")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
     integrator = integrator_for(system, method, options, span, start)
+    system = with_start(integrator, system, start)
     integrator = integrator.resolved(system, start, abs(span[1] - span[0]))
     check_applies(integrator, system, start)
     return Orbits(system, integrator, span, start)

@@ -116,14 +116,10 @@ def curves_figure(x: np.ndarray, curves: np.ndarray, labels: tuple[str, str], ti
     """Curves (N, n) over x, (n,) or (N, n), positive ones on a logarithmic scale; as bars where x is not in order."""
     figure = new_figure(4.2, 3.3)
     ax = figure.subplots()
-    curves = curves[:MOST_LINES]
-    _lines(
-        ax, np.broadcast_to(x, (len(x) if x.ndim > 1 else len(curves), x.shape[-1]))[: len(curves)], curves, "o" * bars
-    )
+    x, curves = np.broadcast_to(x, curves.shape)[:MOST_LINES], curves[:MOST_LINES]
+    _lines(ax, x, curves, "o" * bars)
     if bars:
-        ax.vlines(
-            np.ravel(x[: len(curves)]), np.nanmin(curves) / 10, np.ravel(curves), lw=0.8, color="#999999", zorder=1
-        )
+        ax.vlines(x.ravel(), np.nanmin(curves) / 10, curves.ravel(), lw=0.8, color="#999999", zorder=1)
     if np.nanmin(curves, initial=np.inf) > 0 and np.isfinite(curves).any():
         ax.set_yscale("log")
     dress(ax, *labels)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arguments import check_flag
+from sympflow.arguments import check_flag, checked_number
 from sympflow.storage.identity import Known
 from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, dofs, halves
 from sympflow.storage.store import Appender, Field, Store
@@ -89,8 +89,7 @@ class RunStore:
         check_flag("resume", resume)
         check_flag("same", same)
         every = SECONDS if checkpoint_every is None else checkpoint_every
-        if isinstance(every, bool) or not isinstance(every, int | float | np.number) or not every > 0:
-            raise ValueError(f"`checkpoint_every` must be a positive number of seconds; got {every!r}.")
+        checked_number("checkpoint_every", every, "a positive number of seconds", lambda x: x > 0)
         self.asked, self.path = str(path), Path(os.path.abspath(os.fspath(path)))
         self.resume, self.same, self.every = bool(resume), bool(same), float(every)
         self.consistent, self.committed = True, time.perf_counter()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_counts, check_positive
+from sympflow.arguments import check_counts, check_positive, checked_number
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Integrator
@@ -112,15 +112,14 @@ def poincare_section(
         if not whole_periods(orbits.t_span, T):
             t0, t1 = orbits.t_span
             raise ValueError(f"`t_span` ({t0:g}, {t1:g}) is shorter than the period {T:g}: choose a later end.")
-        seen = stroboscopic(orbits.integrator, system, orbits.t_span, orbits.rows, T)
+        seen = stroboscopic(orbits.integrator, orbits.system, orbits.t_span, orbits.rows, T)
         return _section(orbits, seen, T)
     index = _check_coordinate(0 if coordinate is None else coordinate, system.ndof)
     direction = 1 if direction is None else direction
     if direction not in (-1, 0, 1):
         raise ValueError(f"`direction` must be 1 (upwards), -1 (downwards) or 0 (both); got {direction!r}.")
     level = 0.0 if level is None else level
-    if not (_is_number(level) and math.isfinite(level)):
-        raise ValueError(f"`level` must be a finite number, the value of the coordinate on the plane; got {level!r}.")
+    checked_number("level", level, "a finite number, the value of the coordinate on the plane")
     if energy is not None:
         if y0 is not None:
             raise ValueError("`energy` and `y0` both choose the initial states: give one of them.")
@@ -129,10 +128,9 @@ def poincare_section(
         raise ValueError("`n` orbits are drawn for an `energy`: give it, or the states `y0`.")
     orbits = checked_orbits(system, method, t_span, y0, options, "crossings are located on")
     sample = system.dt if sample is None else sample
-    if not (_is_number(sample) and sample > 0):
-        raise ValueError(f"`sample` must be a positive number, a time; got {sample!r}.")
+    checked_number("sample", sample, "a positive number, a time", lambda x: x > 0)
     where = Plane(index, float(level), direction)
-    seen = crossings(orbits.integrator, system, orbits.t_span, orbits.rows, where, float(sample))
+    seen = crossings(orbits.integrator, orbits.system, orbits.t_span, orbits.rows, where, float(sample))
     return _section(orbits, seen, where)
 
 
@@ -152,8 +150,7 @@ def states_of_energy(system: HamiltonianSystem, energy: float, n: int, plane: Pl
         If the system is driven, or no state of this energy is found.
     """
     system.check_autonomous("so no `energy` is that of an orbit", "pass `y0`")
-    if not (_is_number(energy) and math.isfinite(energy)):
-        raise ValueError(f"`energy` must be a finite number, a value of H; got {energy!r}.")
+    checked_number("energy", energy, "a finite number, a value of H")
     check_counts(n=n)
     d, rng, factors = system.ndof, np.random.default_rng(seed), weights(system)
     c, partner = plane.coordinate, (plane.coordinate + d) % (2 * d)
@@ -294,8 +291,7 @@ class PoincareSection(Report):
 
     def since(self, t: float) -> PoincareSection:
         """Return the section from a time on, along the run: without what passes before a damped system settles."""
-        if not (_is_number(t) and math.isfinite(t)):
-            raise ValueError(f"`t` must be a finite number, a time; got {t!r}.")
+        checked_number("t", t, "a finite number, a time")
         kept = self.t >= t if self.t_span[1] >= self.t_span[0] else self.t <= t
         return replace(self, trajectory=self.trajectory[kept], t=self.t[kept], states=self.states[kept])
 
@@ -375,8 +371,7 @@ class PoincareSection(Report):
         j = (position + d if position < d else 0) if y is None else _check_coordinate(y, d)
         points = self.states[:, [i, j]]
         if turn is not None:
-            if not (_is_number(turn) and 0 < turn < math.inf):
-                raise ValueError(f"`turn` must be positive and finite, such as 2*pi; got {turn!r}.")
+            checked_number("turn", turn, "positive and finite, such as 2*pi", lambda x: 0 < x < math.inf)
             points[:, 0] -= turn * np.rint(points[:, 0] / turn)
         heading = f"{self.system.title}, {name_of(self.integrator)}: {self._seen}"
         return section_figure(points, self.trajectory, len(self.y0), (label[i], label[j]), heading)
@@ -405,10 +400,6 @@ class PoincareSection(Report):
 def names(ndof: int) -> list[str]:
     """q, p for one degree of freedom; q1 … qd, p1 … pd for more."""
     return [f"{x}{i + 1}" if ndof > 1 else x for x in "qp" for i in range(ndof)]
-
-
-def _is_number(x: object) -> bool:
-    return isinstance(x, int | float | np.number) and not isinstance(x, bool)
 
 
 def _check_coordinate(coordinate: int | str, ndof: int) -> int:

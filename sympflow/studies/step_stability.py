@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span, positive_numbers
+from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span, checked_number, positive_numbers
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.hamiltonian.scales import smallest_size, started
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -139,9 +139,7 @@ def stability(
     if isinstance(metrics, str) or unknown:
         raise ValueError(f"`metrics` must be a list of names from {', '.join(METRICS)}; got {metrics!r}.")
     check_counts(min_steps=min_steps, max_steps=max_steps)
-    real = isinstance(bound, int | float | np.number) and not isinstance(bound, bool)
-    if not real or np.iscomplexobj(bound) or not 0 < bound < math.inf:
-        raise ValueError(f"`bound` must be positive and finite, a relative energy error; got {bound!r}.")
+    checked_number("bound", bound, "positive and finite, a relative energy error", lambda x: 0 < x < math.inf)
     attempts.check_progress(progress)
     lengths = None if steps is None else positive_numbers("steps", steps)
     unknown = [d for d in dtypes if d not in ("float32", "float64")]

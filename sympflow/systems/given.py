@@ -8,9 +8,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
-from sympflow.arrays import is_tensor, to_numpy
+from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
@@ -57,6 +55,5 @@ def _first(params: Mapping[str, Any] | None) -> dict[str, float] | None:
     """The first value of each of some parameters, which may be arrays or tensors."""
     if not isinstance(params, Mapping):
         return None
-    return {
-        name: to_numpy(x).ravel()[0] if is_tensor(x) else np.ravel(x)[0] for name, x in params.items() if np.size(x)
-    }
+    rows = {name: to_numpy(x).ravel() for name, x in params.items()}
+    return {name: row[0] for name, row in rows.items() if row.size}

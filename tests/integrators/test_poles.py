@@ -84,7 +84,7 @@ def of_functions(V):
 
 
 LEAPT_UNSEEN = "1/(1 + sin(q))/1e6", "1/(q**2 - 1)", "1/(exp(q) - 1 - q)"
-"""V of which no divisor has another sign, and H no other value, after the leap."""
+"""V whose divisors keep their signs, and H its value, over the leap."""
 
 
 @pytest.mark.parametrize("V", [V for V in CROSSED if V not in LEAPT_UNSEEN])

@@ -102,7 +102,7 @@ def test_h_is_typeset():
 def test_one_number_is_not_drawn(found):
     result = found(HH, "verlet", (0, 5))
     assert result.preview() is None
-    with pytest.raises(ValueError, match="not two orbits with a finite"):
+    with pytest.raises(ValueError, match="`plot` needs at least two orbits"):
         result.plot()
 
 

@@ -280,6 +280,7 @@ def test_orbits_of_one_energy_start_on_the_plane(system, energy, direction):
         ({"energy": 0.1, "y0": systems.henon_heiles().y0}, "`energy` and `y0`"),
         ({"n": 4}, "`n` orbits are drawn for an `energy`"),
         ({"energy": np.nan}, "`energy` must be a finite number"),
+        ({"energy": 10**400}, "`energy` must be a finite number"),
         ({"energy": 0.1, "period": 1.0}, "`period` and `energy`"),
         ({"n": 4, "period": 1.0}, "`period` and `n`"),
     ],
