@@ -70,7 +70,7 @@ SOLVE: tuple[tuple[str, str, tuple[str, ...]], ...] = (
         ),
     ),
     (
-        "GridRun",
+        "Run",
         "the one driver",
         (
             "walks the grid t0 + k·dt, asks the stepper for steps",

@@ -272,7 +272,7 @@ def _annotate(ax: Axes, points: Sequence[tuple[float, float, str]], styles: dict
         centre = (markers[k][0] + markers[k][1]) / 2
         choices = []
         for dx, dy, align, shift in _BESIDE:
-            low = centre + np.array([dx - shift * size[0], dy])
+            low = centre + np.array([dx - shift * size[0], dy - BELOW])
             taken = markers[:k] + markers[k + 1 :] + placed
             outside = _area(low, low + size) - _overlap((low, low + size), (np.zeros(2), inches * 72))
             choices.append((sum(_overlap((low, low + size), other) for other in taken) + outside, dx, dy, align, low))
@@ -289,8 +289,9 @@ def _annotate(ax: Axes, points: Sequence[tuple[float, float, str]], styles: dict
         )
 
 
-LETTER, LINE = 4.4, 9.0  # points that a letter of a label is wide, and high
-_BESIDE = ((0.0, 9.0, "center", 0.5), (0.0, -15.0, "center", 0.5), (8.0, -3.0, "left", 0.0), (-8.0, -3.0, "right", 1.0))
+LETTER, LINE, BELOW = 4.4, 11.0, 2.0
+"""Points that a letter of a label is wide, that a label is high, and that it reaches below its line."""
+_BESIDE = ((0.0, 7.0, "center", 0.5), (0.0, -13.0, "center", 0.5), (8.0, -3.0, "left", 0.0), (-8.0, -3.0, "right", 1.0))
 """Offsets of a label in points, its alignment, and the share of it that is left of there."""
 
 
