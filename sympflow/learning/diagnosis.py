@@ -65,10 +65,10 @@ def hint(
     widest = _left(whole.fields(x), v, scales)[0]
     if not {*whole.expressions} <= {*library.expressions}:
         found.append((widest, "Terms outside of the library fit much better: leave `terms` out, or give others."))
-    for other, said in ((frictions, FRICTION), (turns, TURNED), (drags, DRAG)):
-        if other is force or (other is frictions and force is not None) or (other is turns and d == 1):
+    for cause, said in ((frictions, FRICTION), (turns, TURNED), (drags, DRAG)):
+        if cause is force or (cause is frictions and force is not None) or (cause is turns and d == 1):
             continue
-        pushes = fields_of(other, x)
+        pushes = fields_of(cause, x)
         rest, theta = _left(np.concatenate([X, pushes], 2), v, scales)
         found.append((rest, said.format(_said(theta[-pushes.shape[2] :]))))
     if d > 1:
