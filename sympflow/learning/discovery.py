@@ -18,7 +18,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_ASKED_VALUES, plain, real_number
+from sympflow.arguments import plain, real_number
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -301,12 +301,12 @@ def discover(
         raise ValueError(f"`piece` must be a positive time; got {piece!r}: leave it out for about one period.")
     if progress is not None and not callable(progress):
         raise TypeError(f"`progress` must be a function of a line of text; got {progress!r}: leave it out.")
-    if plain(degree) in range(HIGHEST + 1, MAX_ASKED_VALUES):
-        raise ValueError(f"`degree` must be at most {HIGHEST}; got {degree!r}: give other `terms`.")
     degree, most_terms, seed = plain(degree), plain(most_terms), plain(seed)
     for argument, value, least in (("degree", degree, 1), ("most_terms", most_terms, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"`{argument}` must be an integer, {least} or more; got {value!r}.")
+    if degree > HIGHEST:
+        raise ValueError(f"`degree` must be at most {HIGHEST}; got {degree!r}: give other `terms`.")
     huber = limit_of(loss)
     say = progress or (lambda _: None)
     search = _Search(trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, say, session)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_ASKED_VALUES, floats, plain
+from sympflow.arguments import MAX_ASKED_VALUES, floats, plain, real_number
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.reading import (
     OBSERVED,
@@ -137,7 +137,7 @@ class Trajectories(Shown):
         >>> Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]))).ndof
         1
         """
-        if ndof is not None and (isinstance(ndof, bool | str) or ndof not in range(1, MAX_ASKED_VALUES)):
+        if ndof is not None and not (real_number(ndof) and 1 <= ndof < MAX_ASKED_VALUES and ndof == int(ndof)):
             raise ValueError(
                 f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}: or leave it out."
             )

@@ -712,6 +712,7 @@ def test_a_long_run_is_cut_and_the_only_one_divided():
 HOSTILE = [
     ({}, 1e80, ValueError, "`trajectories` have q1 up to .*give `units`"),
     ({"ndof": "1"}, 1, ValueError, "`ndof` must be a positive integer"),
+    ({"ndof": 1.5}, 1, ValueError, "`ndof` must be a positive integer"),
     ({"ndof": True}, 1, ValueError, "`ndof` must be a positive integer"),
     ({"noise": "a"}, 1, TypeError, "`noise` must be made of real numbers"),
     ({"noise": np.nan}, 1, ValueError, "`noise` must be a standard deviation"),
