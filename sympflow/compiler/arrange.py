@@ -62,10 +62,10 @@ class _Body(Recording):
         super().__init__()
         self.known: dict[int, int] = {}
 
-    def record(self, name: str, args: Sequence[Any]) -> Any:
-        value = super().record(name, args)
-        if isinstance(value, Traced) and value.name in FUNCTIONS and value.order not in self.known:
-            self.known[value.order] = max(map(self.depth, value.args)) + FUNCTIONS[value.name].cost
+    def _number(self, name: str, args: tuple[Any, ...]) -> Traced:
+        value = super()._number(name, args)
+        if name != "input" and value.order not in self.known:
+            self.known[value.order] = max(map(self.depth, args)) + FUNCTIONS[name].cost
         return value
 
     def depth(self, x: Any) -> int:

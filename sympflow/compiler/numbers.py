@@ -23,7 +23,7 @@ class Number:
 
     def apply(self, name: str, args: Sequence[Any]) -> Any:
         """Return the value of the function `name` of the table; this number is one of the arguments."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} must define apply().")
 
     def __add__(self, other: Any) -> Any:
         return self.apply("add", (self, other))

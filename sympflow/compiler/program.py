@@ -275,10 +275,8 @@ def traced(function: Callable[..., Sequence[Any]], *names: str) -> Program:
 def _partials(x: Traced) -> Iterator[tuple[Traced, Any]]:
     base, *rest = x.args
     if x.name == "pow" and isinstance(base, Traced) and base.name == "sqrt" and isinstance(rest[0], float):
-        yield (
-            base.args[0],
-            0.5 * rest[0] * base ** (rest[0] - 2.0),
-        )  # where that of the root is infinite, it need not be
+        # finite where the derivative of the root alone is not
+        yield base.args[0], 0.5 * rest[0] * base ** (rest[0] - 2.0)
         return
     rule = FUNCTIONS[x.name].partials
     if rule is None:
@@ -289,7 +287,7 @@ def _partials(x: Traced) -> Iterator[tuple[Traced, Any]]:
 
 
 def _through(slope: Any, partial: Any) -> Any:
-    """The product of two derivatives, 0 where a choice makes one of them 0, even if the other is no number there."""
+    """The product of two derivatives: 0 where a choice makes one of them 0, even where the other is NaN or infinite."""
     for x, y in ((slope, partial), (partial, slope)):
         if isinstance(x, Traced) and x.name == "where":
             condition, a, b = x.args
@@ -370,7 +368,7 @@ def _slopes_of(y: Traced, ends: set[int]) -> Iterator[tuple[Traced, Any]]:
 
 
 def _waiting(program: Program, late: Sequence[Traced]) -> int:
-    """How long the outputs wait for inputs that are known late, in cycles."""
+    """The time that outputs wait for inputs that are known late, in cycles."""
     known = {x.order: 0 for x in late}
     for x in program.operations:
         ready = [known[a.order] for a in x.args if isinstance(a, Traced) and a.order in known]

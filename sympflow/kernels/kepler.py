@@ -55,7 +55,7 @@ Vectors = list[Any]
 
 
 class Form(NamedTuple):
-    """What a run carries: deviation vectors, which may grow without bound, force gradients, compensated sums."""
+    """Contents of a run: deviation vectors, which may grow without bound, force gradients, compensated sums."""
 
     vectors: int = 0
     grows: bool = False
@@ -229,7 +229,7 @@ class KeplerCode(Rollouts):
         self._write(room, place, state)
 
     def _of_mass(self, j: Value) -> Value:
-        """Where G m of planet j stands in the table."""
+        """The place of G m of planet j in the table."""
         group = j >> LANES_SHIFT
         return j + group * (LANES * (len(ROWS) - 1))
 
@@ -636,10 +636,8 @@ class KeplerKernel(Kernel):
     def jvp(self, h: ArrayLike, y: np.ndarray, W: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The steps from rows of `y` (N, 2d), and vectors W (N, 2d, k) moved by their derivatives."""
         vectors = y[..., None, :][:, :0] if W is None else W.swapaxes(-1, -2)
-        code, N, k = (
-            self.loops.code(self.form._replace(vectors=vectors.shape[1], compensated=False)),
-            *vectors.shape[:2],
-        )
+        N, k, _ = vectors.shape
+        code = self.loops.code(self.form._replace(vectors=k, compensated=False))
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), (N,))
         nothing = (0.0, 0.0, 0.0)
         rows = np.concatenate([self.loops.rows(y), self.loops.rows(vectors, 0.0).reshape(N, k * code.whole)], axis=1)

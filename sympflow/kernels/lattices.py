@@ -559,7 +559,7 @@ class _Scene:
 
     @contextmanager
     def _piece(self, side: str, f: int) -> Iterator[Value]:
-        """If there is a piece beside, with the first site of field f of q there."""
+        """Execute what is written inside if there is a piece beside, with the first site of field f of q there."""
         code, room = self.code, self.number(side)
         with code.given(~code.apply("eq", (room, 0))):
             yield code.at(code.address(room + self._distance), self.numbers["vector"] * f + self.numbers["low"])

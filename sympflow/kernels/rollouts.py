@@ -59,6 +59,8 @@ class Rollouts(ABC):
         Numbers of a state.
     n_values : int
         Numbers that a stage changes: those of the state, and others behind them, which begin as 0.
+    size : int
+        Numbers of a column.
     lanes : int
         Trajectories of a batch that run side by side: of two registers or four, so that one need not wait for the
         other.
@@ -84,6 +86,7 @@ class Rollouts(ABC):
         False if outputs are never closed, so that the code need not hold a stage for that.
     """
 
+    size: Any
     lanes = 16
     fewest = 2
     room: int | None = None
@@ -112,11 +115,6 @@ class Rollouts(ABC):
     def look(self, values: Any) -> Any:
         """The running state changed, where there is `every`: see `sympflow.kernels.runs.run_function`."""
         return values
-
-    @cached_property
-    def size(self) -> int:
-        """Numbers of a column."""
-        raise NotImplementedError
 
     def prepared(self, table: Any) -> Columns:
         """The columns of a table; a table may be these already."""

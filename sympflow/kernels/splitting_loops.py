@@ -70,6 +70,7 @@ class SplittingLoops:
         self._written: Callable[..., Splitting] | None = None
         self._compile: Callable[..., SplittingRollouts]
         self._longs: dict[int, bool] = {}
+        self._damped_numbers: tuple[Any, np.ndarray] = None, np.empty(0)  # of the latest steps that are all alike
         self.tensors: Sequence[Any] = ()
         self.abreast = 1.0
         self.driven = not system.autonomous
@@ -317,19 +318,27 @@ class SplittingLoops:
         varied: bool,
     ) -> np.ndarray:
         """`step_rows` with friction, whose numbers are no polynomials: by one table, or one of its own for each row."""
-        alike = not varied and (h == h[:1]).all() and (t == t[:1]).all()
-        rows = slice(0, 1 if alike else len(y))
-        own, m = table.valued(x[rows], h[rows]).damped(self.friction), len(table.drifts)
-        values: Sequence[Any] = [*np.tile(y[:, 2 * self.ndof :].T, m)] if varied else self.values
-        if self.driven:
-            numbers = own.timed_rows(values, np.tile(h[rows], m), np.tile(t[rows], m))
-        else:
-            numbers = own.with_constants(values if varied or self.takes_values(table.level) else ())
-        if not alike:
+        alike = len(y) > 0 and not varied and bool((h == h[0]).all() and (t == t[0]).all())
+        rows, key = slice(0, 1 if alike else len(y)), (table, x[0], h[0], t[0]) if alike else None
+        known, numbers = self._damped_numbers
+        if key is None or key != known:
+            numbers = self._damped_table(table, x[rows], h[rows], y, t[rows], varied)
+        if key is None:
             return functions.own_steps(numbers, y[:, : 2 * self.ndof])
+        self._damped_numbers = key, numbers
         out = np.empty_like(y)
         functions.mapped(numbers, y, out)
         return out
+
+    def _damped_table(
+        self, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, t: np.ndarray, varied: bool
+    ) -> np.ndarray:
+        """The numbers of steps with friction, of each stage those of all rows."""
+        own, m = table.valued(x, h).damped(self.friction), len(table.drifts)
+        values: Sequence[Any] = [*np.tile(y[:, 2 * self.ndof :].T, m)] if varied else self.values
+        if self.driven:
+            return own.timed_rows(values, np.tile(h, m), np.tile(t, m))
+        return own.with_constants(values if varied or self.takes_values(table.level) else ())
 
 
 def _layered_code(layered: LayeredPotential, level: int, compensated: bool, monomials: Monomials) -> Any:

@@ -196,7 +196,7 @@ class Terms:
         return self
 
     def derivatives(self, times: int, bends: bool = False) -> list[Program]:
-        """Of a term of each kind ∇f, ∇²f v or ½ ∇³f(v, v), by the times along v; their own derivatives behind."""
+        """∇f, ∇²f v or ½ ∇³f(v, v) of a term of each kind, by the `times` along v; with `bends` their slopes behind."""
         key = times, bends
         if key not in self._programs:
             self._programs[key] = [self._derived(family, *key) for family in self._families]

@@ -216,7 +216,7 @@ def test_it_is_symplectic_at_every_t(lawful):
 def test_its_velocity_is_the_time_derivative_and_that_of_its_hamiltonian(lawful):
     flow, x, unit = lawful
     t, begun = flow.dt * torch.linspace(0.05, 0.95, 5, dtype=torch.float64), started(flow)
-    generated = 1e-10 if flow.system is POLAR else 1e3 * EPS  # its forces of 1e4 r cancel to 1e-4 of their size
+    generated = 1e-10 if flow.system is POLAR else 1e3 * EPS  # a spring of 1e4 times the rounding of r, in each map
     y, velocity = flow.psi_and_velocity(t, x, **begun)
     by_jvp = torch.func.jvp(lambda t: flow.psi(t, x, **begun), (t,), (torch.ones_like(t),))
     torch.testing.assert_close(y / unit, by_jvp[0] / unit, rtol=0, atol=64 * EPS)

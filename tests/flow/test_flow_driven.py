@@ -67,6 +67,14 @@ def test_a_flow_is_fitted_at_all_times_of_the_drive(system, flow):
     assert flow.shape.timed
 
 
+def test_its_hamiltonian_is_near_that_of_the_system(system, flow):
+    """Up to a function of t, at all times of a step."""
+    y = states(system)
+    for t in (0.1, 0.25, DT):
+        H = flow.hamiltonian(t, torch.tensor(y), T0).detach().numpy() - system.hamiltonian(y, T0 + t)
+        assert np.ptp(H) < 1e-2 * np.ptp(system.hamiltonian(y, T0 + t))
+
+
 def test_many_outputs_are_those_of_single_ones(system, flow):
     """χ of 300 outputs, more than are made at once and no multiple of those in a vector, each at its own time."""
     x, span = states(system, 3), (T0, T0 + 299 * DT)

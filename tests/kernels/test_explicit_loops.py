@@ -62,3 +62,13 @@ def test_rows_pieces_and_single_steps_give_the_same_bits(name):
     assert np.array_equal(batch, np.concatenate(pieces, axis=1))
     times = (np.full(11, 0.5),) if t else ()
     assert np.array_equal(kernel.step(np.full(11, 0.02), y0, *times).states, batch[:, 1])
+
+
+def test_a_run_that_ends_keeps_its_finite_states():
+    """H = p²/2 − q⁴ from (1, 1), where p = √(2q⁴ − 1), is at infinity at t = ∫₁^∞ dq/√(2q⁴ − 1) = 0.76."""
+    system = made("p**2/2 - q**4", y0=[1.0, 1.0], dt=0.01)
+    runs = [solve(system, "rk4", (0, 5), backend=b) for b in ("compiled", "array")]
+    assert [run.status for run in runs] == [-1, -1]
+    assert len(runs[0].t) == len(runs[1].t)
+    assert 0.76 < runs[0].t[-1] < 0.85
+    assert np.isfinite(runs[0].y).all()

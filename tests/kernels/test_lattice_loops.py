@@ -36,8 +36,8 @@ def start(system, n=None):
     return np.random.default_rng(3).uniform(-0.5, 0.5, shape)
 
 
-def compared(system, method, y0, **more):
-    """Runs by loops and by arrays have the same states, at times on and off the grid."""
+def assert_loops_are_arrays(system, method, y0, **more):
+    """Runs by loops and by arrays, whose forces are tested by differences, agree at times on and off the grid."""
     options = {"t_span": (0.0, 1.0), "y0": y0, "dt": 0.05, "t_eval": np.array([0.0, 0.5, 0.52, 1.0]), **more}
     loops, arrays = (solve(system, method, backend=backend, **options) for backend in ("compiled", "array"))
     np.testing.assert_allclose(loops.y, arrays.y, rtol=1e-12, atol=1e-13)
@@ -47,9 +47,9 @@ def compared(system, method, y0, **more):
 @pytest.mark.parametrize("method", ["srkn6b", "chin4c"])
 def test_loops_make_the_steps_of_array_operations(method):
     system = chain()
-    compared(system, method, start(system))
-    compared(system, method, start(system, 3))
-    compared(system, method, start(system), t_span=(1.0, 0.0), t_eval=np.array([1.0, 0.31, 0.0]))
+    assert_loops_are_arrays(system, method, start(system))
+    assert_loops_are_arrays(system, method, start(system, 3))
+    assert_loops_are_arrays(system, method, start(system), t_span=(1.0, 0.0), t_eval=np.array([1.0, 0.31, 0.0]))
 
 
 TWO_FIELDS = {
@@ -81,7 +81,7 @@ KINDS = {
 def test_lattices_of_every_kind(kind):
     definition, method = KINDS[kind]
     system = HamiltonianSystem.lattice(**definition)
-    compared(system, method, start(system))
+    assert_loops_are_arrays(system, method, start(system))
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_lattices_of_every_kind(kind):
     ],
 )
 def test_lattices_in_vector_registers(shapes, boundary, method):
-    """Whatever the number of sites: slabs of one site, of two, of several lengths.
+    """Slabs have one site, or two, or several lengths, by the number of sites.
 
     The force of the bonds does not vanish where r = 0, and it has a pole.
     """
@@ -116,7 +116,7 @@ def test_lattices_in_vector_registers(shapes, boundary, method):
             boundary=boundary,
             params={"a": a, "b": 0.3, "m": m},
         )
-        compared(system, method, start(system))
+        assert_loops_are_arrays(system, method, start(system))
 
 
 def test_a_bond_that_is_not_there_may_be_infinite():
@@ -124,7 +124,7 @@ def test_a_bond_that_is_not_there_may_be_infinite():
     system = HamiltonianSystem.lattice(bond={1: "r**2/2", 2: "exp(r) - r"}, shape=(3, 9), boundary="free")
     y0 = start(system)
     y0[: system.ndof] += 800
-    compared(system, "verlet", y0)
+    assert_loops_are_arrays(system, "verlet", y0)
 
 
 @pytest.fixture
@@ -187,6 +187,15 @@ def test_a_run_in_pieces_has_the_bits_of_one(compensated, pieces):
             carry = RunCheckpoint()
             parts = [kernel.run(0.05, y0, n, np.array([n]), carry).states[0] for n in (20, 90)]
         np.testing.assert_array_equal(np.stack(parts), whole)
+
+
+def test_events_and_dense_output_of_a_ring():
+    found = solve(
+        ring(), "srkn6b", t_span=(0, 5), y0=start(ring()), dt=0.05, events=lambda t, y: y[0], dense_output=True
+    )
+    assert found.stats["backend"] == "compiled"
+    assert len(found.t_events[0]) > 0
+    assert np.abs(found.sol(found.t_events[0])[0]).max() < 1e-10
 
 
 @pytest.mark.parametrize("shape", [48, (6, 9)])

@@ -139,7 +139,7 @@ def test_tables_that_do_not_fit_are_refused(changes, message):
 
 
 def test_a_rung_takes_over_the_force_gradients():
-    """If a polynomial holds ½|∇V|², the search begins at the table without one; and comes nearer than that."""
+    """The search begins at the table without a polynomial, where one holds ½|∇V|², and comes nearer than that."""
     options = {"restarts": 1, "points": 60, "label_times": 2, "reference_states": 50}
     before = train(QUARTIC, flow=SympFlow.primed(QUARTIC, 3, dt=0.5, processor=2), **{**options, "restarts": 3})
     start, after = PrimedFit(0.5, stages=3, processor=2, polynomial=6).flow(QUARTIC, earlier=before), {}

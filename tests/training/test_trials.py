@@ -112,6 +112,22 @@ def test_another_shape_is_taken_where_its_error_is_less_at_as_many_kicks(monkeyp
         assert start in trials.all_starts(HH, HH.domain)
 
 
+def test_among_those_with_nearly_the_least_work_the_best_in_long_runs_is_chosen(monkeypatch):
+    near, best = [], None
+
+    def long_errors(flows, *_):
+        near[:] = flows
+        return [1e-9 if flow == best else 1e-6 for flow in flows]
+
+    monkeypatch.setattr(trials, "trial", lambda start, *_: trials.Trial(start, 1e-9, start))
+    monkeypatch.setattr(trials, "long_errors", long_errors)
+    first = trials.chosen_trial(HH, HH.domain).start
+    assert len(near) == trials.NEAREST
+    assert first == near[0]
+    for best in tuple(near):
+        assert trials.chosen_trial(HH, HH.domain).start == best
+
+
 @pytest.mark.parametrize("unit", [1e-15, 1.0, 1e4])
 def test_steps_divide_round_times(unit):
     for dt in np.geomspace(0.01, 9.9, 40) * unit:
