@@ -112,9 +112,10 @@ def solve(
         Initial state [q, p], or a batch of them. The default is the system's. A NumPy array gives float64 (integers are
         promoted); a tensor gives a tensor of its dtype and device, and gradients flow to it.
     tol : float, optional
-        The largest relative energy error that is asked for. A method of fixed steps takes the step that
-        `sympflow.choose_step` finds by short trial runs; for "sympflow" it chooses the flow, see its option. The run
-        itself is checked: where its energy error is larger, a RuntimeWarning and the message say so.
+        The largest relative energy error that is asked for; on the logarithmic clock, which may keep H where the time
+        is wrong, the error of states. A method of fixed steps takes the step that `sympflow.choose_step` finds by short
+        trial runs; for "sympflow" it chooses the flow, see its option. The run itself is checked: where its energy
+        error is larger, a RuntimeWarning and the message say so.
     tol_of : {"energy", "state"}
         See `sympflow.choose_step`.
     params : mapping of str to array_like, optional

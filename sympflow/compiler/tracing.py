@@ -698,6 +698,9 @@ class Chain(NamedTuple):
     layers: list[tuple[Any, Any]]
 
 
+NO_CHAIN = "its linear layers do not follow one another with the same function between all features"
+
+
 def trace_chain(function: Callable[..., Any], names: Sequence[str]) -> Chain:
     """Record a function of a tensor with linear layers, whose weights may change: see `trace`."""
     recording = _Recorded()
@@ -710,13 +713,13 @@ def trace_chain(function: Callable[..., Any], names: Sequence[str]) -> Chain:
     _check_inputs(first, inputs)
     for before, layer in pairwise(layers):
         if len(layer.given) != len(before.results):
-            raise Untraceable("its layers are no chain")
+            raise Untraceable(NO_CHAIN)
         each = [Program([z], [x]) for z, x in zip(before.results, layer.given, strict=True)]
         for program, z in zip(each, before.results, strict=True):
             _check_inputs(program, [z])
         between.append(traced(each[0], "a"))
         if len({str(traced(program, "a")) for program in each}) > 1:
-            raise Untraceable("its layers are no chain")
+            raise Untraceable(NO_CHAIN)
     last = Program([*inputs, *layers[-1].results], [value])
     _check_inputs(last, last.inputs)
     return Chain(first, between, last, [(layer.weight, layer.bias) for layer in layers])
@@ -726,7 +729,7 @@ def _check_inputs(program: Program, inputs: Sequence[Traced]) -> None:
     """Refuse a program that depends on other numbers than these."""
     known = {x.order for x in inputs}
     if any(x.name == "input" and x.order not in known for x in reached(program.outputs)):
-        raise Untraceable("its layers are no chain")
+        raise Untraceable(NO_CHAIN)
 
 
 def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:

@@ -31,8 +31,9 @@ SHORTEST, LONGEST, SCANNED = 1e-30, 1e30, 30001
 FAR, REACH = (10.0, 100.0), 2.0
 """Bond lengths at which V must have fallen off faster than bodies grow in number, and which a cut-off must have."""
 MOST_WRITTEN = 45
-MOST_SPELLED_PAIRS = 400
 """Differences of coordinates of two bodies up to which pairs are written out: six bodies in space."""
+MOST_SPELLED_PAIRS = 400
+"""Pairs up to which H is written in symbols, term by term, for methods that need it so."""
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
 """Pairs up to which the energy at the end of a run is always looked at, and steps beside which it costs nothing."""
 
@@ -382,7 +383,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return out.reshape(*out.shape[:-2], self.ndof)
 
     def _both_ends(self, f: Array, pairs: Pairs) -> tuple[Array, Array]:
-        """What the first and the second bodies of pairs feel of these values (..., P, dim)."""
+        """Values (..., P, dim) for the first and for the second bodies of pairs."""
         return f, f
 
     def _pairs(self, *arrays: Array) -> Iterator[Pairs]:

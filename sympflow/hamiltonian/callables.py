@@ -544,7 +544,7 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
             f"`{name}` failed on a torch tensor of shape {tuple(x.shape)} ({error}){traced}. Write it with NumPy's or "
             "torch's functions of (..., d) arrays, or pass `gradient` as well, or use HamiltonianSystem.from_sympy."
         ) from error
-    if untraced and not is_tensor(value) and hasattr(value, "dtype"):
+    if untraced and isinstance(value, np.ndarray | np.generic):
         raise TypeError(
             f"`{name}` could not be traced, for {untraced}, and torch cannot differentiate what it returns. Write it "
             "with functions that have a rule, or pass `gradient` as well, as spline(q, 1) of a spline of SciPy."

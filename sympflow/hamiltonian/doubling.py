@@ -122,7 +122,7 @@ def doubled(
     Raises
     ------
     TypeError
-        If `system` is no HamiltonianSystem, or `force` is neither text, expression nor function.
+        If `system` is not a HamiltonianSystem, or `force` is neither text, expression nor function.
     ValueError
         If `force` has another number of components, cannot be parsed, or holds symbols without values.
 

@@ -59,7 +59,7 @@ RELATIONS = {ast.Lt: sp.Lt, ast.LtE: sp.Le, ast.Gt: sp.Gt, ast.GtE: sp.Ge}
 
 
 class Unreadable(ValueError):
-    """Why a text is refused, as a clause."""
+    """Refusal of a text, with the reason as a clause."""
 
 
 def read(text: str, names: Collection[str] = ()) -> sp.Expr:
@@ -128,7 +128,7 @@ def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
 
 
 def complex_part(f: sp.Expr) -> sp.Expr | None:
-    """A part of an expression that is no real number, whatever the values of its symbols; None without."""
+    """A part of an expression that is not real, whatever the values of its symbols; None without."""
     if f.has(sp.I):
         return sp.I
     powers = (a for a in f.atoms(sp.Pow) if not a.exp.is_number and a.base.is_negative)

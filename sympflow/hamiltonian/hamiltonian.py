@@ -341,7 +341,7 @@ class Hamiltonian:
             return ()
         if self.definition.impulses:
             self.check_impulses(
-                "so that H and its derivatives are no functions",
+                "so that H and its derivatives are infinite there",
                 "solve it by sympflow.solve; or use system.between_impulses, and the kicks of p between by "
                 "system.kicks(t0, t1)",
             )

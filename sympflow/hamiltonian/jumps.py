@@ -170,7 +170,7 @@ def check_continuous(
 def _jump_in_states(
     border: Border, states: set[sp.Symbol], values: Mapping[sp.Symbol, Any]
 ) -> tuple[sp.Symbol, float, float, float] | None:
-    """Where an expression jumps across a border, by a symbol, its value, and those on the sides; None if nowhere."""
+    """Return a jump of an expression across a border: a symbol, its value, and those on the sides; None without."""
     rng, n = np.random.default_rng(0), 64
     variables = sorted(border.symbols, key=str)
     given = {s: rng.choice(np.ravel(values[s]), n) if s in values else _tried(s, (n,), rng) for s in variables}

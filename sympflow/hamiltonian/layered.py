@@ -33,11 +33,14 @@ class LayeredPotential:
         From how many numbers to how many each layer goes.
     tensors : list of Tensor
         The weights and biases, in their order.
+    first : Program
+        From q to x_1.
     """
 
     def __init__(self, ndof: int, chain: Chain, inverse_mass: np.ndarray | None) -> None:
         M = np.ones(ndof) if inverse_mass is None else inverse_mass
         self.ndof, self._chain, self.inverse_mass = ndof, chain, np.diag(M) if M.ndim == 1 else M
+        self.first = chain.first
         self.sizes = [(w.shape[1], w.shape[0]) for w, _ in chain.layers]
         self.tensors = [x for pair in chain.layers for x in pair if x is not None]
         if sum(map(sum, self.sizes)) > MOST_FEATURES or self.sizes[-1][1] > MOST_OUTPUTS:
@@ -53,7 +56,7 @@ class LayeredPotential:
 
     @cached_property
     def starts(self) -> list[tuple[int, int | None]]:
-        """Where the weights of each layer begin among all numbers, and its biases."""
+        """Places among all numbers at which the weights of each layer begin, and its biases."""
         found, n = [], 0
         for (come, go), (_, bias) in zip(self.sizes, self._chain.layers, strict=True):
             found.append((n, None if bias is None else n + come * go))
@@ -62,7 +65,7 @@ class LayeredPotential:
 
     @cached_property
     def n_weights(self) -> int:
-        """How many numbers the tensors have."""
+        """Count of the numbers in the tensors."""
         return sum(x.numel() for x in self.tensors)
 
     @property
@@ -89,11 +92,6 @@ class LayeredPotential:
             (slope,) = gradient(program.outputs[0], program.inputs)
             found.append(Program(program.inputs, [*program.outputs, slope, *gradient(slope, program.inputs)]))
         return found
-
-    @property
-    def first(self) -> Program:
-        """From q to x."""
-        return self._chain.first
 
     @cached_property
     def first_moved(self) -> Program:

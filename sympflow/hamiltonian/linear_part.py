@@ -344,7 +344,7 @@ def quadratic_terms(H: sp.Expr, variables: tuple[sp.Symbol, ...]) -> tuple[sp.Ex
 
 
 def _degree(term: sp.Expr, variables: tuple[sp.Symbol, ...]) -> float:
-    """Total degree of a monomial; infinite for what is no monomial."""
+    """Total degree of a monomial; infinite for other expressions."""
     if not term.free_symbols:
         return 0
     powers = term.as_powers_dict()
@@ -370,7 +370,7 @@ def inverse_mass(system: Any) -> np.ndarray:
 
 
 def turning(system: Any, part: LinearPart | None) -> str | None:
-    """Why a constant K does not follow the stiff directions of V, or None.
+    """Reason for which a constant K does not follow the stiff directions of V, or None.
 
     ∇²V is taken at states of low potential, in the domain or about y0: in the valleys where orbits are. It is stiff if
     at the median state a gap divides its curvatures; then the stiff directions must be those of K at all of them, or,

@@ -49,7 +49,7 @@ class LocalHamiltonian(Definition, ABC):
     frame: Any = None
     """The coordinates of planets about a star, of a system that knows its star: see `sympflow.hamiltonian.planets`."""
     arrays_only: str = ""
-    """What in the system has no compiled kicks, "" if all has."""
+    """The part of the system without compiled kicks; "" if all has them."""
     written: SymbolicHamiltonian | None = None
     """H in symbols, of a system so small that it is written out when symbols are asked for."""
     loops: str
@@ -62,7 +62,7 @@ class LocalHamiltonian(Definition, ABC):
         """Return the definition with other values of some parameters."""
 
     def check_names(self, names: Iterable[str]) -> None:
-        """Refuse names that are no parameters, with those that there are."""
+        """Refuse names other than those of parameters, which the message lists."""
         for name in names:
             if name not in self.params:
                 raise ValueError(
@@ -71,7 +71,7 @@ class LocalHamiltonian(Definition, ABC):
                 )
 
     def check_numbers(self, names: Iterable[str]) -> None:
-        """Refuse names that are no parameters, and those of arrays, of which trajectories have none of their own."""
+        """Refuse names other than those of parameters, and arrays: trajectories share them."""
         names = list(names)
         self.check_names(names)
         for name in names:

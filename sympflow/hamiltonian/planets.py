@@ -282,7 +282,7 @@ class Frame:
 
 
 def frame_of(local: Any, y0: Any) -> Frame | None:
-    """The frame of planets, or of a star and bodies in pairs that attract each other as these do; None of others."""
+    """The frame of planets, or of a star and bodies in pairs that attract each other so; None for other systems."""
     if isinstance(local, PlanetsHamiltonian):
         return local.frame
     G = newtonian(local) if isinstance(local, PairsHamiltonian) else None
@@ -290,7 +290,7 @@ def frame_of(local: Any, y0: Any) -> Frame | None:
 
 
 def newtonian(local: PairsHamiltonian) -> float | None:
-    """G of bodies in space that attract each other by −G m₁m₂/r; None of others."""
+    """G of bodies in space that attract each other by −G m₁m₂/r; None for other systems."""
     if local.dim != 3 or local.box is not None or local.cutoff is not None or local.softening or len(local.first) != 1:
         return None
     if not np.array_equal(local.columns[0], local.masses):
@@ -499,7 +499,6 @@ class PlanetsHamiltonian(PairsHamiltonian):
     def with_params(self, values: Mapping[str, Any]) -> Self:
         other = super().with_params(values)
         other.constants = (other.params["G"],)
-        vars(other).pop("frame", None)
         return other
 
 

@@ -74,10 +74,14 @@ class Poles(Protocol):
     def look(
         self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Numbers (..., m) that differ on the two sides of a place, H and T: states (..., 2d), times (...)."""
+        """Numbers (..., m) that differ on the two sides of a place, H and T at states (..., 2d) and times (...).
+
+        T is None, and H is 0 or NaN, where runs are not judged by the size of H.
+        """
 
     def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
-        """The values that vanish at the places: (..., m)."""
+        """The values (..., m) that vanish at the places by which H is judged."""
+        return np.empty((*y.shape[:-1], 0))
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         """Return True if H is infinite, or no number, on the way between states y (2, 2d) in two cells."""
@@ -176,9 +180,6 @@ class LatticePoles(Poles):
         ending = self._columns("endings", _endings, y)
         return cells, np.where(np.isnan(ending).any(-1), np.nan, 0.0), None
 
-    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
-        raise NotImplementedError("LatticePoles has no sizes: its H is not looked at.")
-
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         f, x, place, axis, k, i, _ = self._at(column, y)
         letters = (*x, *self._lattice.c)
@@ -263,9 +264,6 @@ class PairsPoles(Poles):
             sums += np.stack([((a - b) * number).sum(-1) for a, b in zip(cells, beyond, strict=True)], axis=-1)
         return sums, np.where(np.isnan(self._pairs.potential(q)), np.nan, 0.0), None
 
-    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
-        raise NotImplementedError("PairsPoles has no sizes: its H is not looked at.")
-
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         names = (self._x, *self._pairs.first, *self._pairs.second, *self._pairs.c)
         for _, _, x, letters in self._pairs.met(y[..., : self._pairs.ndof]):
@@ -298,7 +296,7 @@ def _cells(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
 
 
 def _endings(f: sp.Expr, x: tuple[sp.Symbol, ...]) -> list[sp.Expr]:
-    """The parts of f that are no number beyond some place."""
+    """The parts of f that are NaN beyond some place."""
     return [*f.atoms(*_ENDING), *(power for power in f.atoms(sp.Pow) if power.exp.is_integer is False)]
 
 
@@ -465,7 +463,7 @@ def _removable(f: sp.Expr, place: Place) -> sp.Expr | None:
 def infinite_between(
     f: sp.Expr, cell: sp.Expr, letters: tuple[sp.Symbol, ...], a: Sequence[float], b: Sequence[float]
 ) -> bool:
-    """Return True if f grows without bound, or is no real number, where the cell changes from a to b (k,)."""
+    """Return True if f grows without bound, or is not real, where the cell changes from a to b (k,)."""
     function, number = _precise(f, cell, letters)
     with mpmath.workdps(DIGITS):
         start, way = [mpmath.mpf(x) for x in a], [mpmath.mpf(y) - mpmath.mpf(x) for x, y in zip(a, b, strict=True)]

@@ -137,11 +137,12 @@ def _hessians(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
 
 
 def started(system: Any, y0: np.ndarray) -> Any:
-    """Return the system, where it has no initial state a copy with that of y0 (..., 2d) with the highest energy."""
+    """Return the system; without a y0 of its own, a copy with dt, and the state of highest energy of y0 (..., 2d)."""
     if system.y0 is not None:
         return system
     other = bare_copy(system)
     rows, highest = y0.reshape(-1, y0.shape[-1]).astype(float), 0
+    other.dt = default_step(system, rows) if system.step_is_open else system.dt
     if len(rows) > 1 and system.autonomous:
         with np.errstate(all="ignore"):
             highest = int(np.argmax(np.nan_to_num(system.hamiltonian(rows), nan=-np.inf, posinf=-np.inf)))

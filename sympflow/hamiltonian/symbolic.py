@@ -260,7 +260,7 @@ class SymbolicHamiltonian(Definition):
 
     @cached_property
     def _switches(self) -> list[Switch]:
-        """Where H may jump in t alone."""
+        """Borders at which H may jump in t alone."""
         if self.time is None:
             return []
         own = [border for border in borders(self.H, [self.time]) if border.g.free_symbols == {self.time}]

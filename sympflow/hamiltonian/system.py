@@ -476,7 +476,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         Raises
         ------
         TypeError, ValueError
-            If the system is no lattice, or has a rate of friction for each site, or the shape does not fit its bonds.
+            If the system is not a lattice or has a rate of friction for each site, or the shape does not fit its bonds.
 
         Examples
         --------
@@ -670,7 +670,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         return self._params
 
     def check_parameters(self, names: Iterable[str]) -> None:
-        """Refuse names that are no parameters of H.
+        """Refuse names other than those of the parameters of H.
 
         Raises
         ------

@@ -133,7 +133,7 @@ EPSILON = 119.8
 """Depth of the potential in kelvin (times Boltzmann's constant)."""
 
 SIGMA = 0.341
-"""Where the potential is zero, in nanometres."""
+"""Distance at which the potential is zero, in nanometres."""
 
 MASS = 66.34e-27 / 1.380658e-23
 """The mass of an atom, in K·ns²/nm²: kilograms over Boltzmann's constant, 1 nm/ns being 1 m/s."""

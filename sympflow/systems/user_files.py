@@ -218,7 +218,7 @@ def _domain(table: dict[str, Any], file: Path) -> Ball | Box | EnergySublevel | 
         return domain_from_dict(table)
     except ValueError as error:
         said = str(error).removeprefix("`description` is not a domain: ").rstrip(".")
-        raise ValueError(f"`domain` is no {kind}: {said} (in {str(file)!r}).") from error
+        raise ValueError(f"`domain` is not a {kind}: {said} (in {str(file)!r}).") from error
 
 
 def _is_number(value: Any) -> bool:

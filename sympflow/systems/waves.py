@@ -31,7 +31,7 @@ def grid(system: HamiltonianSystem) -> np.ndarray:
     Raises
     ------
     ValueError
-        If the system is no lattice of one axis and one field.
+        If the system is not a lattice of one axis and one field.
     """
     from sympflow.hamiltonian.lattice import LatticeHamiltonian
     from sympflow.hamiltonian.wave_functions import WaveFunctionHamiltonian

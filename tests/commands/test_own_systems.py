@@ -209,7 +209,7 @@ def test_a_wrong_word_is_named(word, message, files):
         ("f.toml", 'hamiltonian = "p**2 + q**2"\ndt = true', "`dt` must be a number; got True"),
         ("f.toml", 'hamiltonian = "p**2 + q**2"\nt_span = [1, 2, 3]', "`t_span` must be two"),
         ("f.toml", 'hamiltonian = "p**2 + q**2"\n[domain]\nkind = "Bax"', "`domain` needs a kind, one of Ball, Box"),
-        ("f.toml", 'hamiltonian = "p**2 + q**2"\n[domain]\nkind = "Box"\nlow = [1, 2]', "`domain` is no Box"),
+        ("f.toml", 'hamiltonian = "p**2 + q**2"\n[domain]\nkind = "Box"\nlow = [1, 2]', "`domain` is not a Box"),
         ("f.toml", 'hamiltonian = "p**2"\n[domain]\nkind = "Box"\nr = 1', "`domain` has a key 'r', but a Box has low"),
         ("f.py:x", "import a_module_that_is_not_there", "`system` 'f.py' cannot be run (ModuleNotFoundError"),
         ("f.py:x", "def f(:", "`system` 'f.py' cannot be run (SyntaxError: invalid syntax, line 1): mend it."),

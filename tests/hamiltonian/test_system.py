@@ -459,3 +459,13 @@ def test_parametric_form(text, params, expected, values):
     numeric = form.H.subs(dict(zip(form.parameters, values, strict=True)))
     mine, its = ([f.subs(y) for y in at] for f in (numeric, symbols.H))
     assert abs((mine[1] - mine[0]) - (its[1] - its[0])) < 1e-14  # but for a constant
+
+
+@pytest.mark.parametrize("domain", [None, Ball([0.0, 0.0], 1.0)])
+@pytest.mark.parametrize("method", ["kahan_li8", "log_kahan_li8", "tao4"])
+def test_without_y0_every_method_takes_the_same_default_step_whatever_was_read_before(domain, method):
+    """That of the fastest motion, of the rate √3|q| here: at the given states, or in the domain if there is one."""
+    y0 = np.array([[9.0, 0.0], [0.1, 0.1]])
+    fresh, read = (made("p**2/2 + q**4/4", domain=domain) for _ in range(2))
+    dt = float(f"{0.05 / (np.sqrt(3) * 9):.2g}") if domain is None else read.dt
+    assert [solve(system, method, (0, 1), y0).stats["n_steps"] for system in (fresh, read)] == [np.ceil(1 / dt)] * 2

@@ -284,7 +284,7 @@ def test_networks_that_are_no_chain_run_as_arrays():
     system = HamiltonianSystem(lambda q: V(q) + V(q + 0.1), ndof=2)
     sol = solve(system, "verlet", (0, 1), torch.tensor(start(system, ())), dt=0.1)
     assert sol.stats["backend"] == "torch"
-    assert "its layers are no chain" in repr(system)
+    assert "its linear layers do not follow one another" in repr(system)
     assert torch.autograd.grad(sol.y.sum(), net[0].weight)[0].abs().max() > 0
 
 
