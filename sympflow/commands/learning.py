@@ -75,6 +75,8 @@ def learn(
         from sympflow.learning.learner import learn as learn_flow
         from sympflow.learning.trajectories import Trajectories
 
+        if damping and drag:
+            raise ValueError("`--drag` is learned in place of `--damping`: leave out one of them.")
         ready_file(to)
         if plot is not None:
             ready_file(plot, "--plot")
@@ -107,8 +109,10 @@ def learn(
         print_table(titles, rows)
         learned = flow.recipe["learned"]
         out.print(f"Chosen: {learned['model']}, for {learned['reason']}", markup=False)
-        formula = flow.system.expression
+        formula = learned.get("physical")
         show("H is the flow's own, of no formula." if formula is None else f"H = {formula}")
+        if learned.get("drag"):
+            show(f"drag = {', '.join(learned['drag'])}")
         if flow.system.friction:
             show(f"damping = {flow.system.friction.damping.tolist()}")
         shown = {k: v for k, v in flow.figures.items() if k.startswith(("held_out_error", "noise", "energy_scatter"))}

@@ -504,10 +504,6 @@ class Code:
                 variable.value = x
         return [x.value for x in variables]
 
-    def fold(self, count: Any, x: Value, body: Callable[[Value, Value], Value]) -> Value:
-        """Return what `body(k, x)` makes of a value, one turn after the other, for k = 0 … count − 1."""
-        return self.loop(count, [x], lambda k, values: [body(k, values[0])])[0]
-
     @contextmanager
     def sweep(self, first: Value, last: Value, read: Callable[[Any, Value], Value]) -> Iterator[Sweep]:
         """Execute what is written inside for k = first … last − 1, at least once, with values of other turns."""

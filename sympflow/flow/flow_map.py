@@ -345,7 +345,7 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         return sum(w.numel() for w in self.parameters())
 
     def identity_parts(self) -> Any:
-        """Return what a store knows it by: the map alone, without what is told of it."""
+        """Return the description by which a store recognises it: the map alone, without its records."""
         return [self.kind, self.architecture(), self.dt, dict(self.state_dict())]
 
     # its system ---------------------------------------------------------------------------------------------

@@ -67,7 +67,7 @@ class Layer(nn.Module):
 
 
 class OwnLayer(Layer):
-    """A layer that is made of what its flow knows."""
+    """A layer that takes its numbers and functions from its flow."""
 
     def __init__(self, flow: Any) -> None:
         super().__init__()

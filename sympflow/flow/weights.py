@@ -76,7 +76,7 @@ def checksum(tensors: Mapping[str, Tensor]) -> str:
 
 
 class Kept(Generic[T]):
-    """Something made of tensors in some modules' dictionaries, and made anew when one of them has changed.
+    """An object made of tensors in some modules' dictionaries, and made anew when one of them has changed.
 
     Their values are read from memory in microseconds, edits through `.data` included.
     """

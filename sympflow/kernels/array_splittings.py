@@ -6,7 +6,7 @@ depend on the size of a system; or functions at an address.
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,7 +31,7 @@ __all__ = ["ArrayCode", "Functions", "TermForces", "function_code", "term_code"]
 ARRAYS = 4  # of d numbers that a kick needs: slopes, velocities, products with the Hessian, curvatures
 
 
-class Forces:
+class Forces(ABC):
     """Derivatives of V and T as code, which reads arrays `data`: the inverse mass (d,) or (d, d), if any, last."""
 
     lanes = 1

@@ -348,9 +348,10 @@ class _Errors:
                 error = self.error(row) * self.weight(self.scale, row)
                 code.store(error, self.r, (j * n_errors + row) * n + start)
             with code.over(n_errors - self.n_rows):
-                code.store(
-                    code.fold(self.n_slopes, self.zero, self.summed), self.r, (j * n_errors + self.n_rows) * n + start
-                )
+                total = code.variable(self.zero)
+                with code.over(self.n_slopes) as m:
+                    total.value = fma(self.error(m), self.weight(self.slope, m), total.value)
+                code.store(total.value, self.r, (j * n_errors + self.n_rows) * n + start)
             if self.linearized:
                 with code.over(n_errors) as row:
                     self.back(row)
@@ -388,9 +389,6 @@ class _Errors:
 
     def error(self, row: Value) -> Value:
         return self.W[self.place(row)] - self.weight(self.Y, row)
-
-    def summed(self, k: Value, total: Value) -> Value:
-        return fma(self.error(k), self.weight(self.slope, k), total)
 
     # the way there ----------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ hundred bodies. Those of a team run the same compiled code from the first step t
 from __future__ import annotations
 
 import os
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
@@ -111,7 +111,7 @@ class Member:
     others: Any = ()
 
 
-class SharedMemory(Memory):
+class SharedMemory(Memory, ABC):
     """A state in memory as so many sets of numbers, positions, momenta and their errors, which threads share."""
 
     at_once = 8

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from sympflow.learning.library import Library, library_for, polynomials
-from sympflow.learning.models import drags, turns
+from sympflow.learning.models import Force, drags, frictions, turns
 from sympflow.learning.parts import Drive, Polynomial
 from sympflow.learning.smoothing import Smooth
 from sympflow.learning.trajectories import Trajectories
@@ -20,6 +20,10 @@ MUCH_BETTER = 0.1
 """The same of a vector field that is not Hamiltonian: a sum that has more terms leaves less by itself."""
 ALIKE = 1.2
 """Factor by which a reading may leave more than the best, and is named if it stands before it."""
+FRICTION = (
+    "Friction p' = -γp with γ = {} would leave much less: the data are dissipative, areas of phase space shrink as "
+    "exp(-γt), and no symplectic map explains them. Learn a flow with damping."
+)
 TURNED = (
     "The second half looks like velocities in a uniform magnetic field, by which p_i' = B p_j, p_j' = -B p_i with "
     "B = {} for i < j. These are not momenta, which with a mass m are p_i - m B q_j/2 and p_j + m B q_i/2: pass "
@@ -36,40 +40,37 @@ FREQUENCIES = 1000
 """Halves of the angular frequency π over the longest time, up to which that of a drive is looked for."""
 
 
-def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str, damped: bool = False) -> str:
+def hint(
+    library: Library,
+    smooth: Smooth,
+    data: Trajectories,
+    otherwise: str,
+    force: Force | None = None,
+    drive: Drive | None = None,
+) -> str:
     """The likeliest reason why the terms do not explain the data, with the remedy; else what is said otherwise.
 
-    Of a model that was `damped` friction is no reason.
+    A force and a drive that the model has already are no reason; beside any force friction is none.
     """
     d, scales = data.ndof, data.scales
     x, v = smooth.points, smooth.slopes
-    friction = np.zeros((*x.shape, d))
-    for i in range(d):
-        friction[:, d + i, i] = -x[:, d + i]
-    of_terms = library.fields(x)
-    X = np.concatenate([of_terms, friction], 2) if damped else of_terms
+    X = library.fields(x)
+    if force is not None:
+        X = np.concatenate([X, fields_of(force, x)], 2)
+    if drive is not None:
+        X = _with_drive(X, smooth, drive, drive.frequency)
     left = _left(X, v, scales)[0]
     found: list[tuple[float, str]] = []
     whole = library_for(None, d, 4, x)[0]
     widest = _left(whole.fields(x), v, scales)[0]
     if not {*whole.expressions} <= {*library.expressions}:
         found.append((widest, "Terms outside of the library fit much better: leave `terms` out, or give others."))
-    if not damped:
-        rest, theta = _left(np.concatenate([X, friction], 2), v, scales)
-        found.append(
-            (
-                rest,
-                f"Friction p' = -γp with γ = {_said(theta[-d:])} would leave much less: the data are dissipative, "
-                "areas of phase space shrink as exp(-γt), and no symplectic map explains them. Learn a flow with "
-                "damping.",
-            )
-        )
-    if d > 1:
-        turned = np.moveaxis(turns(x.T)[0], -1, 0)
-        rest, theta = _left(np.concatenate([X, turned], 2), v, scales)
-        found.append((rest, TURNED.format(_said(theta[-turned.shape[2] :]))))
-    rest, theta = _left(np.concatenate([X, np.moveaxis(drags(x.T)[0], -1, 0)], 2), v, scales)
-    found.append((rest, DRAG.format(_said(theta[-d:]))))
+    for cause, said in ((frictions, FRICTION), (turns, TURNED), (drags, DRAG)):
+        if cause is force or (cause is frictions and force is not None) or (cause is turns and d == 1):
+            continue
+        pushes = fields_of(cause, x)
+        rest, theta = _left(np.concatenate([X, pushes], 2), v, scales)
+        found.append((rest, said.format(_said(theta[-pushes.shape[2] :]))))
     if d > 1:
         pairs = [*range(0, 2 * d, 2), *range(1, 2 * d, 2)]
         with np.errstate(all="ignore"):
@@ -89,8 +90,9 @@ def hint(library: Library, smooth: Smooth, data: Trajectories, otherwise: str, d
                 f"The second half looks like velocities, of masses {said}: pass velocity_mass=[…], by which p = M v.",
             )
         )
-    rest, frequency = _driven(X, smooth, scales, polynomial_drive(scales))
-    found.append((rest * left, DRIVEN.format(*2 * [f"{frequency:.5g}"])))
+    if drive is None:
+        rest, frequency = _driven(X, smooth, scales, Drive(Polynomial.up_to(2, "q", scales[:d]), 1.0))
+        found.append((rest * left, DRIVEN.format(*2 * [f"{frequency:.5g}"])))
     least = min(found)[0]
     best = next(one for one in found if one[0] <= ALIKE * least)
     if best[0] < BETTER * left:
@@ -114,10 +116,9 @@ def _said(numbers: np.ndarray) -> str:
     return ", ".join(f"{number:.3g}" for number in numbers)
 
 
-def polynomial_drive(scales: np.ndarray) -> Drive:
-    """Forces and stiffnesses that a clock moves, of the first frequency that comes."""
-    d = len(scales) // 2
-    return Drive(Polynomial.up_to(2, "q", scales[:d]), 1.0)
+def fields_of(force: Force, x: np.ndarray) -> np.ndarray:
+    """The fields (n, 2d, k) of a force at states (n, 2d)."""
+    return np.moveaxis(force(x.T)[0], -1, 0)
 
 
 def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> float:

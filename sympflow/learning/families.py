@@ -13,7 +13,7 @@ import numpy as np
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.inertia import Inertia
 from sympflow.learning.maps import NetworkFlow
-from sympflow.learning.models import Force, Model
+from sympflow.learning.models import Force, Model, drags
 from sympflow.learning.parts import Distances, Drive, FixedKinetic, Formula, Kinetic, Network, Part, Polynomial, Waves
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
@@ -293,6 +293,10 @@ def families(constraints: Constraints, name: str | None) -> list[str]:
         constraints.separable is False or (name and not FAMILIES[name].separable)
     ):
         raise ValueError("`drive` is of a separable H: leave out `separable`, or the `family`.")
+    if constraints.frequency is not None and constraints.force is drags:
+        raise ValueError("`drive` is learned beside friction, not beside drag: pass damping=True, or leave it out.")
+    if constraints.frequency is not None and any(not part.kicks for part in constraints.known):
+        raise ValueError("`drive` is of H = ½ pᵀM⁻¹p + V(q, t), which `known` does not fit: leave out one of them.")
     if constraints.inverse_mass is not None and (
         constraints.separable is False or (name and not FAMILIES[name].separable)
     ):

@@ -15,12 +15,7 @@ from sympflow.arguments import check_flag, plain
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.families import Constraints, families
-from sympflow.learning.fitting import (
-    LAG,
-    Setting,
-    limit_of,
-    noise_of,
-)
+from sympflow.learning.fitting import LAG, Setting, limit_of, noise_of
 from sympflow.learning.models import drags, friction, frictions
 from sympflow.learning.parts import Formula
 from sympflow.learning.search import Search, drive_frequency_of
@@ -93,8 +88,9 @@ def learn(
         True to learn one rate γ of friction, p' = −∂H/∂q − γp; "each" for one rate for each p; "quadratic" for drag,
         p_i' = −∂H/∂q_i − c_i|p_i|p_i, by which `flow.system` is `sympflow.doubled`.
     drive : bool or float
-        True to learn forces and stiffnesses a cos ωt + b sin ωt, and ω, in the time of the data; or ω, about. Then
-        `flow.system` is an H(q, p, t) of period 2π/ω.
+        True to learn forces and stiffnesses a cos ωt + b sin ωt, and ω, in the time of the data; or ω, about, in
+        radians per unit of that time. Then `flow.system` is an H(q, p, t) = ½ pᵀM⁻¹p + V(q, t) of period 2π/ω, beside
+        friction or none, not beside drag.
     period : float or array_like of shape (d,), optional
         Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none. Angles that
         were wrapped are continued.
@@ -147,11 +143,14 @@ def learn(
     data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()
     data.check_angles(None if period is None else np.isinf(periods_of(period, data.ndof)))
-    seed, damping = plain(seed), plain(damping)
+    seed, damping, drive, replicas = plain(seed), plain(damping), plain(drive), plain(replicas)
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
     constraints = _constraints(data, separable, mass, damping, period, known)
-    check_drive(drive)
+    if not isinstance(drive, bool) and not (isinstance(drive, int | float) and 0 < drive < math.inf):
+        raise ValueError(
+            f"`drive` must be True, for a frequency that is found, a positive one, or False; got {drive!r}."
+        )
     huber = limit_of(loss)
     dt = plain(dt)
     if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
@@ -217,14 +216,6 @@ def _few(data: Trajectories, seed: int) -> Trajectories:
     drawn = np.random.default_rng(seed).permutation(len(data.runs))
     numbers = np.cumsum([np.isfinite(data.runs[i].y).sum() for i in drawn])
     return data.subset(sorted(drawn[: max(1, int(np.searchsorted(numbers, MOST_VALUES, side="right")))]))
-
-
-def check_drive(drive: Any) -> None:
-    """Refuse a drive that is neither True or False nor a positive angular frequency."""
-    if not isinstance(drive, bool) and not (isinstance(drive, int | float) and 0 < drive < math.inf):
-        raise ValueError(
-            f"`drive` must be True, for a frequency that is found, a positive one, or False; got {drive!r}."
-        )
 
 
 def _constraints(data: Trajectories, separable: Any, mass: Any, damping: Any, period: Any, known: Any) -> Constraints:

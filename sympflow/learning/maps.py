@@ -6,7 +6,6 @@ initial states, by the same shooting as the numbers of an H.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -20,7 +19,7 @@ from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
 from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.learning.models import VectorField
-from sympflow.learning.orbits import Method, Stepper
+from sympflow.learning.orbits import Orbit, Over, Stepper
 
 ON_TIME = 1e-9
 """Share of Δt by which a time may exceed it and still counts as Δt."""
@@ -38,29 +37,20 @@ class OwnSteps(Stepper):
     ) -> Any:
         return model.psi(theta, h, x, X)
 
-    def orbit(
-        self,
-        method: Method,
-        model: Any,
-        theta: np.ndarray,
-        x: np.ndarray,
-        X: np.ndarray | None,
-        gaps: np.ndarray,
-        t: np.ndarray,
-    ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+    def orbit(self, over: Over, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray) -> Orbit:
         passed = np.zeros(x.shape[1])  # since the last whole step
         for gap in gaps:
             passed = passed + gap
             while (late := passed > self.longest * (1 + ON_TIME)).any():
                 some = None if X is None else X[..., late]
-                end, slopes = self.step(model, theta, x[:, late], some, np.full(int(late.sum()), self.longest), t[late])
+                end, slopes = over(x[:, late], some, np.full(int(late.sum()), self.longest), t[late])
                 x = x.copy()
                 x[:, late] = end
                 if X is not None:
                     X = X.copy()
                     X[..., late] = slopes
                 passed[late] -= self.longest
-            yield self.step(model, theta, x, X, passed, t) if passed.any() else (x, X)
+            yield over(x, X, passed, t) if passed.any() else (x, X)
 
 
 class NetworkFlow(VectorField):

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from sympflow.learning.parts import Drive, Linear, Part, Polynomial
+
 if TYPE_CHECKING:
     import sympy
-from sympflow.learning.parts import Drive, Linear, Part, Polynomial
 
 NEWTON = 8  # steps by which momenta are found of velocities
 
@@ -37,6 +38,10 @@ class VectorField:
     def states(self, theta: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The states (2d, N) of observations."""
         return y
+
+    def frequency(self, theta: np.ndarray) -> float | None:
+        """The angular frequency of the drive; None without one."""
+        return None
 
 
 Force = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -108,6 +113,10 @@ class Model(VectorField):
 
     def at(self, t: np.ndarray) -> Model:
         return self if self.drive is None else replace(self, parts=tuple(part.at(t) for part in self.parts))
+
+    def frequency(self, theta: np.ndarray) -> float | None:
+        shares = zip(self.parts, self.places, strict=True)
+        return next((p.frequency + float(theta[own][-1]) for p, own in shares if isinstance(p, Drive)), None)
 
     @property
     def separable(self) -> bool:

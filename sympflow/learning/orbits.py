@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,12 @@ SOLVED = 1e-4  # of the error of a scheme, to which its equations are solved
 
 
 # orbits with their derivatives ----------------------------------------------------------------------------------------
+
+
+Orbit = Iterator[tuple[np.ndarray, np.ndarray | None]]
+"""States (2d, N) and derivatives (2d, c, N) at one point after another."""
+Over = Callable[[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray], Any]
+"""States and derivatives at the end of gaps (N,), by those at their beginnings t (N,)."""
 
 
 class Stepper(ABC):
@@ -50,20 +56,11 @@ class Stepper(ABC):
         The first 2d columns of X are those by the initial state, the others those by θ, if there are any.
         """
 
-    def orbit(
-        self,
-        method: Method,
-        model: Field,
-        theta: np.ndarray,
-        x: np.ndarray,
-        X: np.ndarray | None,
-        gaps: np.ndarray,
-        t: np.ndarray,
-    ) -> Iterator[tuple[np.ndarray, np.ndarray | None]]:
+    def orbit(self, over: Over, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray) -> Orbit:
         """States and derivatives after each of the gaps (k, N) between points, the first of which follows t (N,)."""
         for gap in gaps:
             if gap.any():
-                x, X = method.over(model, theta, x, X, gap, t)
+                x, X = over(x, X, gap, t)
                 t = t + gap
             yield x, X
 
@@ -218,6 +215,12 @@ class Method:
         for k in range(n):
             x, X = self.stepper.step(model, theta, x, X, gaps / n, t + k * gaps / n)
         return x, X
+
+    def orbit(
+        self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray
+    ) -> Orbit:
+        """States and derivatives after each of the gaps (k, N) between points, the first of which follows t (N,)."""
+        return self.stepper.orbit(partial(self.over, model, theta), x, X, gaps, t)
 
 
 # observations ---------------------------------------------------------------------------------------------------------

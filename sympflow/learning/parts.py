@@ -541,6 +541,13 @@ class Formula(Part):
     def __init__(self, of: str, formula: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> None:
         self.of, self.n, self.formula, self.symbols = of, 0, formula, tuple(symbols)
 
+    @property
+    def kicks(self) -> bool:
+        """True of a V(q), or a T(p) whose masses are constant."""
+        import sympy
+
+        return self.of == "q" or (self.of == "p" and not sympy.hessian(self.formula, self.symbols).free_symbols)
+
     @cached_property
     def _functions(self) -> tuple[Any, Any, Any]:
         """The function, its gradient and its second derivatives on and above the diagonal."""

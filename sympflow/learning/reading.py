@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,9 +17,6 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import MAX_ASKED_VALUES, floats, is_number_word
 from sympflow.arrays import is_tensor, to_numpy
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
-
-if TYPE_CHECKING:
-    pass
 
 UNITS = {
     "1": 1.0, "rad": 1.0, "deg": np.pi / 180, "rev": 2 * np.pi,

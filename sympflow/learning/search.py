@@ -20,7 +20,7 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
 from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning.diagnosis import drive_frequency, hint
+from sympflow.learning.diagnosis import drive_frequency, fields_of, hint
 from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Constraints, pruned, with_unit_mass
 from sympflow.learning.fitting import (
     SILENT,
@@ -74,7 +74,7 @@ def drive_frequency_of(constraints: Constraints, smooth: Smooth) -> float:
     if not len(x):
         raise ValueError("`drive` cannot be found without successive points that have all values: give its frequency.")
     fields = library_for(None, d, 4, x)[0].fields(x)
-    resistance = np.moveaxis((constraints.force or frictions)(x.T)[0], -1, 0)
+    resistance = fields_of(constraints.force or frictions, x)
     base = constraints.driven(1.0)
     return drive_frequency(np.concatenate([fields, resistance], axis=2), smooth, constraints.scales, base)
 
@@ -108,9 +108,7 @@ class Replicas:
             raise ValueError(f"`y0` must be one finite state ({2 * self.model.ndof},); got {y0!r}.")
         orbits = []
         for theta in self.thetas:
-            orbit = self.method.stepper.orbit(
-                self.method, self.model, theta, start[:, None].copy(), None, gaps, times[:1]
-            )
+            orbit = self.method.orbit(self.model, theta, start[:, None].copy(), None, gaps, times[:1])
             orbits.append(np.stack([state[:, 0].copy() for state, _ in orbit], axis=1))
         return np.stack(orbits)
 
@@ -483,8 +481,10 @@ class Search:
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         if self.cut:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
-        library, damped = library_for(None, self.data.ndof, 4, smooth.points)[0], self.constraints.force is not None
-        said += " " + hint(library, smooth, self.data, otherwise, damped)
+        library, drive = library_for(None, self.data.ndof, 4, smooth.points)[0], None
+        if self.constraints.frequency is not None:
+            drive = self.constraints.driven(candidate.model.frequency(self.winner[1].theta))
+        said += " " + hint(library, smooth, self.data, otherwise, self.constraints.force, drive)
         warnings.warn(said, UserWarning, stacklevel=4)
 
     def freedom(self, setting: Setting) -> Freedom | None:
@@ -607,10 +607,9 @@ class Search:
         domain, states = self._domain()
         energies = model.hamiltonian(found.theta, states.T)
         start, options = 0.0, {}
-        if model.drive is not None:
-            (place,) = (place for part, place in zip(model.parts, model.places, strict=True) if part is model.drive)
-            period = 2 * math.pi / (model.drive.frequency + found.theta[place][-1])
-            start, options = float(self.all.runs[0].t[0]), {"time": "t", "period": period}
+        frequency = model.frequency(found.theta)
+        if frequency is not None:
+            start, options = float(self.all.runs[0].t[0]), {"time": "t", "period": 2 * math.pi / frequency}
         elif isinstance(domain, Box) and np.isfinite(energies).all():
             top = float(energies.max())
             domain = EnergySublevel(top + MARGIN * (top - float(energies.min())), domain)

@@ -130,7 +130,7 @@ class Problem:
         if derivatives:
             X = np.zeros((m, m + (0 if self.frozen else self.model.n), x.shape[1]))
             X[np.arange(m), np.arange(m)] = 1.0
-        orbit = self.method.stepper.orbit(self.method, self.model, theta, x, X, batch.gaps, batch.starts)
+        orbit = self.method.orbit(self.model, theta, x, X, batch.gaps, batch.starts)
         for k, (x, X) in enumerate(orbit):
             if stop():
                 raise OutOfTime

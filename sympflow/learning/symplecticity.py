@@ -65,9 +65,8 @@ class Reading:
 
     def remedy(self, theta: np.ndarray) -> str:
         """Advice, with the factors of the forces that were found."""
-        drive = getattr(self.field, "drive", None)
-        if self.said == DRIVE[0] and drive is not None:
-            return self.advice.format(*2 * [f"{drive.frequency + theta[self.numbers][-1]:.5g}"])
+        if self.said == DRIVE[0]:
+            return self.advice.format(*2 * [f"{self.field.frequency(theta):.5g}"])
         return self.advice.format(", ".join(f"{factor:.3g}" for factor in theta[self.numbers or slice(0)]))
 
     def possible(self, theta: np.ndarray) -> bool:

@@ -16,12 +16,6 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import MAX_ASKED_VALUES, floats, plain
 from sympflow.flow.scaling import Scaling
-from sympflow.show.cards import Card, Shown
-from sympflow.show.pictures import MOST_LINES, trajectory_figure
-from sympflow.show.style import saved
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 from sympflow.learning.reading import (
     OBSERVED,
     Found,
@@ -37,6 +31,12 @@ from sympflow.learning.reading import (
     rows_of,
     width_of,
 )
+from sympflow.show.cards import Card, Shown
+from sympflow.show.pictures import MOST_LINES, trajectory_figure
+from sympflow.show.style import saved
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FEW = 8
 """Trajectories from which some are held out for good; of fewer each is left out in turn, or in one of three parts."""

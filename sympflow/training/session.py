@@ -30,7 +30,7 @@ class OutOfTime(Exception):
 
 
 class Interruption:
-    """A context in which Ctrl-C asks for an end once it is `armed`; before that, and twice, it raises."""
+    """A context in which Ctrl-C requests an end once it is `armed`; before that, and a second time, it raises."""
 
     def __init__(self) -> None:
         self.armed = self.asked = False

@@ -219,15 +219,25 @@ def test_saving_never_changes_the_trajectory(systems, scheme, save):
     assert np.array_equal(some, every[save])
 
 
-def test_runs_without_outputs_reach_their_end(systems):
-    carry = RunCheckpoint()
-    run = (
-        splitting_loops(systems["henon_heiles"])
-        .kernel(VERLET)
-        .run(0.1, np.full((37, 4), 0.1), 50, np.zeros(0, int), carry)
-    )
+def test_runs_without_outputs_or_steps_reach_their_end(systems):
+    kernel, y0, carry = splitting_loops(systems["henon_heiles"]).kernel(VERLET), np.full((37, 4), 0.1), RunCheckpoint()
+    run = kernel.run(0.1, y0, 50, np.zeros(0, int), carry)
     assert (run.n_finite == 50).all()
     assert np.isfinite(carry.running).all()
+    Y, n_finite, _ = kernel.run(0.1, y0, 0, np.array([0]))
+    assert np.array_equal(Y, y0[:, None])
+    assert not n_finite.any()
+
+
+def test_damped_steps_of_one_length_or_time_after_another_are_runs_of_one_step():
+    """The numbers of a step are kept for the next one, of the same length at the same time."""
+    y0 = np.array([[1.0, 0.2]])
+    for H, time in (("p**2/2 + q**4/4", None), ("2*p**2 + q**4/4", None), ("p**2/2 + q**2/2 - q*cos(t)", "t")):
+        system = HamiltonianSystem.from_sympy(H, damping=0.3, time=time)
+        kernel = splitting_loops(system).kernel(VERLET)
+        for h, t in ((0.1, 0.0), (0.1, 0.0), (0.2, 0.0), (0.1, 1.0), (0.1, 0.0)):
+            run = kernel.run(h, y0, 1, np.array([1]), t0=t)
+            assert np.abs(kernel.step(h, y0, t).states - run.states[:, 0]).max() < 1e-15
 
 
 def test_compensated_summation_lowers_the_round_off(systems):

@@ -140,7 +140,10 @@ def circles(sigma):
 
 @pytest.mark.parametrize(
     ("data", "same"),
-    [(circles(0.0), "p2 - q1, p1 + q2"), (circles(0.01), "p2 - q1, p1 + q2")],
+    [
+        pytest.param(circles(0.0), "p2 - q1, p1 + q2", marks=pytest.mark.slow),
+        (circles(0.01), "p2 - q1, p1 + q2"),
+    ],
 )
 def test_what_the_data_do_not_tell_is_said(data, same):
     with pytest.warns(UserWarning, match="The data do not tell H beyond themselves: .* to the noise, ") as said:

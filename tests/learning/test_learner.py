@@ -226,9 +226,20 @@ def test_bodies_whose_total_momentum_changes_are_no_bodies():
     assert all("one axis after another" in name for name in names)
 
 
-@pytest.mark.parametrize("observed", ["qp", "qv", "q"])
+KEPLER = (lambda r: -2 / r**2, lambda r: -2 / r)
+LOGARITHM = (lambda r: -1 / r - r, lambda r: np.log(r) + r**2 / 2)
+
+
 @pytest.mark.parametrize(
-    ("force", "V"), [(lambda r: -2 / r**2, lambda r: -2 / r), (lambda r: -1 / r - r, lambda r: np.log(r) + r**2 / 2)]
+    ("force", "V", "observed"),
+    [
+        (*KEPLER, "qp"),
+        pytest.param(*KEPLER, "qv", marks=pytest.mark.slow),
+        pytest.param(*KEPLER, "q", marks=pytest.mark.slow),
+        pytest.param(*LOGARITHM, "qp", marks=pytest.mark.slow),
+        pytest.param(*LOGARITHM, "qv", marks=pytest.mark.slow),
+        pytest.param(*LOGARITHM, "q", marks=pytest.mark.slow),
+    ],
 )
 def test_central_fields_are_found(force, V, observed):
     """To 1 % of its spread along the orbits, of a noise of 1e-3."""
@@ -368,6 +379,9 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
         assert message in " ".join(found.output.split())
 
 
+RELATIVISTIC = sympflow.HamiltonianSystem.from_sympy("sqrt(1 + p**2) + 0*q")
+
+
 @pytest.mark.parametrize(
     ("runs", "options", "match"),
     [
@@ -378,6 +392,8 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
         (4, {"damping": 0.1}, "`damping`"),
         (4, {"drive": -1.0}, "`drive`"),
         (4, {"drive": 1.0, "separable": False}, "`drive`"),
+        (4, {"drive": True, "damping": "quadratic"}, "`drive` .* not beside drag"),
+        (4, {"drive": np.float32(1.0), "known": RELATIVISTIC}, "`drive` .* `known`"),
         (4, {"mass": 1.0, "separable": False}, "`mass`"),
         (4, {"dt": -1.0}, "`dt`"),
         (4, {"seed": "x"}, "`seed`"),
@@ -513,8 +529,15 @@ def test_bands_cover_the_truth_as_often_as_they_say():
     assert np.mean(inside) == pytest.approx(0.9, abs=1.5 * 0.3 / np.sqrt(20))  # values of one set are correlated
 
 
-@pytest.mark.parametrize("damping", [True, "each"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("damping", "seed"),
+    [
+        (True, 0),
+        pytest.param(True, 1, marks=pytest.mark.slow),
+        pytest.param("each", 0, marks=pytest.mark.slow),
+        pytest.param("each", 1, marks=pytest.mark.slow),
+    ],
+)
 def test_friction_that_chance_makes_negative_is_none(damping, seed):
     """Data without friction: one rate in two is below 0 by chance."""
     found = sympflow.learn(

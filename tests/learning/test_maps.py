@@ -42,7 +42,7 @@ def test_orbits_are_those_of_the_flow():
     theta = model.start(np.random.default_rng(1))
     times = np.array([[0.0, 0.0], [0.3, DT], [1.0, 2 * DT], [3.1, 2 * DT + 0.1]])
     gaps, x = np.diff(times, axis=0, prepend=0.0), np.array([[0.5, -1.0], [0.2, 0.7]])
-    orbit = model.stepper.orbit(Method(model.stepper, DT), model, theta, x.copy(), None, gaps, np.zeros(2))
+    orbit = Method(model.stepper, DT).orbit(model, theta, x.copy(), None, gaps, np.zeros(2))
     flow = model.flow(theta)
     for at, (state, _) in zip(times, orbit, strict=True):
         for i in range(2):

@@ -12,6 +12,8 @@ from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
 from sympflow.learning.learner import _constraints
 from sympflow.learning.library import library_for
+from sympflow.learning.models import drags, frictions
+from sympflow.learning.parts import Drive, Polynomial
 from sympflow.learning.search import Search
 from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import best_by_increments
@@ -43,6 +45,10 @@ def turning(t, y):
 
 def driven(t, y):
     return [y[1], -np.sin(y[0]) + 0.3 * np.cos(1.7 * t)]
+
+
+def dragged(t, y):
+    return [y[1], -y[0] - 0.2 * abs(y[1]) * y[1]]
 
 
 def in_pairs(runs):
@@ -107,22 +113,24 @@ def test_discover_tells_it_too_and_ends_with_its_time():
 
 
 @pytest.mark.parametrize(
-    ("field", "d", "damped", "said"),
+    ("field", "d", "known", "said"),
     [
-        (lambda t, y: [y[1], -y[0] - 0.2 * y[1]], 1, False, "Friction p' = -γp with γ = 0.2"),
-        (lambda t, y: [y[1], -y[0] - 0.2 * abs(y[1]) * y[1]], 1, True, "Quadratic drag p' = -c|p|p with c = 0.2"),
-        (driven, 1, False, "angular frequency 1.7"),
-        (turning, 2, False, "magnetic field, by which p_i' = B p_j, p_j' = -B p_i with B = 0.8"),
-        (lambda t, y: [y[1], -np.sin(y[0])], 1, False, "otherwise"),
+        (lambda t, y: [y[1], -y[0] - 0.2 * y[1]], 1, {}, "Friction p' = -γp with γ = 0.2"),
+        (dragged, 1, {"force": frictions}, "Quadratic drag p' = -c|p|p with c = 0.2"),
+        (dragged, 1, {"force": drags}, "otherwise"),
+        (driven, 1, {"drive": Drive(Polynomial.up_to(1, "q", [1.0]), 1.7)}, "otherwise"),
+        (driven, 1, {}, "angular frequency 1.7"),
+        (turning, 2, {}, "magnetic field, by which p_i' = B p_j, p_j' = -B p_i with B = 0.8"),
+        (lambda t, y: [y[1], -np.sin(y[0])], 1, {}, "otherwise"),
     ],
 )
-def test_hints_name_the_reason_and_its_size(field, d, damped, said):
+def test_hints_name_the_reason_and_its_size(field, d, known, said):
     data = Trajectories.read(runs(field, d, points=61, noise=1e-3))
     smooth = smoothed(data)
-    found = hint(library_for(None, d, 4, smooth.points)[0], smooth, data, "otherwise", damped)
+    found = hint(library_for(None, d, 4, smooth.points)[0], smooth, data, "otherwise", **known)
     assert re.search(rf"{re.escape(said)}\d?", found), found
     one = smoothed(data.subset([0]))
-    assert "driven" not in hint(library_for(None, d, 4, one.points)[0], one, data, "otherwise", damped)
+    assert "driven" not in hint(library_for(None, d, 4, one.points)[0], one, data, "otherwise", **known)
 
 
 def test_friction_of_one_percent_is_named():

@@ -74,7 +74,7 @@ class Recipe:
         return flow
 
     def identify(self, flow: FlowMap) -> None:
-        """Put into the flow by what it knows its system: H all over the domain."""
+        """Put the identity of its system into the flow: H all over the domain."""
         system = self.system()
         if flow.origin is None:
             flow.identify(system, flow.domain)
