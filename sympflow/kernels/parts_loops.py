@@ -237,7 +237,8 @@ class PartsLoops:
         if parts.ndof > MOST_IN_REGISTERS or rest > MOST_WRITTEN_OUT:
             raise ValueError(
                 f"`system` is too large for compiled flows of its parts: {parts.ndof} degrees of freedom, about "
-                f"{rest:,} operations in its gradient, at most {MOST_IN_REGISTERS} and {MOST_WRITTEN_OUT}. Use backend='array'."
+                f"{rest:,} operations in its gradient, at most {MOST_IN_REGISTERS} and {MOST_WRITTEN_OUT}."
+                " Use backend='array'."
             )
         self.parts, self.driven = parts, parts.driven
         self._maps: dict[bool, PartMaps] = {False: PartMaps(parts, False)}
