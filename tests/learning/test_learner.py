@@ -69,8 +69,16 @@ def test_shooting_finds_h_to_rounding(clean):
     assert potential.coefficients(found.theta[1:]) == pytest.approx([0, STIFF / 2, 0, QUARTIC / 4], abs=1e-10)
 
 
-@pytest.mark.parametrize("driven", [False, True])
-@pytest.mark.parametrize("force", [None, friction, drags])
+@pytest.mark.parametrize(
+    ("force", "driven"),
+    [
+        (None, False),
+        (friction, False),
+        (drags, False),
+        (None, True),
+        pytest.param(friction, True, marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives_are_those_of_the_orbits(clean, force, driven):
     """A splitting scheme and collocation, by the initial state and by θ, against differences."""
     model = quartic(clean, force)
@@ -455,7 +463,7 @@ CLOCKS = {
 }
 
 
-@pytest.fixture(scope="module", params=CLOCKS)
+@pytest.fixture(scope="module", params=["drive", pytest.param("stiffness", marks=pytest.mark.slow), "drag"])
 def forced(request):
     """Noisy trajectories of what no H(q, p) explains, with the remedy that a warning names."""
     field, remedy, options = CLOCKS[request.param]
