@@ -8,11 +8,11 @@ own. Each pair is met once: its force is added to one body and taken from the ot
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 import sympy as sp
@@ -136,6 +136,7 @@ class FewSymbols:
 
     local: PairsHamiltonian
     T = None
+    samples: ClassVar[Mapping[str, Any]] = {}
 
     @cached_property
     def numbers(self) -> dict[str, float]:

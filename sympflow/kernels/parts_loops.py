@@ -229,12 +229,16 @@ class PartsLoops:
         if parts.linear is not None and not parts.linear.dense:
             raise ValueError("`system` has its normal modes by fast transforms, on arrays: use backend='array'.")
         if not all(isinstance(part, PartFunctions) for part in parts.rest):
-            raise ValueError("`system` is given by plain functions: define it with from_sympy, or use backend='array'.")
+            raise ValueError(
+                "`system` has parts that are not formulas, and exact flows of parts are compiled of formulas alone: "
+                "define it with from_sympy, or use backend='array'."
+            )
         rest = sum(written_out(part.H, (*part.q, *part.p)) for part in parts.rest)
         if parts.ndof > MOST_IN_REGISTERS or rest > MOST_WRITTEN_OUT:
             raise ValueError(
-                f"`system` is too large for compiled normal modes: {parts.ndof} degrees of freedom, about {rest:,} "
-                f"operations in its gradient, at most {MOST_IN_REGISTERS} and {MOST_WRITTEN_OUT}. Use backend='array'."
+                f"`system` is too large for compiled flows of its parts: {parts.ndof} degrees of freedom, about "
+                f"{rest:,} operations in its gradient, at most {MOST_IN_REGISTERS} and {MOST_WRITTEN_OUT}."
+                " Use backend='array'."
             )
         self.parts, self.driven = parts, parts.driven
         self._maps: dict[bool, PartMaps] = {False: PartMaps(parts, False)}

@@ -18,6 +18,7 @@ DAMPED = HamiltonianSystem.from_sympy("p**2/2 - w*cos(q)", params={"w": 1.0}, da
 RELATIVISTIC = HamiltonianSystem.from_sympy("sqrt(1 + p**2) + q**4/4")
 KEPLER = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2 - 1/sqrt(q1**2 + q2**2 + 0.3)")
 GEODESIC = HamiltonianSystem.from_sympy("(p1**2 + p2**2)/2*(1 + q1**2) + (q1**4 + q2**4)/4")
+BODIES = HamiltonianSystem.pairs("-m1*m2/sqrt(r**2 + 0.3)", masses=[1.0, 0.5, 0.3], dim=2)
 SYSTEMS = [
     (CUBIC, "verlet"),
     (CUBIC, "srkn11b"),
@@ -29,6 +30,7 @@ SYSTEMS = [
     (GEODESIC, "rk4"),
     (DRIVEN, "heun3"),
     (DAMPED, "midpoint"),
+    (BODIES, "kahan_li8"),
 ]
 RUNS = [
     {"t_span": (0, 2), "dt": 0.1, "t_eval": [2.0]},

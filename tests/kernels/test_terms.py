@@ -158,7 +158,7 @@ def test_many_degrees_of_freedom_run_compiled(kinetic, method):
 
 def test_the_modes_of_many_degrees_of_freedom_are_arrays():
     assert solve(SYSTEM, "impulse", (0, 0.1), dt=0.05).stats["backend"] != "compiled"
-    with pytest.raises(ValueError, match=r"^`system` is too large for compiled normal modes"):
+    with pytest.raises(ValueError, match=r"^`system` is too large for compiled flows of its parts"):
         parts_loops(linear_and_rest(SYSTEM))
 
 
