@@ -13,7 +13,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
-from sympflow.hamiltonian.scales import known_scale, weights
+from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
 from sympflow.show.cards import Card, Shown
 from sympflow.show.pictures import KINDS, trajectory_figure
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 LARGE = 2_000_000
 """Numbers of a solution beyond which its card has no energy error."""
+LOOKED_AT = 64  # outputs at which the terms of H are looked at
 
 
 @dataclass(repr=False)
@@ -185,7 +186,15 @@ class Solution(Shown):
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
         if self.varied and not self.system.autonomous:
             return gathered(self, lambda part: part.energy_scale())
-        return known_scale(self.system, to_numpy(self.y0), self.t_span[0], _energy(self, self.y0, self.t_span[0]))
+        H0, size = _energy(self, self.y0, self.t_span[0]), 0.0
+        if self.system.energy_scale is None:
+            few, y0 = slice(None, None, -(-max(1, len(self.t)) // LOOKED_AT)), to_numpy(self.y0)[..., None, :]
+            y = np.concatenate([y0, to_numpy(self.states)[..., few, :]], axis=-2).astype(float)
+            t = np.broadcast_to(np.append(self.t_span[0], self.t[few]), y.shape[:-1])
+            with np.errstate(all="ignore"):
+                sizes = self.rows.sizes_of_terms(y) if self.rows and self.varied else size_of_terms(self.system, y, t)
+            size = np.fmax.reduce(np.where(np.isfinite(sizes), sizes, 0.0), axis=-1)
+        return known_scale(self.system, H0, size)
 
     def card(self) -> Card:
         t, stats = self.t, self.stats
@@ -440,7 +449,7 @@ def energy_change(sol: Solution, relative: bool = True) -> np.ndarray:
         scale = sol.energy_scale()
         if (absolute := np.isnan(scale)).any():
             warn(
-                "The energy error is absolute where H(y0) is 0 but for rounding: give the system an `energy_scale`.",
+                "The energy error is absolute where all terms of H are 0: give the system an `energy_scale`.",
                 RuntimeWarning,
             )
         compared = error / np.where(absolute, 1.0, scale)[..., None]

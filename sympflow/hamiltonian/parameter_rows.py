@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arrays import differentiable, expanded, is_tensor, transformed
+from sympflow.hamiltonian.scales import size_of_terms
 from sympflow.hamiltonian.symbolic import exact, generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -130,30 +131,40 @@ class ParameterRows:
 
     def hamiltonian(self, y: np.ndarray) -> np.ndarray:
         """H of each trajectory at its states y (*shape, ..., 2d): (*shape, ...)."""
+        return self._evaluated(y, "_hamiltonian", lambda system, states: system.hamiltonian(states))
+
+    def sizes_of_terms(self, y: np.ndarray) -> np.ndarray:
+        """½ Σ|y_i ∂H/∂y_i| of each trajectory at its states y (*shape, ..., 2d): (*shape, ...)."""
+        return self._evaluated(y, "_sizes", lambda system, states: size_of_terms(system, states, 0.0))
+
+    def _evaluated(self, y: np.ndarray, name: str, of_system: Callable[[Any, np.ndarray], Any]) -> np.ndarray:
+        """A function of symbols, or else that of the system of each value, at states."""
         if self.system.symbols is None:
-            return self._one_by_one(y)
+            states = y.reshape(math.prod(self.shape), *y.shape[len(self.shape) :])
+            found = np.empty(states.shape[:-1])
+            for index, system, _ in self.distinct():
+                found[index] = of_system(system, states[index])
+            return found.reshape(y.shape[:-1])
         more = (1,) * (y.ndim - 1 - len(self.shape))
         columns = [value.reshape(*self.shape, *more) for value in self.values.values()]
-        d = self.system.ndof
-        (H,) = self._function(*(y[..., i] for i in range(2 * d)), *columns)
-        return np.broadcast_to(H, y.shape[:-1])
-
-    def _one_by_one(self, y: np.ndarray) -> np.ndarray:
-        """`hamiltonian` by the system of each value."""
-        states = y.reshape(math.prod(self.shape), *y.shape[len(self.shape) :])
-        H = np.empty(states.shape[:-1])
-        for index, system, _ in self.distinct():
-            H[index] = system.hamiltonian(states[index])
-        return H.reshape(y.shape[:-1])
+        (values,) = getattr(self, name)(*(y[..., i] for i in range(2 * self.system.ndof)), *columns)
+        return np.broadcast_to(values, y.shape[:-1])
 
     @cached_property
-    def _function(self) -> Any:
+    def _hamiltonian(self) -> Any:
+        return self._generated(lambda H, y: H)
+
+    @cached_property
+    def _sizes(self) -> Any:
+        return self._generated(lambda H, y: sp.Add(*[sp.Abs(s * sp.diff(H, s)) for s in y]) / 2)
+
+    def _generated(self, of: Callable[[sp.Expr, Sequence[sp.Symbol]], sp.Expr]) -> Any:
         symbols = self.system.symbols
         assert symbols is not None
         H, values = symbols.written
         H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
-        parameters = [sp.Symbol(name, real=True) for name in self.values]
-        return generate([printable(H)], [*symbols.q, *symbols.p, *parameters], "numpy")
+        parameters, y = [sp.Symbol(name, real=True) for name in self.values], [*symbols.q, *symbols.p]
+        return generate([printable(of(H, y))], [*y, *parameters], "numpy")
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""

@@ -78,6 +78,10 @@ class FixedStep(Integrator):
         """Return a warning of the method with its step on a system, or nothing."""
         return ""
 
+    def multiplier(self, z: np.ndarray) -> np.ndarray:
+        """Return the number that is exp(iz) of an oscillation of z radians in a step, (n,); of one that bears any z, that."""
+        return np.exp(1j * z)
+
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of one run, for states such as the problem's y0."""
         self.check_library(problem.y0)
