@@ -212,7 +212,7 @@ class Solution(Shown):
     def _energy_text(self) -> str:
         """The largest relative energy error in words; empty where there is none, or it takes long."""
         large = isinstance(self, StoredSolution) or math.prod(self.y.shape) > LARGE or not len(self.t)
-        if large or not self.system.keeps_energy:
+        if large or not self.system.shows_energy:
             return ""
         with warnings.catch_warnings(action="ignore"), suppress(ArithmeticError, ValueError, TypeError, RuntimeError):
             return f"{np.abs(energy_change(self)).max():.1e}, relative"
@@ -234,7 +234,7 @@ class Solution(Shown):
         """
         y, kinds = to_numpy(self.y), (kinds,) if isinstance(kinds, str) else kinds
         error = None
-        if self.system.keeps_energy:
+        if self.system.shows_energy:
             with warnings.catch_warnings(action="ignore"):
                 error = energy_change(self).reshape(-1, len(self.t))
         heading = f"{self.system.title}, {method_text(self.integrator, self.stats.get('dt'))}"

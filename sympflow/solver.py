@@ -60,7 +60,7 @@ from sympflow.integrators.problems import (
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, get, naming_plugin
 from sympflow.solution import Solution, StoredSolution, energy_change, joined
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -70,7 +70,7 @@ FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite
 
 
 def solve(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | Array | None = None,
@@ -265,7 +265,7 @@ def solve(
     elif system.step_is_open and readable(y_start):
         integrator = with_step(integrator, system, to_numpy(y_start))
     sol = _shown(integrator, problem, action, rows, progress)
-    if tol is not None and steps_chosen and store is None and tol_of == "energy" and system.keeps_energy:
+    if tol is not None and steps_chosen and store is None and tol_of == "energy" and system.shows_energy:
         _check_tolerance_met(sol, tol)
     if chosen is not None:
         sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"

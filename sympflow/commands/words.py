@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import keyword
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -64,6 +65,7 @@ OneMethod = Annotated[
         autocompletion=completion.one_method,
     ),
 ]
+TStart = Annotated[float | None, typer.Option(help="Start of the interval. Default: the system's.")]
 TEnd = Annotated[float | None, typer.Option(help="End of the interval. Default: the system's.")]
 State = Annotated[str | None, typer.Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
 Step = Annotated[float | None, typer.Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
@@ -212,10 +214,11 @@ def one_scene(words: Sequence[str] | None, own: Sequence[str] | None = None) -> 
     return found[0]
 
 
-def interval(scene: Scene, t_end: float | None) -> tuple[float, float]:
-    """From the scene's start to the end asked for: with the scene, by --t-end, or its own."""
+def interval(scene: Scene, t_start: float | None, t_end: float | None) -> tuple[float, float]:
+    """From the start that is asked for, or the scene's, to the end: with the scene, by --t-end, or its own."""
     start, end = scene.system.t_span
-    return check_t_span((start, scene.t_end if scene.t_end is not None else t_end if t_end is not None else end))
+    asked = [at for at in (scene.t_end, t_end, end) if at is not None]
+    return check_t_span((start if t_start is None else t_start, asked[0]))
 
 
 def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
@@ -253,9 +256,10 @@ def _formula(text: str) -> Callable[..., HamiltonianSystem]:
     words = dict.fromkeys(w for w in re.findall(r"[A-Za-z_]\w*", symbols) if w not in known)
 
     def make(**values: float) -> HamiltonianSystem:
-        if missing := [f"--{name}" for name in names if name not in values]:
+        if missing := [f"--{name}" for name in names if name not in (*values, "t")]:
             raise Usage(f"`{missing[0]}` is missing, the value of a symbol in {text!r}: give it, as in {missing[0]} 1.")
-        return HamiltonianSystem.from_sympy(text, params=values)
+        driven = "t" in names and "t" not in values
+        return HamiltonianSystem.from_sympy(text, params=values, time="t" if driven else None)
 
     names = [word for word in words if not re.fullmatch(r"[qp]\d*", word)]
     if len(names) == len(words) > 0:
@@ -263,6 +267,8 @@ def _formula(text: str) -> Callable[..., HamiltonianSystem]:
             f"`system` {text!r} has no coordinates: they are q and p, or q1 … qd and p1 … pd. Write it with these in "
             f"place of {', '.join(names)}."
         )
+    if reserved := [name for name in names if keyword.iskeyword(name)]:
+        raise Usage(f"`system` has a symbol {reserved[0]!r}, which is a word of Python: give it another name.")
     given = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=float) for name in names]
     make.__signature__ = inspect.Signature(given)  # type: ignore[attr-defined]
     return make
@@ -279,7 +285,8 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
     name, *pairs = word.split(":")
     name = name.replace("_", "-")
     if name not in scene_names():
-        close = difflib.get_close_matches(name, scene_names(), n=1, cutoff=0.5)
+        files = [str(path) for path in map(Path, (f"{word}.py", f"{word}.toml")) if path.is_file()]
+        close = files or difflib.get_close_matches(name, scene_names(), n=1, cutoff=0.5)
         hint = f"Did you mean {close[0]!r}? " if close else ""
         raise ValueError(
             f"`system` {name!r} is unknown. {hint}Choose from {', '.join(scene_names())}, or name an own one, "

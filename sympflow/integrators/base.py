@@ -79,7 +79,7 @@ class FixedStep(Integrator):
         return ""
 
     def multiplier(self, z: np.ndarray) -> np.ndarray:
-        """Return the number that is exp(iz) of an oscillation of z radians in a step, (n,); of one that bears any z, that."""
+        """Return what stands for exp(iz), (n,), in a step of z radians of an oscillation; that where any z is borne."""
         return np.exp(1j * z)
 
     def stepper(self, problem: Problem) -> Stepper:

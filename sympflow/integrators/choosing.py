@@ -24,7 +24,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.registry import build, check_applies, get
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
 """Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
@@ -194,7 +194,7 @@ def with_step(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray)
 
 
 def choose_step(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any,
     tol: float,
     *,
@@ -213,9 +213,10 @@ def choose_step(
     method : str or Integrator, or None
         A method of fixed steps, such as "srkn11b"; None for the one that suits the system, as for `solve`.
     tol : float
-        The largest error: |H − H₀| relative to the `energy_scale` of `sympflow.metrics.energy`. Where H is not conserved, with
-        friction or a drive, the difference of H from that of a run with half of the step takes its place. The methods
-        on the logarithmic clock may keep H where the time is wrong: their error is that of the states.
+        The largest error: |H − H₀| relative to the `energy_scale` of `sympflow.metrics.energy`. Where H is not
+        conserved, with friction or a drive, the difference of H from that of a run with half of the step takes its
+        place. The methods on the logarithmic clock may keep H where the time is wrong: their error is that of the
+        states.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
@@ -262,13 +263,9 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     """The step of `choose_step` for a problem."""
     check_tolerance(tol, tol_of)
     if not isinstance(integrator, FixedStep) or integrator.trained:
-        own = (
-            "a flow has its own: leave `tol` out"
-            if integrator.trained
-            else (
-                f"{integrator.label!r} chooses its own: give it `rtol` and `atol`, such as rtol={tol:g} and atol={tol:g}"
-            )
-        )
+        own = "a flow has its own: leave `tol` out"
+        if not integrator.trained:
+            own = f"{integrator.label!r} chooses its own: give it `rtol` and `atol`, as rtol={tol:g} and atol={tol:g}"
         raise TypeError(f"`tol` chooses the step of a method with fixed steps, such as 'srkn11b', and {own}.")
     if integrator.dt is not None:
         raise ValueError(f"`tol` chooses the step, but `dt` is given, {integrator.dt:g}: leave out one of them.")
@@ -319,12 +316,12 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[fl
     """The error of a trial run, as a function of the step."""
     system, y0 = problem.system, problem.y0
     sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
-    conserved = system.keeps_energy
     with np.errstate(all="ignore"):
         H0 = np.asarray(system.hamiltonian(y0, problem.t0))
     factors, smallest = weights(system), smallest_size(system, y0)
 
-    compiled, clock = False, integrator.in_another_time  # on a clock H is kept even where the time is not
+    compiled, idle = False, system.keeps_energy is not system.shows_energy
+    of_states = tol_of == "state" or idle or integrator.in_another_time  # on a clock H is kept where time is wrong
 
     def run(h: float, end: float, n: int) -> tuple[np.ndarray, np.ndarray]:
         t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
@@ -345,11 +342,11 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[fl
         with np.errstate(all="ignore"):
             size = np.fmax.reduce(size_of_terms(system, y[few := slice(None, None, -(-n // LOOKED_AT))], times[few]))
             scale = np.nan_to_num(known_scale(system, H0, size), nan=1.0)
-            if tol_of == "energy" and conserved and not clock:
+            if system.keeps_energy and not of_states:
                 found = np.abs(np.asarray(system.hamiltonian(y)) - np.asarray(system.hamiltonian(y0))) / scale
             else:
                 _, finer = run(h / 2, end, n)
-                if tol_of == "state" or clock:
+                if of_states:
                     found = np.abs(factors * (y - finer)).max(-1) / (factors.max() * smallest)
                 else:
                     found = np.abs(np.asarray(system.hamiltonian(y, times) - system.hamiltonian(finer, times))) / scale

@@ -45,7 +45,7 @@ LOST_AROUND = 0.1
 TOO_LONG = 0.05
 """Energy error, over the size of the energy, of a run whose step is too long."""
 PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
-"""Where energy is not kept, a step is too long if an oscillation is off by so much of each radian, or beyond the last."""
+"""Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
 _FAST: WeakKeyDictionary[HamiltonianSystem, tuple[Any, str]] = WeakKeyDictionary()
 LARGE = 200  # degrees of freedom
 FEW_STEPS = 20
@@ -323,10 +323,12 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if doubt := integrator.doubt(system):
         warn(doubt, RuntimeWarning)
     seen = LOOKED_AT * (n_steps >= FEW_STEPS) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
-    if integrator.dt is not None and n_steps >= FEW_STEPS and not system.keeps_energy and not integrator.trained:
-        if told := _too_fast(integrator, problem):
-            warn(told, RuntimeWarning)
-    if not n or not seen or integrator.trained or not system.keeps_energy or system.between_impulses is not system:
+    if integrator.trained:
+        return
+    given = integrator.dt is not None and n_steps >= FEW_STEPS and not system.keeps_energy
+    if given and (told := _too_fast(integrator, problem)):
+        warn(told, RuntimeWarning)
+    if not n or not seen or not system.keeps_energy or system.between_impulses is not system:
         return
     width = 2 * system.ndof
     every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
