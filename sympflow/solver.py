@@ -36,7 +36,6 @@ from sympflow.arrays import (
     readable,
     to_numpy,
 )
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_start, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem

@@ -15,7 +15,6 @@ PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Options that are unknown to a command may be parameters of a system: --omega 100."""
 
 
-
 class Command(TyperCommand):
     """A command that refuses an option with two values, of which the last one would count."""
 

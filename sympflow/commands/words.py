@@ -19,6 +19,7 @@ from sympflow.arguments import check_t_span, is_number_word
 from sympflow.commands import completion
 from sympflow.hamiltonian.expression import FUNCTIONS
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.registry import available as available_methods
 from sympflow.integrators.registry import build
 from sympflow.systems import SYSTEMS, harmonic_oscillator
 from sympflow.systems import available as available_systems
@@ -174,18 +175,19 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
     names, shared = _split(words or ())
     names += own or ()
     if not names:
-        raise Usage(
-            f"`system` is missing: name one of {', '.join(scene_names())}, or an own one, file.py:name or file.toml."
-        )
+        raise Usage(f"`system` is missing: {SYSTEM}.")
     try:
         parted = [_parted(name) for name in names]
         known = {p for _, factory, _ in parted for p in _defaults(factory)}
         for name in shared:
             if name not in known:
                 takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
-                option = name.replace("_", "-")
+                option, by_case = name.replace("_", "-"), {p.lower(): p for p in known}
+                meant = MEANT.get(name.lower()) or by_case.get(name.lower())
+                meant = meant or next(iter(difflib.get_close_matches(name, known, n=1)), "")
                 raise Usage(
-                    f"`--{option}` is neither an option nor a parameter of {', '.join(names)} ({takes}): see --help."
+                    f"`--{option}` is neither an option nor a parameter of {', '.join(names)} ({takes}): "
+                    + (f"did you mean --{meant}?" if meant else "see --help.")
                 )
         return _told_apart([_scene(name, factory, pairs, shared) for name, factory, pairs in parted])
     except (ValueError, TypeError) as error:  # of what the system is made of, which is no option of the command
@@ -233,7 +235,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
             continue
         name, equals, value = word.partition("=")
         if not name.startswith("--"):
-            raise ValueError(f"`{name}` is not an option: see --help.")
+            raise ValueError(f"`{name}` is not an option: see --help. A formula begins with another sign than -.")
         if not equals:
             if not rest:
                 raise ValueError(f"`{name}` is not an option, or lacks its value: see --help.")
@@ -245,18 +247,32 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     return names, shared
 
 
-FORMULA = re.compile(r"\*|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
+SYSTEM = "name a scene, of those that `sympflow systems` lists, an own one, file.py:name or file.toml, or write H"
+MEANT = {
+    **dict.fromkeys(("solver", "integrator", "scheme"), "method"),
+    **dict.fromkeys(("steps", "n_steps", "step", "h", "stepsize", "step_size"), "dt"),
+    **dict.fromkeys(("t", "tmax", "t_max", "tend", "t_span", "time", "duration", "end"), "t-end"),
+    **dict.fromkeys(("t0", "start"), "t-start"),
+    **dict.fromkeys(("q0", "p0", "x0", "q", "p", "initial", "ic"), "y0"),
+    **dict.fromkeys(("output", "save", "plot", "file", "csv", "o"), "out"),
+}
+"""Options by the names that users try."""
+FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
 """A word that is H, and not the name of a scene."""
 
 
 def _formula(text: str) -> Callable[..., HamiltonianSystem]:
     """The function that makes a system of H as text, by the values of its other symbols."""
+    if "=" in text:
+        left, _, _ = text.partition("=")
+        raise Usage(f"`system` {text!r} is an equation: write its right side alone, without {left}=.")
     known = {*FUNCTIONS, "pi"}
-    symbols = re.sub(r"(?<![\w.])(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", " ", text)
+    symbols = re.sub(r"(?<![\w.])(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[²³]", " ", text)
     words = dict.fromkeys(w for w in re.findall(r"[A-Za-z_]\w*", symbols) if w not in known)
 
     def make(**values: float) -> HamiltonianSystem:
         if missing := [f"--{name}" for name in names if name not in (*values, "t")]:
+            HamiltonianSystem.from_sympy(text, params=dict.fromkeys(names, 1.0))  # which says what is not understood
             raise Usage(f"`{missing[0]}` is missing, the value of a symbol in {text!r}: give it, as in {missing[0]} 1.")
         driven = "t" in names and "t" not in values
         return HamiltonianSystem.from_sympy(text, params=values, time="t" if driven else None)
@@ -285,13 +301,16 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
     name, *pairs = word.split(":")
     name = name.replace("_", "-")
     if name not in scene_names():
+        key, equals, value = word.partition("=")
+        if equals:
+            raise Usage(f"`system` {word!r} is no system: give a parameter as --{key} {value}.")
+        if word in available_methods():
+            raise Usage(f"`system` {word!r} is a method: give it as --method {word}.")
         files = [str(path) for path in map(Path, (f"{word}.py", f"{word}.toml")) if path.is_file()]
-        close = files or difflib.get_close_matches(name, scene_names(), n=1, cutoff=0.5)
-        hint = f"Did you mean {close[0]!r}? " if close else ""
-        raise ValueError(
-            f"`system` {name!r} is unknown. {hint}Choose from {', '.join(scene_names())}, or name an own one, "
-            "file.py:name or file.toml."
-        )
+        last = name.rpartition(".")[2].lower()
+        close = files or difflib.get_close_matches(last, scene_names(), n=1, cutoff=0.5)
+        hint = f"Did you mean {close[0]!r}? Else {SYSTEM}" if close else f"{SYSTEM[0].upper()}{SYSTEM[1:]}"
+        raise ValueError(f"`system` {name!r} is unknown. {hint}.")
     return name, _making(name), [pair for pair in pairs if pair]
 
 
@@ -407,7 +426,7 @@ def state(words: str | None) -> np.ndarray | None:
     """A state from ``0.3,-0.3,0.3,0.15``."""
     if words is None:
         return None
-    return np.array([_float("--y0", word) for word in words.split(",")])
+    return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])
 
 
 def widths(words: str) -> tuple[int, ...]:

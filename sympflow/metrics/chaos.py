@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import as_float, check_counts, check_one_of, check_t_eval, floats, warn
 from sympflow.hamiltonian.scales import weights
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
