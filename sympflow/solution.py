@@ -186,15 +186,17 @@ class Solution(Shown):
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
         if self.varied and not self.system.autonomous:
             return gathered(self, lambda part: part.energy_scale())
-        H0, size = _energy(self, self.y0, self.t_span[0]), 0.0
+        few, y0 = slice(None, None, -(-max(1, len(self.t)) // LOOKED_AT)), to_numpy(self.y0)[..., None, :]
+        y, t = y0, np.array(self.t_span[:1])
         if self.system.energy_scale is None:
-            few, y0 = slice(None, None, -(-max(1, len(self.t)) // LOOKED_AT)), to_numpy(self.y0)[..., None, :]
-            y = np.concatenate([y0, to_numpy(self.states)[..., few, :]], axis=-2).astype(float)
-            t = np.broadcast_to(np.append(self.t_span[0], self.t[few]), y.shape[:-1])
-            with np.errstate(all="ignore"):
-                sizes = self.rows.sizes_of_terms(y) if self.rows and self.varied else size_of_terms(self.system, y, t)
-            size = np.fmax.reduce(np.where(np.isfinite(sizes), sizes, 0.0), axis=-1)
-        return known_scale(self.system, H0, size)
+            y, t = np.concatenate([y0, to_numpy(self.states)[..., few, :]], axis=-2), np.append(t, self.t[few])
+        H, y = _energy(self, y, t), y.astype(float)
+        with np.errstate(all="ignore"):
+            if self.rows is not None and self.varied:
+                sizes = self.rows.sizes_of_terms(y)
+            else:
+                sizes = size_of_terms(self.system, y, np.broadcast_to(t, y.shape[:-1]))
+        return known_scale(self.system, np.moveaxis(H, -1, 0), np.moveaxis(sizes, -1, 0))
 
     def card(self) -> Card:
         t, stats = self.t, self.stats

@@ -52,7 +52,7 @@ PHRASES = {
     r"sympflow\.systems\.available\(\)": "`sympflow systems`",
     r"\bsympflow\.(solve|train|compare|stability|learn|poincare_section|work_precision|available|shipped_flows)\b"
     r"(\([^)]*\))?|\b(poincare_section|work_precision)\b": lambda m: f"`sympflow {COMMANDS.get(m[1] or m[3], m[1])}`",
-    r"(by |with )?(sympflow\.)?HamiltonianSystem(\.\w+)?(\([^)]*\))?": "as a formula",
+    r"(by |with )?(sympflow\.)?HamiltonianSystem(\.\w+(\([^)]*\))?|\([^)]*\))": "as a formula",
     r",? or (pass|use) a SymPy expression": "",
     r"\[('[\w-]+'(?:, '[\w-]+')*)\]": lambda m: m[1].replace("'", "").replace(", ", ","),
 }

@@ -116,13 +116,14 @@ class EnergyError(Reduction):
         system = chunk.system
         with np.errstate(all="ignore"):
             H0 = np.asarray(system.hamiltonian(chunk.y0))
-            size, worst, last = size_of_terms(system, chunk.y0, chunk.t_span[0]), np.zeros(len(chunk)), chunk.y0
+            worst, last = np.zeros(len(chunk)), chunk.y0
             for _, y in chunk.windows():
                 H = np.asarray(system.hamiltonian(y.swapaxes(1, 2)))
                 worst = np.maximum(worst, np.abs(H - H0[:, None]).max(axis=1, initial=0.0))
                 last = y[..., -1] if y.shape[-1] else last
-            size = np.fmax(size, size_of_terms(system, last, chunk.t_span[0]))
-            scale = np.nan_to_num(known_scale(system, H0, size), nan=1.0)
+            ends = np.stack([chunk.y0, last])
+            sizes = size_of_terms(system, ends, chunk.t_span[0])
+            scale = np.nan_to_num(known_scale(system, np.asarray(system.hamiltonian(ends)), sizes), nan=1.0)
         return {"energy_error": np.where(chunk.status < 0, np.nan, worst / scale)}
 
 

@@ -160,12 +160,15 @@ def size_of_terms(system: Any, y: np.ndarray, t: Any) -> np.ndarray:
         return 0.5 * np.abs(y * np.asarray(system.gradient(y, t))).sum(-1)
 
 
-def known_scale(system: Any, H0: np.ndarray, size: Any) -> np.ndarray:
-    """The system's `energy_scale`, else |H0| or, where H0 is about 0, `SMALLEST_SCALE` of the size of its terms: (...).
+def known_scale(system: Any, H: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The scale of energy errors, (...), of H and the sizes of its terms at the start and along an orbit, (n, ...).
 
-    It is NaN where all are 0.
+    It is the system's `energy_scale`, else |H| at the start or, where that is about 0, `SMALLEST_SCALE` of the largest
+    size of states that kept H. It is NaN where all are 0.
     """
     if system.energy_scale is not None:
-        return np.full_like(H0, system.energy_scale)
-    scale = np.where(np.isfinite(H0) & np.isfinite(size), np.fmax(np.abs(H0), SMALLEST_SCALE * size), np.abs(H0))
+        return np.full_like(H[0], system.energy_scale)
+    with np.errstate(all="ignore"):
+        kept = np.isfinite(sizes) & (np.abs(H - H[0]) <= SMALLEST_SCALE * sizes)
+        scale = np.fmax(np.abs(H[0]), SMALLEST_SCALE * np.max(np.where(kept, sizes, 0.0), axis=0))
     return np.where(scale == 0, np.nan, scale)

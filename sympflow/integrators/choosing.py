@@ -273,10 +273,11 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     if states.ndim > 1:
         states = states.reshape(-1, states.shape[-1])[:MOST_STATES]
     system = with_start(integrator, problem.system.between_impulses, states)
-    length, error = abs(problem.t1 - problem.t0), _error(integrator, replace(problem, system=system, y0=states), tol_of)
+    length, own = abs(problem.t1 - problem.t0), with_step(integrator, system, states).step_length(system)
+    error = _error(integrator, replace(problem, system=system, y0=states), tol_of, TRIAL_LENGTH * own)
     check_applies(integrator, system, states)
     most = min(length, integrator.longest_step(system))
-    h = min(integrator.step_length(system), most)
+    h = min(own, most)
     good, bad, least = 0.0, math.inf, math.inf
     for _ in range(TRIALS):
         e = error(h)
@@ -312,12 +313,10 @@ def _rounded(h: float, length: float) -> float:
     return math.floor(h * 10.0**digits * (1 + 1e-12)) / 10.0**digits
 
 
-def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[float], float]:
-    """The error of a trial run, as a function of the step."""
+def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -> Callable[[float], float]:
+    """The error of a trial run over a time, as a function of the step."""
     system, y0 = problem.system, problem.y0
     sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
-    with np.errstate(all="ignore"):
-        H0 = np.asarray(system.hamiltonian(y0, problem.t0))
     factors, smallest = weights(system), smallest_size(system, y0)
 
     compiled, idle = False, system.keeps_energy is not system.shows_energy
@@ -334,22 +333,24 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[fl
         return t, full
 
     def error(h: float) -> float:
-        n = max(TRIAL_STEPS, min(math.ceil(TRIAL_LENGTH * system.dt / h), MOST_TRIAL_STEPS) if compiled else 0)
+        n = max(TRIAL_STEPS, min(math.ceil(trial / h), MOST_TRIAL_STEPS) if compiled else 0)
         n = max(1, min(n, math.ceil(length / h)))
         end, n = min(n * h, length), -(-n // -(-n // TRIAL_STEPS))
         t, y = run(h, end, n)
         times = np.broadcast_to(t.reshape(-1, *[1] * (y0.ndim - 1)), y.shape[:-1])
+        few = slice(None, None, -(-n // LOOKED_AT))  # with the start
         with np.errstate(all="ignore"):
-            size = np.fmax.reduce(size_of_terms(system, y[few := slice(None, None, -(-n // LOOKED_AT))], times[few]))
-            scale = np.nan_to_num(known_scale(system, H0, size), nan=1.0)
+            H = np.asarray(system.hamiltonian(y, times))
+            scale = known_scale(system, H[few], size_of_terms(system, y[few], times[few]))
+            scale = np.where(np.isnan(scale), 1.0, scale)
             if system.keeps_energy and not of_states:
-                found = np.abs(np.asarray(system.hamiltonian(y)) - np.asarray(system.hamiltonian(y0))) / scale
+                found = np.abs(H - H[0]) / scale
             else:
                 _, finer = run(h / 2, end, n)
                 if of_states:
                     found = np.abs(factors * (y - finer)).max(-1) / (factors.max() * smallest)
                 else:
-                    found = np.abs(np.asarray(system.hamiltonian(y, times) - system.hamiltonian(finer, times))) / scale
+                    found = np.abs(H - np.asarray(system.hamiltonian(finer, times))) / scale
         worst = float(np.max(found))
         return worst if math.isfinite(worst) else math.inf
 

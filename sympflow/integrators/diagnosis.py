@@ -325,8 +325,9 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     seen = LOOKED_AT * (n_steps >= FEW_STEPS) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
     if integrator.trained:
         return
-    given = integrator.dt is not None and n_steps >= FEW_STEPS and not system.keeps_energy
-    if given and (told := _too_fast(integrator, problem)):
+    known = integrator.dt is None or (not system.step_is_open and integrator.dt <= system.dt)
+    looked = n_steps >= FEW_STEPS and not (known or system.keeps_energy)
+    if looked and (told := _too_fast(integrator, problem)):
         warn(told, RuntimeWarning)
     if not n or not seen or not system.keeps_energy or system.between_impulses is not system:
         return

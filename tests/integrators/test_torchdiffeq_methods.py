@@ -17,7 +17,7 @@ EPS = np.finfo(float).eps
 
 def options(method):
     tight = 1e-6 if get(method).order == 2 else 1e-9
-    return {"rtol": tight, "atol": 0.01 * tight} if method in ADAPTIVE else {"dt": 0.05}
+    return {"rtol": tight, "atol": 0.01 * tight} if method in ADAPTIVE else {"dt": 0.04 if method == "euler" else 0.05}
 
 
 @pytest.mark.parametrize("method", [*ADAPTIVE, *FIXED, *MULTISTEP])
