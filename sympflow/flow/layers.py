@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.arrays import jvp
+from sympflow.compiler import NotCompiled
 from sympflow.flow.potentials import NO_NETWORK, Potential, Time
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
@@ -59,7 +60,7 @@ class Layer(nn.Module):
 
     def network(self) -> NetworkLayer:
         """Return its weights for compiled loops; a ValueError if it is not a kick or a drift with an MLP potential."""
-        raise ValueError(NO_NETWORK)
+        raise NotCompiled(NO_NETWORK)
 
     def trained(self) -> TrainedNetwork | None:
         """Return its network for compiled derivatives by the parameters; None if there are none."""

@@ -11,6 +11,7 @@ from typing import Any
 import sympy as sp
 from sympy.core.relational import Relational
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
 from sympflow.compiler.program import Program, Traced
 from sympflow.hamiltonian.removable import sinc
@@ -18,7 +19,7 @@ from sympflow.hamiltonian.removable import sinc
 __all__ = ["NotRecorded", "calculated", "can_be_recorded", "check_recorded", "in_symbols"]
 
 
-class NotRecorded(ValueError):
+class NotRecorded(NotCompiled):
     """A function in an expression is in no table of the compiler."""
 
 
