@@ -116,7 +116,7 @@ def check_recorded(f: sp.Expr) -> None:
     """Raise a ValueError with the term of an expression of which `calculated` has no rule for a function."""
     for term in sp.Add.make_args(f):
         if not can_be_recorded(term):
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` has the term {term}, for which there is no compiled function: use backend='array'."
             )
 
