@@ -197,10 +197,6 @@ def compiled_loops(
             return loops
         except NotCompiled as error:
             reason = str(error)
-        except Exception as error:
-            import traceback
-            open("/tmp/w1/plain.log","a").write(traceback.format_exc()[-1500:]+"\n=====\n")
-            raise
     if backend == "compiled":
         raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
     if compensated:
