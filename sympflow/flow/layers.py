@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from sympflow.compiler import NotCompiled
 from sympflow.flow.potentials import NO_NETWORK, Potential, Time, by_time
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
@@ -54,7 +55,7 @@ class Layer(nn.Module):
 
     def network(self) -> NetworkLayer:
         """Return its weights for compiled loops; a ValueError if it is not a kick or a drift with an MLP potential."""
-        raise ValueError(NO_NETWORK)
+        raise NotCompiled(NO_NETWORK)
 
     def trained(self) -> TrainedNetwork | None:
         """Return its network for compiled derivatives by the parameters; None if there are none."""

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.arrays import jvp
+from sympflow.compiler import NotCompiled
 from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 from sympflow.lazy import announced, distribution, load_announced
 
@@ -313,7 +314,7 @@ class Potential(nn.Module):
 
     def network(self, is_kick: bool) -> NetworkLayer:
         """Return the weights of a kick or drift of it for compiled loops; ValueError if there are none."""
-        raise ValueError(NO_NETWORK)
+        raise NotCompiled(NO_NETWORK)
 
     def trained(self) -> TrainedNetwork | None:
         """Return the network for compiled derivatives by its parameters; None if there are none."""
@@ -504,7 +505,7 @@ class MLPPotential(Potential):
         from sympflow.kernels.networks import NetworkLayer
 
         if self.features:
-            raise ValueError(
+            raise NotCompiled(
                 "`flow` has networks that take the time of the state, and these have no compiled form: use "
                 "backend='array'."
             )

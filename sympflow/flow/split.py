@@ -20,6 +20,7 @@ from torch import Tensor
 
 from sympflow.arguments import check_flag, plain
 from sympflow.arrays import to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.flow.coefficients import Column
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.known import UNCOMPENSATED
@@ -292,7 +293,7 @@ class SplitFlow(SystemFlow):
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> SplitFlowKernel:
         if compensated:
-            raise ValueError(UNCOMPENSATED)
+            raise NotCompiled(UNCOMPENSATED)
         flow = self.bound(system)
         frozen = flow.frozen()
         if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
