@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from sympflow.arrays import is_tensor, values
+from sympflow.compiler import NotCompiled
 from sympflow.flow.records import Provenance
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, recognised, without_friction
@@ -249,7 +250,7 @@ class KnownFlow:
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         """Return the compiled loops of the flow with its present weights, the same while these do not change."""
-        raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
+        raise NotCompiled(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count the evaluations of the system's own functions in a run; a network has none."""
