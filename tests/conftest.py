@@ -30,7 +30,7 @@ LOW_ORDER = {"adaptive_heun", "bosh3", "fehlberg2"}
 
 
 def pytest_collection_modifyitems(config, items):
-    """Mark as slow what `long.txt` lists (rows of two seconds and more whose kind a shorter row shows) and LOW_ORDER."""
+    """Mark as slow LOW_ORDER, and what long.txt lists: rows of some seconds whose kind a shorter row shows."""
     listed = set((TESTS / "long.txt").read_text("utf-8").splitlines())
     if config.args == config.getini("testpaths") and (gone := listed - {item.nodeid for item in items}):
         raise pytest.UsageError(f"tests/long.txt lists tests that are gone: {sorted(gone)}")
