@@ -32,7 +32,7 @@ PROBES = 8
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth, NaN where it is not finite; then the entries of Γ where there is friction."""
+    """H at 8 fixed states less H at a ninth, NaN where it is not finite; then the entries of Γ of a damped system."""
     states = _fixed_states(system.ndof)
     if system.local is not None:
         states[:, : system.ndof] *= system.local.apart
