@@ -6,7 +6,6 @@ import ctypes
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Protocol
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
 from sympflow.kernels.runs import Numbers, Room, reverse_function
+from sympflow.lazy import kept
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
 
@@ -33,7 +33,7 @@ class Tableau(Protocol):
 
 def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system; a ValueError says why there are none."""
-    field = _field(system)
+    field = field_of(system)
     kind = _InMemory if field.large else _InRegisters
     A = tuple(tuple(map(float, row)) for row in tableau.A)
     code = kind(field, A, tuple(map(float, tableau.B)))
@@ -42,16 +42,7 @@ def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKerne
 
 def compiled_field(system: HamiltonianSystem) -> CompiledField:
     """The vector field of a symbolic system, compiled, for one solver; a ValueError says why there is none."""
-    return CompiledField(_field(system))
-
-
-def _field(system: HamiltonianSystem) -> Field:
-    if system not in _FIELDS:
-        _FIELDS[system] = Field(system)
-    return _FIELDS[system]
-
-
-_FIELDS: WeakKeyDictionary[HamiltonianSystem, Field] = WeakKeyDictionary()
+    return CompiledField(field_of(system))
 
 
 class Field:
@@ -144,6 +135,9 @@ class Field:
                     moved.value = moved.value - code.load(data[-1], m * d + j) * code.load(y, j + d)
                 force = moved.value
             code.store(force, out, m + d)
+
+
+field_of = kept(Field)
 
 
 class _Explicit(OneStep):

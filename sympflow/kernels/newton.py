@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from functools import cached_property, reduce
 from itertools import pairwise
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_larg
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
+from sympflow.lazy import kept
 
 __all__ = ["implicit_kernel", "newton_code"]
 
@@ -38,21 +38,12 @@ ABREAST = 4  # numbers of a row of a matrix that are changed together
 LONG = 4e6  # operations between two looks for a stop
 
 
+@kept
 def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
 
-    A ValueError says why there are none.
+    NotCompiled says why there are none.
     """
-    kernels = _KERNELS.setdefault(system, {})
-    if (tableau, compensated) not in kernels:
-        kernels[tableau, compensated] = _kernel(system, tableau, compensated)
-    return kernels[tableau, compensated]
-
-
-_KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneStepKernel]] = WeakKeyDictionary()
-
-
-def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
     written = system.spelled
     if written is None:
         raise NotCompiled(
