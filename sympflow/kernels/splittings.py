@@ -530,16 +530,6 @@ class SplittingCode(SplittingRollouts):
             state = self._kinds[k].plain(*state, *self._kinds[k].table(*given))
         return torch.stack([x.expand(y.shape[:-1]) for x in state[: self.n_out]], dim=-1)
 
-    @property
-    def given_numbers(self) -> int:
-        """How many numbers of a column are given, from which those are computed that the code reads."""
-        return len(self._splitting.numbers)
-
-    def executed(self, given: Sequence[Any], values: list[Value]) -> list[Value]:
-        """The values after a stage of the last kind, by the numbers that are given."""
-        last = self._kinds[-1]
-        return last.body(*values, *last.table(*given))
-
     def made(self, name: str, width: int) -> Callable[..., None]:
         """Compile the function of a name: "step", "reverse" and "slopes", each " own" too."""
         what, _, own = name.partition(" ")
