@@ -204,11 +204,9 @@ class ArrayCode(SplittingCode):
 
     def __init__(self, splitting: Splitting, forces: Forces) -> None:
         super().__init__(splitting, chunked=False)
+        self._given = splitting, forces
         self._forces, self.data, self.lanes = forces, forces.data, forces.lanes
         self.room = ARRAYS * splitting.ndof
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return ArrayCode, (self._splitting, self._forces)
 
     @cached_property
     def _kinds(self) -> list[Arranged]:

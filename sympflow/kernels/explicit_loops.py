@@ -16,7 +16,7 @@ from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
-from sympflow.kernels.runs import Numbers, Room, reverse_function
+from sympflow.kernels.runs import Numbers, Room
 from sympflow.lazy import kept
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
@@ -145,6 +145,7 @@ class _Explicit(OneStep):
 
     def __init__(self, field: Field, A: tuple[tuple[float, ...], ...], B: tuple[float, ...]) -> None:
         super().__init__(field.lettered, 2 * field.ndof, len(field.rates))
+        self._given = field, A, B
         self.field, self.A, self.B = field, A[: len(B)], B
         self.work = 4.0 * len(B) * field.ndof
 
@@ -155,9 +156,9 @@ class _InRegisters(_Explicit):
     lanes = 8
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-        return self._advanced(*values, *self._given(numbers, values[0].code, step))
+        return self._advanced(*values, *self._numbers(numbers, values[0].code, step))
 
-    def _given(self, numbers: Numbers, code: Code, step: Value) -> list[Value]:
+    def _numbers(self, numbers: Numbers, code: Code, step: Value) -> list[Value]:
         """The numbers of a step: h, the parameters, the letters at each stage, the rates."""
         column = self.column(code, numbers, step)
         letters = [x for row in self.A for x in self.letters_at(column, sum(row))]
@@ -187,16 +188,10 @@ class _InRegisters(_Explicit):
         return len(self.field.program) * len(self.A) <= MOST_REVERSED
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
     ) -> tuple[list[Value], list[Value]]:
-        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
-        found = self._reverse(*values, *self._given(numbers, step.code, step), *cotangents)
+        found = self._reverse(*values, *self._numbers(numbers, step.code, step), *cotangents)
         return [step.code.operand(x, values[0].type) for x in found], []
-
-    def made(self, name: str, width: int) -> Callable[..., None]:
-        if name != "reverse":
-            return super().made(name, width)
-        return reverse_function(self.n_values, self.n_out, self.size, self.adjoint, width, closing=False)
 
 
 class _InMemory(_Explicit):

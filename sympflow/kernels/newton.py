@@ -88,6 +88,7 @@ class NewtonCode(OneStep):
     counted = True
 
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
+        self._given = lettered, tableau, compensated, damped
         self._tableau, self._compensated, self._damped = tableau, compensated, damped
         self._nodes, self.stages = stage_nodes(tableau), len(tableau[1])
         n = 2 * lettered.symbols.ndof
@@ -95,9 +96,6 @@ class NewtonCode(OneStep):
         self.unknowns = n * self.stages
         self.work = 4 * self.unknowns**3
         self.block = int(min(max(LONG / self.unknowns**3, 1), Rollouts.block))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return newton_code, (self.lettered, self._tableau, self._compensated, self._damped)
 
     def _changes(self, K: Sequence[Value]) -> Value:
         """Σ B_i K_i of one variable."""

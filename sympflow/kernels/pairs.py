@@ -537,9 +537,6 @@ class PairCode(SharedRollouts):
         self._sites[0, :n], self._sites[1:, :n] = 1 / local.masses, local.columns
         super().__init__(2 * local.ndof * (1 + compensated), 2 * local.ndof)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return PairCode, self._given
-
     @cached_property
     def size(self) -> int:
         return len(self._stages.splitting.numbers)

@@ -172,11 +172,8 @@ class PartsCode(Rollouts):
 
     def __init__(self, maps: PartMaps, groups: Sequence[tuple[int, ...]]) -> None:
         super().__init__(2 * maps.ndof, 2 * maps.ndof)
-        self.maps, self.groups = maps, tuple(groups)
+        self.maps, self.groups = self._given = maps, tuple(groups)
         self.size = maps.size * max(map(len, groups))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return PartsCode, (self.maps, self.groups)
 
     def columns(self, groups: Sequence[Sequence[int]], entries: np.ndarray) -> Columns:
         """The columns (n, k, size) of groups of maps, whose numbers are (n, m, size), and their kinds (k,)."""

@@ -155,15 +155,12 @@ class TangentCode(SplittingCode):
 
     def __init__(self, splitting: Splitting, vectors: int, grows: bool) -> None:
         super().__init__(splitting, chunked=False)
-        self.vectors, self._grows = vectors, grows
+        self.vectors, self._grows, self._given = vectors, grows, (splitting, vectors, grows)
         self._d = d = splitting.symbols.ndof
         self.n_values = self.n_out = 2 * d * (1 + vectors) + (vectors if grows else 0)
         products = d * d + (d if splitting.symbols.inverse_mass is not None else d * d)
         self.room = 0 if vectors * products > MOST_WRITTEN_OUT else None
         self.every = EVERY if grows else None
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return TangentCode, (self._splitting, self.vectors, self._grows)
 
     @cached_property
     def _kinds(self) -> list[Arranged]:
