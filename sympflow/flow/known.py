@@ -92,7 +92,8 @@ class KnownFlow:
         self.lattice_terms = {} if system.local is None else dict(system.local.terms)
         small = self.known_by(system)
         self.fingerprint, self.system_name = small.fingerprint, system.name
-        self.identity = Identity.of(small, domain)
+        in_common_units = domain is not None or np.isfinite(small.fingerprint).all()
+        self.identity = Identity.of(small, domain if in_common_units else small.domain)
 
     def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
         """The system whose H the flow keeps to know another: a few sites of a lattice, else that system itself."""
