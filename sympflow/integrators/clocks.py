@@ -194,7 +194,7 @@ def reach(
     for _ in range(80):
         x = step(sigma)
         residual = x[:, d] - target
-        better = np.abs(residual) < best_residual
+        better = (np.abs(residual) < best_residual) & (best_residual > tolerance)  # others are done
         best[better], best_sigma[better], best_residual[better] = x[better], sigma[better], np.abs(residual)[better]
         if not (best_residual > tolerance).any():
             break
