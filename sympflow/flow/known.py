@@ -154,14 +154,13 @@ class KnownFlow:
             raise ValueError(
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"
             )
-        if not (system.autonomous or self.matches(system)):
-            raise ValueError(
-                f"`system` {system.name!r} is driven, H depends on t, and the flow was trained with another drive or "
-                f"none, for {self.system_name!r}: its amplitude, its frequency or another parameter differs. Pass the "
-                "flow of this system, or train one with sympflow.train(system), from these numbers by "
-                "sympflow.train(system, flow=flow.transferred(system))."
-            )
         if not self.matches(system):
+            system.check_autonomous(
+                f"and the flow was trained with another drive or none, for {self.system_name!r}: its amplitude, its "
+                "frequency or another parameter differs",
+                "pass the flow of this system, or train one with sympflow.train(system), from these numbers by "
+                "sympflow.train(system, flow=flow.transferred(system))",
+            )
             raise ValueError(
                 f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
                 f"parameters differ): {remedy}"

@@ -106,7 +106,8 @@ def check_params(
 
 def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLike], integrator: Integrator) -> None:
     """Refuse a trained flow for other parameters than its system's, and a sweep from where H is constant in time."""
-    if system.autonomous and system.symbols is not None and system.symbols.named_time is not None and values:
+    symbols = system.symbols
+    if values and symbols is not None and symbols.time is not symbols.named_time:
         raise ValueError(
             "`params` are those of a driven system, and the values that `system` has make it constant in time: pass "
             "one whose H depends on t, as by system.with_params(...)."
