@@ -311,7 +311,7 @@ class Integrator:
                 f"`method` {self.name!r} {self.arrays_only}; so its step cannot be differentiated: write it with the "
                 "functions of sympflow.arrays, or define tangent()."
             )
-        times = as_tensor(t) if np.ndim(t) else t
+        times = as_tensor(np.array(t)) if np.ndim(t) else t
         return forward_tangent(lambda x, lengths: self.step(system, times, x, lengths), y, h)
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
