@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from sympflow.arrays import is_tensor, values
+from sympflow.arrays import values
 from sympflow.flow.records import Provenance
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, recognised, without_friction
@@ -200,7 +200,7 @@ class KnownFlow:
         """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing."""
         if not self.unfitted:
             return
-        seen = values(t) if is_tensor(t) else np.asarray(t)
+        seen = values(t)
         if seen is None:  # in a graph that torch.compile traces
             return
         times = np.abs(seen.astype(float)).reshape(-1)
@@ -222,7 +222,7 @@ class KnownFlow:
         """Warn where a run over `passed` from t0 leaves the times for which a drive without a period was fitted."""
         if self.drive_times is None or t0 is None:
             return
-        start, length = (values(each) if is_tensor(each) else np.asarray(each) for each in (t0, passed))
+        start, length = map(values, (t0, passed))
         if start is None or length is None:  # in a graph that torch.compile traces
             return
         if not (start.size and length.size and start.dtype.kind in "fiu"):

@@ -9,6 +9,7 @@ import numpy as np
 
 from sympflow.arrays import (
     Array,
+    as_array,
     beside,
     concatenate,
     detached,
@@ -127,7 +128,7 @@ def _field(system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, sc
 
 def decays(system: HamiltonianSystem, s: Any) -> Array:
     """e^{−Γs} for times s, a number or (...): (..., d, d)."""
-    s = s if is_tensor(s) else np.asarray(s)
+    s = as_array(s)
     return system.friction.drift(like(np.eye(system.ndof), s), s[..., None, None])[1]
 
 

@@ -200,8 +200,8 @@ class GivenForce:
         import torch
 
         value = self.force(torch.as_tensor(q), torch.as_tensor(p))
-        if not is_tensor(value) or tuple(value.shape) != tuple(p.shape):
-            got = tuple(value.shape) if is_tensor(value) else type(value).__name__
+        got = tuple(value.shape) if is_tensor(value) else type(value).__name__
+        if got != tuple(p.shape):
             raise ValueError(
                 f"`force` must return a tensor of the shape of p, {tuple(p.shape)}; got {got}: write it with torch "
                 "functions, for states on the last axis."

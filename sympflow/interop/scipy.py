@@ -139,7 +139,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         system = self._solved
         dt = self.integrator.step_length(system)
         jumps: list[float] = []
-        if math.isfinite(t_bound):
+        if system is not None and math.isfinite(t_bound):
             system.check_times(t0, t_bound)
             told, jumps = landings(self.integrator, system, t0, t_bound)
             if told:
@@ -236,7 +236,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             whole = self._k < grid.n_steps
             self._h = grid.h if whole else grid.remainder
             self._end = grid.time(self._k + 1) if whole else grid.t1
-            if math.isinf(self.t_bound):
+            if self._solved is not None and math.isinf(self.t_bound):
                 try:
                     self._solved.check_times(self._t_anchor, self._end)
                 except ValueError as error:

@@ -284,7 +284,7 @@ def hides_failures_of_batches(self, problem):
 
 
 def clock_in_the_step(self, system, t, y, h):
-    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * float(np.sin(t))))
+    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * np.sin(np.asarray(t))))
 
 
 def first_event_only(self, problem):
