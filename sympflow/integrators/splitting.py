@@ -221,7 +221,9 @@ class Splitting(FixedStep):
 
     def composed(self, system: HamiltonianSystem) -> Composition:
         """Return the scheme × the splitting on a system."""
-        options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
+        options: dict[str, Any] = {}
+        if not self.parts is self.omega is self.corrector is None:
+            options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
         return SPLITTINGS[self.splitting](self.name, self.scheme, system, **options)
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
