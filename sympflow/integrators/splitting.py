@@ -12,6 +12,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag, check_number, check_one_of
 from sympflow.arrays import Array, to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -296,9 +297,9 @@ class Splitting(FixedStep):
             super().check_followed(problem)
         try:
             if problem.backend == "array":
-                raise ValueError("`backend` is 'array'.")
+                raise NotCompiled("`backend` is 'array'.")
             self.composed(problem.system).kernel_by(bool(self.compensated), tuple(problem.followed))
-        except ValueError as error:
+        except NotCompiled as error:
             names = ", ".join(problem.followed)
             raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
 
