@@ -274,7 +274,7 @@ def hides_failures_of_batches(self, problem):
 
 
 def clock_in_the_step(self, system, t, y, h):
-    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * np.sin(np.asarray(t))))
+    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * like(np.sin(to_numpy(t)), y)))
 
 
 def first_event_only(self, problem):
