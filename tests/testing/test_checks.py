@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, available, get
-from sympflow.arrays import concatenate, per_state, to_numpy
+from sympflow.arrays import concatenate, like, per_state, to_numpy
 from sympflow.integrators.base import FixedStep, Outcome, OwnSteps
 from sympflow.integrators.steppers import Stepper
 from sympflow.integrators.tableaux import ADAPTIVE, MULTISTEP
