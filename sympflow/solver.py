@@ -29,7 +29,6 @@ from sympflow.arrays import (
     concatenate,
     finite_states,
     full_of_nan,
-    is_tensor,
     known_finite,
     lanes,
     last,
@@ -198,8 +197,7 @@ def solve(
     >>> sol.y.shape
     (4, 101)
     """
-    if is_tensor(y0):
-        check_not_traced("solve")
+    check_not_traced("solve")
     system = given_system(system, params)
     given, chosen = options, None
     if tol is not None and isinstance(method, str) and "tol" in get(method).options():
