@@ -16,7 +16,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arguments import check_array
+from sympflow.arrays import Array, to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
@@ -149,8 +150,7 @@ class LogarithmicClock(NamedTuple):
 
 def _rows(y: Array, h: Any) -> tuple[np.ndarray, np.ndarray]:
     """States as rows, and a length for each."""
-    if is_tensor(y):
-        raise TypeError("`y` is a tensor: the logarithmic methods step NumPy arrays; pass y.numpy().")
+    check_array(y, "the logarithmic methods step NumPy arrays")
     rows = np.asarray(y).reshape(-1, y.shape[-1])
     return rows, np.broadcast_to(np.asarray(h, dtype=rows.dtype), y.shape[:-1]).reshape(-1)
 

@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, to_numpy
+from sympflow.arrays import Array, as_array, concatenate, library, like, per_state, to_numpy
 from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.scales import natural_scale
@@ -492,7 +492,7 @@ class MidpointLinearRest(LinearRest):
 
 def _each_class(s: Any, parts: ExactParts) -> Any:
     """A time (...) for all F frequencies: (..., F)."""
-    s = s if is_tensor(s) else np.asarray(s, dtype=getattr(s, "dtype", float))
+    s = as_array(s if hasattr(s, "dtype") else float(s))
     return s[..., None] * like(np.ones(parts.n_classes), s)
 
 

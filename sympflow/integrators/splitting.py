@@ -26,7 +26,6 @@ from sympflow.integrators.contract import (
     differentiated,
     forward_tangent,
     in_blocks,
-    start_of,
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
@@ -223,7 +222,9 @@ class Splitting(FixedStep):
 
     def composed(self, system: HamiltonianSystem) -> Composition:
         """Return the scheme × the splitting on a system."""
-        options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
+        options: dict[str, Any] = {}
+        if not self.parts is self.omega is self.corrector is None:
+            options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
         return SPLITTINGS[self.splitting](self.name, self.scheme, system, **options)
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
@@ -346,8 +347,7 @@ class Splitting(FixedStep):
         for times, states, lengths in self.steps(system, t_span, y0):
             for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
                 at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
-                start = start_of(system, at)
-                yield at, length, partial(self.jvp, system, start, y, length.astype(y.dtype))
+                yield at, length, partial(self.jvp, system, at, y, length.astype(y.dtype))
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
         if self.clock != "physical" or self.overrides("step") or self.compensated:
@@ -375,7 +375,7 @@ class Splitting(FixedStep):
             return forward_tangent(lambda z, lengths: composition.step(z, lengths, t), x, h)[1]
 
         for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
-            yield differentiated(jacobian, times, states, lengths, system)
+            yield differentiated(jacobian, times, states, lengths)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)

@@ -355,15 +355,16 @@ def _tangent_code(
 @kept
 def _lacks(system: HamiltonianSystem) -> str:
     """The reason why a system has no compiled vectors, "" if it has."""
-    if not system.autonomous:
-        return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
     if system.symbols is None:
         given = system.local is not None or system.form is not None
     else:
         from sympflow.kernels.terms import is_long
 
         given = not is_long(system.symbols, FORCE_GRADIENT)
-    if not given or not splitting_loops(system).traced:
+    loops = splitting_loops(system) if given else None
+    if loops is not None and loops.driven:
+        return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
+    if loops is None or not loops.traced:
         return (
             f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "
             "few terms: use backend='auto'."
