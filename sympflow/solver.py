@@ -287,7 +287,8 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
         error = float(np.max(np.abs(energy_change(sol)), initial=0.0))
     sol.stats["energy_error"] = error
     if error > tol:
-        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
+        remedy = "pass a smaller one" if sol.y.dtype.itemsize >= 8 else "float32 rounds off, compute in float64"
+        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: {remedy}."
         sol.message += f" {note}"
         warn(note, RuntimeWarning)
 

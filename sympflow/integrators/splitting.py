@@ -232,26 +232,6 @@ class Splitting(FixedStep):
         on = CLOCKS[self.clock].on
         return None if on is None else on(self, system)
 
-    def reach_times(
-        self,
-        clock: LogarithmicClock,
-        h: float,
-        start: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        backend: str,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run on the logarithmic clock in one compiled pass: see `LogarithmicClock`."""
-        transformed = clock.transformed
-        if self.compensated or transformed.symbols is None:
-            return None
-        if compiled_loops(lambda: self.inner.composed(transformed).kernel(False), start, backend) is None:
-            return None
-        from sympflow.kernels.elapsed_times import reach_times
-
-        return reach_times(transformed, self.scheme, h, start, times, stride, expected)
-
     @property
     def inner(self) -> Splitting:
         """The scheme with the splitting and the clock that need none: on the logarithmic clock that is what runs."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary, ref
+from weakref import ref
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +19,7 @@ from sympflow.kernels.one_steps import check_size
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.stages import StageTable, check_damping, run_table, step_table
 from sympflow.kernels.threads import given
+from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
@@ -31,20 +32,14 @@ if TYPE_CHECKING:
     from sympflow.kernels.stage_times import Driving
 
 
+@kept
 def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> SplittingLoops:
     """The compiled loops of splitting schemes on a separable system, made once per system.
 
-    With `names` the values of `SplittingLoops` are those of these parameters. A ValueError says why there are none.
+    With `names` the values of `SplittingLoops` are those of these parameters. NotCompiled says why there are none.
     """
-    known = _LOOPS.get(system)
-    if known is None:
-        known = _LOOPS[system] = {}
-    if names not in known:
-        known[names] = SplittingLoops(system, names)
-    return known[names]
+    return SplittingLoops(system, names)
 
-
-_LOOPS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[str, ...], SplittingLoops]] = WeakKeyDictionary()
 
 LANES_OF_SUMS, LANES = 16.0, 2.0
 """By how much less a kick takes in a batch than `SplittingLoops.work`: of sums and products alone, and of functions."""
