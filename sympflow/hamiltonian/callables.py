@@ -568,8 +568,8 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
     if shape is None or tuple(shape) != expected:
         raise ValueError(
             f"`{name}` must return shape {expected} for a state part of shape {tuple(x.shape)}; got "
-            f"{type(value).__name__ if shape is None else tuple(shape)}. Reduce over the last axis only: write q[..., 0] "
-            "in place of q[0], and NumPy's functions in place of those of `math`."
+            f"{type(value).__name__ if shape is None else tuple(shape)}. Reduce over the last axis only: write "
+            "q[..., 0] in place of q[0], and NumPy's functions in place of those of `math`."
         )
     if library(value) is not library(x):
         given, got = ("a torch tensor", "NumPy's") if tensor else ("a NumPy array", "torch's")
