@@ -154,7 +154,7 @@ class ClockedFlow(SystemFlow):
     def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
         from sympflow.kernels.flow_loops import ClockedFlowKernel
 
-        return ClockedFlowKernel(self.scheme, system, self.advance, self.clock_numbers)
+        return ClockedFlowKernel(self.scheme, system, self.advance)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
