@@ -169,7 +169,7 @@ class Solution(Shown):
     def energy(self) -> Array:
         """H along the solution, of a driven system at the times of its states: (..., n)."""
         with np.errstate(all="ignore"):
-            if self.varied and not is_tensor(self.y) and self.system.autonomous:
+            if self.varied and not is_tensor(self.y):
                 return _energy(self, self.states, self.t)
             if self.varied:
                 return gathered(self, lambda part: part.energy())
@@ -184,18 +184,14 @@ class Solution(Shown):
 
     def energy_scale(self) -> np.ndarray:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
-        if self.varied and not self.system.autonomous:
-            return gathered(self, lambda part: part.energy_scale())
         few, y0 = slice(None, None, -(-max(1, len(self.t)) // LOOKED_AT)), to_numpy(self.y0)[..., None, :]
         y, t = y0, np.array(self.t_span[:1])
         if self.system.energy_scale is None:
             y, t = np.concatenate([y0, to_numpy(self.states)[..., few, :]], axis=-2), np.append(t, self.t[few])
-        H, y = _energy(self, y, t), y.astype(float)
+        H, y, t = _energy(self, y, t), y.astype(float), np.broadcast_to(t, y.shape[:-1])
         with np.errstate(all="ignore"):
-            if self.rows is not None and self.varied:
-                sizes = self.rows.sizes_of_terms(y)
-            else:
-                sizes = size_of_terms(self.system, y, np.broadcast_to(t, y.shape[:-1]))
+            varied = self.rows is not None and self.varied
+            sizes = self.rows.sizes_of_terms(y, t) if varied else size_of_terms(self.system, y, t)
         return known_scale(self.system, np.moveaxis(H, -1, 0), np.moveaxis(sizes, -1, 0))
 
     def card(self) -> Card:
@@ -462,8 +458,8 @@ def _energy(sol: Solution, y: Array, t: Any) -> np.ndarray:
     """H in float64, whatever the precision of the run, of each trajectory at its states (..., k, 2d) or (..., 2d)."""
     states = to_numpy(y).astype(float)
     with np.errstate(all="ignore"):
-        if sol.rows is not None and not sol.rows.uniform and sol.system.autonomous:
-            return sol.rows.hamiltonian(states)
+        if sol.rows is not None and not sol.rows.uniform:
+            return sol.rows.hamiltonian(states, t)
         return np.asarray(sol.system.hamiltonian(states, np.broadcast_to(t, states.shape[:-1])))
 
 

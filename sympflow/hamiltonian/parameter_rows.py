@@ -129,25 +129,28 @@ class ParameterRows:
                 values[index] = math.nan
         return values
 
-    def hamiltonian(self, y: np.ndarray) -> np.ndarray:
-        """H of each trajectory at its states y (*shape, ..., 2d): (*shape, ...)."""
-        return self._evaluated(y, "_hamiltonian", lambda system, states: system.hamiltonian(states))
+    def hamiltonian(self, y: np.ndarray, t: Any) -> np.ndarray:
+        """H of each trajectory at its states y (*shape, ..., 2d) at times that broadcast to these: (*shape, ...)."""
+        return self._evaluated(y, t, "_hamiltonian", lambda system, y, t: system.hamiltonian(y, t))
 
-    def sizes_of_terms(self, y: np.ndarray) -> np.ndarray:
-        """½ Σ|y_i ∂H/∂y_i| of each trajectory at its states y (*shape, ..., 2d): (*shape, ...)."""
-        return self._evaluated(y, "_sizes", lambda system, states: size_of_terms(system, states, 0.0))
+    def sizes_of_terms(self, y: np.ndarray, t: Any) -> np.ndarray:
+        """½ Σ|y_i ∂H/∂y_i| of each trajectory, at states and times as those of `hamiltonian`."""
+        return self._evaluated(y, t, "_sizes", size_of_terms)
 
-    def _evaluated(self, y: np.ndarray, name: str, of_system: Callable[[Any, np.ndarray], Any]) -> np.ndarray:
+    def _evaluated(self, y: np.ndarray, t: Any, name: str, of_system: Callable[..., Any]) -> np.ndarray:
         """A function of symbols, or else that of the system of each value, at states."""
-        if self.system.symbols is None:
-            states = y.reshape(math.prod(self.shape), *y.shape[len(self.shape) :])
+        symbols = self.system.symbols
+        if symbols is None or symbols.samples or symbols.impulses:
+            each = (y, np.broadcast_to(t, y.shape[:-1]))
+            states, times = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in each)
             found = np.empty(states.shape[:-1])
             for index, system, _ in self.distinct():
-                found[index] = of_system(system, states[index])
+                found[index] = of_system(system, states[index], times[index])
             return found.reshape(y.shape[:-1])
         more = (1,) * (y.ndim - 1 - len(self.shape))
         columns = [value.reshape(*self.shape, *more) for value in self.values.values()]
-        (values,) = getattr(self, name)(*(y[..., i] for i in range(2 * self.system.ndof)), *columns)
+        times = () if symbols.time is None else (t,)
+        (values,) = getattr(self, name)(*(y[..., i] for i in range(2 * self.system.ndof)), *columns, *times)
         return np.broadcast_to(values, y.shape[:-1])
 
     @cached_property
@@ -164,7 +167,7 @@ class ParameterRows:
         H, values = symbols.written
         H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
         parameters, y = [sp.Symbol(name, real=True) for name in self.values], [*symbols.q, *symbols.p]
-        return generate([printable(of(H, y))], [*y, *parameters], "numpy")
+        return generate([printable(of(H, y))], [*y, *parameters, *filter(None, [symbols.time])], "numpy")
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""

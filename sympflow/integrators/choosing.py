@@ -30,6 +30,8 @@ TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
 """Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
 AT_ROUNDING = 1e-8
 """Errors that may be rounding: below it, steps that are shorter and no better end the search."""
+KEPT = 1e-12
+"""Errors of the energy that are round-off, whatever the step."""
 TRIALS = 12
 MOST_STATES = 16  # of a batch in trials
 LOOKED_AT = 64  # states of a trial at which the size of the terms of H is taken
@@ -215,8 +217,8 @@ def choose_step(
     tol : float
         The largest error: |H − H₀| relative to the `energy_scale` of `sympflow.metrics.energy`. Where H is not
         conserved, with friction or a drive, the difference of H from that of a run with half of the step takes its
-        place. The methods on the logarithmic clock may keep H where the time is wrong: their error is that of the
-        states.
+        place. Where H is kept whatever the step, as by Gauss methods on a quadratic H, and for the methods on the
+        logarithmic clock, the error is that of the states.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
@@ -279,8 +281,13 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     most = min(length, integrator.longest_step(system))
     h = min(own, most)
     good, bad, least = 0.0, math.inf, math.inf
+    kept = math.inf  # the shortest step with which H is kept to rounding
     for _ in range(TRIALS):
         e = error(h)
+        if tol_of == "energy" and e <= KEPT:
+            if h > kept and h >= min(32 * kept, most):  # as by Gauss methods where H is quadratic
+                return step_for(integrator, problem, tol, "state")
+            kept = min(kept, h)
         if e > tol and h < bad and least <= e <= AT_ROUNDING:
             break
         least = min(least, e)
