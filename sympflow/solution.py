@@ -190,8 +190,10 @@ class Solution(Shown):
             y, t = np.concatenate([y0, to_numpy(self.states)[..., few, :]], axis=-2), np.append(t, self.t[few])
         H, y, t = _energy(self, y, t), y.astype(float), np.broadcast_to(t, y.shape[:-1])
         with np.errstate(all="ignore"):
-            varied = self.rows is not None and self.varied
-            sizes = self.rows.sizes_of_terms(y, t) if varied else size_of_terms(self.system, y, t)
+            if self.rows is None or self.rows.uniform:
+                sizes = size_of_terms(self.system, y, t)
+            else:
+                sizes = self.rows.sizes_of_terms(y, t)
         return known_scale(self.system, np.moveaxis(H, -1, 0), np.moveaxis(sizes, -1, 0))
 
     def card(self) -> Card:

@@ -19,8 +19,8 @@ class Command(TyperCommand):
     """A command that refuses an option with two values, of which the last one would count."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        _, _, order = self.make_parser(ctx).parse_args(args=[*args])
-        for param in {p.name: p for p in order if order.count(p) > 1 and not p.multiple and not p.is_flag}.values():
+        order: list[Any] = self.make_parser(ctx).parse_args(args=[*args])[2]
+        for param in [p for p in order if order.count(p) > 1 and not (p.multiple or p.is_flag)][:1]:
             several = ", its values separated by commas" if param.name == "method_names" else ""
             raise typer.BadParameter(f"it is given {order.count(param)} times: give it once{several}.", ctx, param)
         return super().parse_args(ctx, args)

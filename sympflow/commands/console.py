@@ -36,7 +36,7 @@ OPTIONS = {
 """Arguments of the library that commands have by other names: the first one counts that the command has."""
 COMMANDS = {"poincare_section": "section", "work_precision": "bench", "available": "methods", "shipped_flows": "flows"}
 """Functions of the library that are commands by other names."""
-PHRASES = {
+PHRASES: dict[str, str | Callable[[re.Match[str]], str]] = {
     r"train one by flow = sympflow\.train\(system\) and pass flow=flow": "train one by `sympflow train` and "
     "name its file, or take a method that needs none, such as gauss_legendre6",
     r"train a flow and pass flow=flow": "train one by `sympflow train`, and name its file",

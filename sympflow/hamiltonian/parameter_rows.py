@@ -142,10 +142,10 @@ class ParameterRows:
         symbols = self.system.symbols
         if symbols is None or symbols.samples or symbols.impulses:
             each = (y, np.broadcast_to(t, y.shape[:-1]))
-            states, times = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in each)
+            states, at = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in each)
             found = np.empty(states.shape[:-1])
             for index, system, _ in self.distinct():
-                found[index] = of_system(system, states[index], times[index])
+                found[index] = of_system(system, states[index], at[index])
             return found.reshape(y.shape[:-1])
         more = (1,) * (y.ndim - 1 - len(self.shape))
         columns = [value.reshape(*self.shape, *more) for value in self.values.values()]

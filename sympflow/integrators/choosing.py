@@ -275,11 +275,12 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     if states.ndim > 1:
         states = states.reshape(-1, states.shape[-1])[:MOST_STATES]
     system = with_start(integrator, problem.system.between_impulses, states)
-    length, own = abs(problem.t1 - problem.t0), with_step(integrator, system, states).step_length(system)
-    error = _error(integrator, replace(problem, system=system, y0=states), tol_of, TRIAL_LENGTH * own)
+    length = abs(problem.t1 - problem.t0)
+    step = float(with_step(integrator, system, states).step_length(system) or system.dt)
+    error = _error(integrator, replace(problem, system=system, y0=states), tol_of, TRIAL_LENGTH * step)
     check_applies(integrator, system, states)
     most = min(length, integrator.longest_step(system))
-    h = min(own, most)
+    h = min(step, most)
     good, bad, least = 0.0, math.inf, math.inf
     kept = math.inf  # the shortest step with which H is kept to rounding
     for _ in range(TRIALS):
