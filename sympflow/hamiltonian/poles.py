@@ -11,6 +11,8 @@ import mpmath
 import numpy as np
 import sympy as sp
 
+from sympflow.hamiltonian.removable import Min
+
 __all__ = ["LatticePoles", "PairsPoles", "Place", "Poles", "SymbolicPoles", "places"]
 
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
@@ -375,7 +377,7 @@ def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
     elif isinstance(g, (sp.Abs, *_ODD)) or (g.is_Pow and g.exp.is_positive):
         yield from _split(g.args[0], x)
     elif g.is_Pow and g.base.func is sp.gamma:
-        yield Place(g, sp.Min(sp.floor(g.base.args[0]), 0))
+        yield Place(g, Min(sp.floor(g.base.args[0]), 0))
     elif g.is_Pow:  # what it divides by is looked for itself
         return
     elif isinstance(g, sp.sin | sp.tan):

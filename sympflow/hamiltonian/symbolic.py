@@ -716,14 +716,31 @@ def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tu
     """V(q) and T(p) with H = T + V, or (None, None). Constants go to V."""
     qs, ps = set(q), set(p)
     terms = sp.Add.make_args(H)
-    if any(t.free_symbols & qs and t.free_symbols & ps for t in terms):
-        terms = sp.Add.make_args(sp.expand(H))
     mixed = [t for t in terms if t.free_symbols & qs and t.free_symbols & ps]
+    if mixed and _is_mixed(sp.Add(*mixed), q, p):
+        return None, None
     if mixed:
+        terms = sp.Add.make_args(sp.expand(H))
+    if any(t.free_symbols & qs and t.free_symbols & ps for t in terms):
         return None, None
     T = sp.Add(*[t for t in terms if t.free_symbols & ps])
     V = sp.Add(*[t for t in terms if not t.free_symbols & ps])
     return V, T
+
+
+def _is_mixed(f: sp.Expr, q: Sequence[sp.Symbol], p: Sequence[sp.Symbol]) -> bool:
+    """True if f is no sum of a function of q and one of p, by its values at four states; False where these fail."""
+    others = sorted(f.free_symbols - {*q, *p}, key=str)
+    rng = np.random.default_rng(0)
+    a, b, c, d, t = (rng.uniform(0.3, 0.9, n).tolist() for n in (*(len(q),) * 4, len(others)))
+    try:
+        value = generate([f], (*q, *p, *others), "numpy")
+        with np.errstate(all="ignore"):
+            near, far, *crossed = (float(value(*x, *y, *t)[0]) for x, y in ((a, c), (b, d), (a, d), (b, c)))
+    except (TypeError, NameError, ArithmeticError):  # of a function that NumPy has not
+        return False
+    size = abs(near) + abs(far) + sum(map(abs, crossed))
+    return math.isfinite(size) and abs(near + far - sum(crossed)) > 1e-9 * size
 
 
 LONGEST_SUM = 500
