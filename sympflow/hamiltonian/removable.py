@@ -1,4 +1,4 @@
-"""Functions that SymPy has otherwise: sin(x)/x, accurate where x is small, and Max and Min, compared with numbers alone."""
+"""Functions that SymPy has otherwise: sin(x)/x, accurate where x is small, Max and Min, compared with numbers."""
 
 from __future__ import annotations
 
@@ -72,9 +72,11 @@ def _branches(n: int) -> tuple[sp.Expr, sp.Expr]:
 
 
 class _Extremum:
-    """The largest or smallest of some arguments: SymPy compares each with all others, minutes for a few in each other."""
+    """The largest or smallest argument, each compared with numbers alone: SymPy compares all, which takes minutes."""
 
     above: bool
+    identity: Any
+    args: tuple[Any, ...]
 
     def __new__(cls, *args: Any, **_: Any) -> Any:
         constants: dict[sp.Expr, sp.Expr] = {}
@@ -91,14 +93,14 @@ class _Extremum:
             held = any(getattr(a - bound, over) for a in kept)
             kept = [a for a in kept if not getattr(a - bound, under)] + [bound] * (not held)
         if len(kept) < 2:
-            return kept[0] if kept else cls.identity  # type: ignore[attr-defined]
+            return kept[0] if kept else cls.identity
         made = sp.Expr.__new__(cls, *ordered(kept))
         made._argset = frozenset(kept)
         return made
 
     def fdiff(self, argindex: int) -> sp.Expr:
-        rest = [a for i, a in enumerate(self.args) if i != argindex - 1]  # type: ignore[attr-defined]
-        return sp.Heaviside((self.args[argindex - 1] - type(self)(*rest)) * (1 if self.above else -1))  # type: ignore[attr-defined]
+        rest = [a for i, a in enumerate(self.args) if i != argindex - 1]
+        return sp.Heaviside((self.args[argindex - 1] - type(self)(*rest)) * (1 if self.above else -1))
 
 
 class Max(_Extremum, sp.Max):

@@ -203,8 +203,8 @@ def odeint_event(
     """
     if not _is_ours(kwargs.get("method"), func, kwargs.get("options")):
         theirs = torchdiffeq.odeint if odeint_interface is odeint else odeint_interface
-        start = float(one_lane(t0).reshape(-1)[0])
-        interval = torch.tensor([start, start + (-1.0 if reverse_time else 1.0)], dtype=torch.float64)
+        begin = float(one_lane(t0).reshape(-1)[0])
+        interval = torch.tensor([begin, begin + (-1.0 if reverse_time else 1.0)], dtype=torch.float64)
         kwargs["options"] = _landing(func, interval, kwargs.get("method"), kwargs.get("options"), True)
         arguments = {"event_fn": event_fn, "reverse_time": reverse_time, "odeint_interface": theirs, **kwargs}
         with _names_of_both():
@@ -401,7 +401,9 @@ def _with_jumps(t: Tensor, length: float | None, jumps: np.ndarray) -> Tensor:
     found = torch.as_tensor(jumps).to(t)
     near = 1e-9 * (grid[1:] - grid[:-1]).abs().min()
     apart = ((grid[1:-1, None] - found).abs() > near).all(-1)
-    return torch.cat([grid[:1], torch.cat([grid[1:-1][apart], found]).sort(descending=bool(t[-1] < t[0]))[0], grid[-1:]])
+    return torch.cat(
+        [grid[:1], torch.cat([grid[1:-1][apart], found]).sort(descending=bool(t[-1] < t[0]))[0], grid[-1:]]
+    )
 
 
 def _name(method: Any) -> str:
