@@ -44,6 +44,7 @@ class Definition:
     timed: bool = False
     kinetic_timed: bool = False
     shortest_piece: float = inf  # the shortest time between two jumps of H in t
+    may_jump: bool = False  # at times, which `jump_times` lists
     has_third_derivative: bool = False  # `third_derivative` of all arrays; else by differences
     loops: str = ""  # the compiled loops of a definition by one piece: see `sympflow.hamiltonian.local`
     leaps: bool = False  # bodies may meet, over which a step may leap: then there is `leapt`

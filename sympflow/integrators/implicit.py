@@ -77,7 +77,7 @@ class Gauss(FixedStep):
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian, by differentiating the equations that the K of the step solve."""
         y = to_numpy(y)
-        times = collocation.stage_times(system, self.tableau, t, y, h)
+        times = collocation.stage_times(self.tableau, t, y, h)
         h = np.asarray(h, dtype=y.dtype)[..., None]
         K, _ = collocation.stages(system, self.tableau, y, h, times)
         A, b, scale = (np.array(c, dtype=y.dtype) for c in self.tableau)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import check_not_followed
-from sympflow.arrays import Array, beside, is_tensor, last, like, moveaxis, stack
+from sympflow.arrays import Array, beside, detached, last, like, moveaxis, stack
 
 Time = Any
 """A number, or a tensor that carries a gradient."""
@@ -20,7 +20,7 @@ class Interpolant:
 
     def __init__(self, begin: Time, end: Time, coefficients: Sequence[Array]) -> None:
         self.begin, self.end, self.coefficients = begin, end, coefficients
-        self.t0, self.t1 = (float(t.detach()) if is_tensor(t) else t for t in (begin, end))
+        self.t0, self.t1 = (float(detached(t)) for t in (begin, end))
 
     @property
     def y0(self) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag, check_number, check_one_of
 from sympflow.arrays import Array, to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -25,7 +26,6 @@ from sympflow.integrators.contract import (
     differentiated,
     forward_tangent,
     in_blocks,
-    start_of,
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
@@ -222,33 +222,15 @@ class Splitting(FixedStep):
 
     def composed(self, system: HamiltonianSystem) -> Composition:
         """Return the scheme × the splitting on a system."""
-        options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
+        options: dict[str, Any] = {}
+        if not self.parts is self.omega is self.corrector is None:
+            options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
         return SPLITTINGS[self.splitting](self.name, self.scheme, system, **options)
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
         """Return the method on its clock, where that is not the physical one."""
         on = CLOCKS[self.clock].on
         return None if on is None else on(self, system)
-
-    def reach_times(
-        self,
-        clock: LogarithmicClock,
-        h: float,
-        start: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        backend: str,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run on the logarithmic clock in one compiled pass: see `LogarithmicClock`."""
-        transformed = clock.transformed
-        if self.compensated or transformed.symbols is None:
-            return None
-        if compiled_loops(lambda: self.inner.composed(transformed).kernel(False), start, backend) is None:
-            return None
-        from sympflow.kernels.elapsed_times import reach_times
-
-        return reach_times(transformed, self.scheme, h, start, times, stride, expected)
 
     @property
     def inner(self) -> Splitting:
@@ -295,9 +277,9 @@ class Splitting(FixedStep):
             super().check_followed(problem)
         try:
             if problem.backend == "array":
-                raise ValueError("`backend` is 'array'.")
+                raise NotCompiled("`backend` is 'array'.")
             self.composed(problem.system).kernel_by(bool(self.compensated), tuple(problem.followed))
-        except ValueError as error:
+        except NotCompiled as error:
             names = ", ".join(problem.followed)
             raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
 
@@ -365,8 +347,7 @@ class Splitting(FixedStep):
         for times, states, lengths in self.steps(system, t_span, y0):
             for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
                 at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
-                start = start_of(system, at)
-                yield at, length, partial(self.jvp, system, start, y, length.astype(y.dtype))
+                yield at, length, partial(self.jvp, system, at, y, length.astype(y.dtype))
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
         if self.clock != "physical" or self.overrides("step") or self.compensated:
@@ -394,7 +375,7 @@ class Splitting(FixedStep):
             return forward_tangent(lambda z, lengths: composition.step(z, lengths, t), x, h)[1]
 
         for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
-            yield differentiated(jacobian, times, states, lengths, system)
+            yield differentiated(jacobian, times, states, lengths)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)

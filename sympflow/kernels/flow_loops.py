@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, SubFlow
@@ -68,12 +69,12 @@ class PrimedFlowKernel(Kernel):
 
     def __init__(self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False) -> None:
         if system.friction and compensated:
-            raise ValueError(
+            raise NotCompiled(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
         known = system.form is not None or (tables.level == CURVATURE and system.local is not None)
         if tables.level >= CURVATURE and not known:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
                 "use backend='array'."
             )
@@ -212,21 +213,14 @@ class ClockedFlowKernel(Kernel):
     """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B], of the transformed system.
 
     B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept:
-    ``advance(s, B)`` of steps s. The `numbers` are those that the clock has now: see `reach_times`.
+    ``advance(s, B)`` of steps s.
     """
 
     saves_finite = False
 
-    def __init__(
-        self,
-        scheme: Scheme,
-        system: HamiltonianSystem,
-        advance: Callable[[Any, Any], Any],
-        numbers: Callable[[], tuple[float, ...]],
-    ) -> None:
-        self.system = system
-        self._scheme, self._kernel = scheme, splitting_loops(system).kernel(scheme)
-        self._advance, self._numbers, self._time = advance, numbers, system.ndof - 1
+    def __init__(self, scheme: Scheme, system: HamiltonianSystem, advance: Callable[[Any, Any], Any]) -> None:
+        self._kernel = splitting_loops(system).kernel(scheme)
+        self._advance, self._time = advance, system.ndof - 1
 
     def runs(self, task: Task) -> Run:
         """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
@@ -244,24 +238,6 @@ class ClockedFlowKernel(Kernel):
         else:
             out[:, self._time] += self._advance(np.asarray(h, dtype=np.float64), y[:, -1])
         return Steps(out)
-
-    def reach_times(
-        self,
-        h: float,
-        y0: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        numbers: tuple[float, ...] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The states of rows of `y0` (N, 2d) at elapsed times: see `elapsed_times.reach_times`.
-
-        `numbers` are those of the clock, if they have been asked for.
-        """
-        from sympflow.kernels.elapsed_times import reach_times
-
-        numbers = self._numbers() if numbers is None else numbers
-        return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)
 
 
 class CollocatedFlowKernel(Kernel):

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from sympflow.compiler.control import BOOL, INT, POINTER, Module
 from sympflow.compiler.machine import address, host
 from sympflow.kernels.runs import Lanes, finished, groups
+from sympflow.lazy import kept
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.domain import Box, EnergySublevel
@@ -22,8 +22,6 @@ __all__ = ["all_within", "row_products"]
 
 LANES = 16
 MOST_OPERATIONS = 2000  # of an H that is written out
-
-_SUBLEVELS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., None] | None] = WeakKeyDictionary()
 
 
 def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: np.ndarray, slack: float) -> bool:
@@ -41,9 +39,7 @@ def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: 
     else:
         low, high = domain.limits(slack)
         if symbols is not None and (domain.hamiltonian is None or domain.hamiltonian == system.hamiltonian):
-            if symbols not in _SUBLEVELS:
-                _SUBLEVELS[symbols] = _sublevel_function(symbols)
-            within = _SUBLEVELS[symbols]
+            within = _sublevel_function(symbols)
     if within is None or states.dtype != np.float64 or len(low) != width + 2 * (not isinstance(domain, Box)):
         return False
     rows, inside = np.ascontiguousarray(states), np.zeros(1, dtype=np.int64)
@@ -56,6 +52,7 @@ def _box_function(width: int) -> Callable[..., None]:
     return _within_function(width, None)
 
 
+@kept
 def _sublevel_function(symbols: SymbolicHamiltonian) -> Callable[..., None] | None:
     """The test of an H; None if that cannot be recorded or is long."""
     import sympy as sp

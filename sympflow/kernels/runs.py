@@ -42,9 +42,9 @@ Numbers = Callable[..., Any]
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 """``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
 `step` tells after how many whole steps the stage is executed."""
-Adjoint = Callable[[list[Value], list[Value], Numbers, Value, Value], tuple[list[Value], list[Value]]]
-"""``adjoint(values, cotangents, numbers, kind, step)``: the cotangents of the values before a stage, and of its
-numbers, for those of the values after it."""
+Adjoint = Callable[[list[Value], list[Value], Numbers, Value, Value, bool], tuple[list[Value], list[Value]]]
+"""``adjoint(values, cotangents, numbers, kind, step, slopes)``: the cotangents of the values before a stage, and with
+`slopes` of its numbers, for those of the values after it."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
 Over = Callable[[Callable[..., None], Numbers, Value, Value], None]
@@ -215,7 +215,7 @@ def reverse_function(
         n, saved = code.variable(n_steps), code.variable(n_saved)
 
         def pulled(j: Value, step: Value, state: list[Value], given: list[Value]) -> list[Value]:
-            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step)
+            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step, slopes)
             for i, x in enumerate(of_numbers if slopes else ()):
                 at = j * (size * width) + i * width
                 code.store(code.load(found, at, x.type) + x, found, at)
