@@ -103,6 +103,10 @@ class _Extremum:
         return sp.Heaviside((self.args[argindex - 1] - type(self)(*rest)) * (1 if self.above else -1))
 
 
+    def _torchcode(self, printer: Any) -> str:
+        return f"{'max' if self.above else 'min'}({', '.join(map(printer._print, self.args))})"
+
+
 class Max(_Extremum, sp.Max):
     """The largest of some expressions."""
 
