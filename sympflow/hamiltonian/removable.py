@@ -102,7 +102,6 @@ class _Extremum:
         rest = [a for i, a in enumerate(self.args) if i != argindex - 1]
         return sp.Heaviside((self.args[argindex - 1] - type(self)(*rest)) * (1 if self.above else -1))
 
-
     def _torchcode(self, printer: Any) -> str:
         return f"{'max' if self.above else 'min'}({', '.join(map(printer._print, self.args))})"
 

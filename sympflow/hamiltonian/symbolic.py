@@ -45,9 +45,9 @@ from sympflow.hamiltonian.jumps import (
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
-from sympflow.hamiltonian.removable import sinc
+from sympflow.hamiltonian.removable import Max, sinc
 
-LARGEST = sys.float_info.max
+LARGEST, TINY = sys.float_info.max, 1e-150
 MOST_LEFT_OUT = 100
 """Degrees of freedom up to the last one that a formula may do without."""
 LONGEST_NAME = 40  # in messages
@@ -708,7 +708,20 @@ def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
 
 def printable(f: sp.Expr) -> sp.Expr:
     """A derivative as code needs it: constants as numbers, sinc written out, the δ of a kink's second one left out."""
-    return _with_numeric_constants(without_deltas(f).replace(sinc, lambda *args: sinc(*args).written_out))
+    f = without_deltas(f).replace(sinc, lambda *args: sinc(*args).written_out)
+    if f.has(Max) and f.has(sp.Heaviside):
+        f = f.replace(lambda e: e.is_Mul and e.has(sp.Heaviside), _bounded_below)
+    return _with_numeric_constants(f)
+
+
+def _bounded_below(f: sp.Mul) -> sp.Expr:
+    """A product with Heaviside(x) and a negative power of Max(x, 0), which is 0/0 in arrays, as 0 for x ≤ 0."""
+    steps = {x.as_base_exp()[0].args[0] for x in f.args if isinstance(x.as_base_exp()[0], sp.Heaviside)}
+    for x in f.args:
+        base, exponent = x.as_base_exp()
+        if exponent.is_negative and isinstance(base, Max) and (held := [s for s in steps if base == Max(s, 0)]):
+            return sp.Piecewise((f.xreplace({base: Max(held[0], TINY)}), held[0] > 0), (0, True))
+    return f
 
 
 def without_deltas(f: sp.Expr) -> sp.Expr:

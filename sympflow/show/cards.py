@@ -101,7 +101,21 @@ def legible(text: str) -> str:
     return plain.encode(encoding, "replace").decode(encoding)
 
 
-SPELLED = {"…": "...", "–": "-", "—": "-", "−": "-", "×": "x", "·": "*", "∞": "inf", "≤": "<=", "≥": ">=", "→": "->"}
+SPELLED = {
+    "…": "...",
+    "µ": "u",
+    "±": "+-",
+    "─": "-",
+    "–": "-",
+    "—": "-",
+    "−": "-",
+    "×": "x",
+    "·": "*",
+    "∞": "inf",
+    "≤": "<=",
+    "≥": ">=",
+    "→": "->",
+}
 
 
 def _spelled(character: str) -> str:
