@@ -247,9 +247,10 @@ class PairsPoles(Poles):
     def __init__(self, pairs: Any) -> None:
         self._pairs, self._x = pairs, sp.Symbol("r", real=True)
         own = [s for s in pairs.of_distance.free_symbols if s.name == "r"]
-        self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if pairs.on_a_line else self._x for s in own})
+        self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if pairs.signed else self._x for s in own})
         found = places(self._f, (self._x,))
-        self._places = [place for place in found if pairs.on_a_line or place.cell != sp.sign(self._x)]
+        self._places = [place for place in found if pairs.signed or place.cell != sp.sign(self._x)]
+        self._passing = pairs.dim > 1 and [place.cell for place in self._places] == [sp.sign(self._x)]
         self.watched = bool(self._places)
         self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
 
@@ -259,7 +260,9 @@ class PairsPoles(Poles):
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         q, end = y[..., : self._pairs.ndof], self._pairs.cutoff
         sums = np.zeros((*y.shape[:-1], len(self._places)))
-        for i, j, x, letters in self._pairs.met(q):
+        if self._passing and not self._pairs.may_pass(y[[0, -1]]):
+            return sums, sums[..., 0], None
+        for i, j, x, letters in self._pairs.met(y):
             cells = self._cells(x, letters)
             beyond = self._cells(np.full_like(x, end), letters) if end else [0.0] * len(cells)
             number = 1 + i * self._pairs.n_bodies + j
@@ -268,7 +271,7 @@ class PairsPoles(Poles):
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
         names = (self._x, *self._pairs.first, *self._pairs.second, *self._pairs.c)
-        for _, _, x, letters in self._pairs.met(y[..., : self._pairs.ndof]):
+        for _, _, x, letters in self._pairs.met(y, together=True):
             cells = self._cells(x, letters)[column]
             for k in np.flatnonzero(cells[0] != cells[1])[:MOST_MET]:
                 own = [float(np.broadcast_to(v, x.shape)[0, k]) for v in letters]
@@ -281,7 +284,7 @@ class PairsPoles(Poles):
         return f"{_written(self._places[column].g.xreplace(names))} = 0 of two bodies"
 
     def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([x for _, _, x, _ in self._pairs.met(y[..., : self._pairs.ndof])], axis=-1)
+        return np.concatenate([x for _, _, x, _ in self._pairs.met(y)], axis=-1)
 
     def _cells(self, x: np.ndarray, letters: Sequence[Any]) -> list[np.ndarray]:
         return self._pairs.values_of("cells", [place.cell for place in self._places], self._x, x, letters)
