@@ -280,7 +280,7 @@ class PairsPoles(Poles):
         return False
 
     def name(self, column: int) -> str:
-        names = dict(zip(self._pairs.c, map(sp.Symbol, self._pairs.params), strict=False))
+        names = dict(zip(self._pairs.c, map(sp.Symbol, self._pairs.params), strict=False)) | {sp.Abs(self._x): self._x}
         return f"{_written(self._places[column].g.xreplace(names))} = 0 of two bodies"
 
     def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
