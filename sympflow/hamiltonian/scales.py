@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.hamiltonian.definition import bare_copy
+from sympflow.hamiltonian.definition import Found, bare_copy
 
 STATES = 64
 """States of a domain at which Hessians are taken, where there is no y0."""
@@ -26,24 +24,25 @@ SMALLEST_SCALE = 1e-12
 """|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
 
 
-_KNOWN: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
-_STARTED: WeakKeyDictionary[Any, dict[Any, Any]] = WeakKeyDictionary()
+_KNOWN = Found()
+_STARTED = Found(most=64)
 """What was found at states: by these default steps, and by one of these and a step the system that starts there."""
-MOST_STARTED = 64
 
 
 def natural_scale(scene: Any) -> np.ndarray:
     """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω)."""
     system = scene.between_impulses
-    if system not in _KNOWN:
+
+    def found() -> np.ndarray:
         with np.errstate(all="ignore"):
             try:
                 large = system.local is not None and system.ndof > MOST_DENSE
                 s = _of_large(system) if large else _of_hessians(system)
             except (ArithmeticError, ValueError, TypeError):  # singular at the origin, or no second derivatives
                 s = np.ones(system.ndof)
-        _KNOWN[system] = np.where(np.isfinite(s) & (s > 0), s, 1.0)
-    return _KNOWN[system].copy()
+            return np.where(np.isfinite(s) & (s > 0), s, 1.0)
+
+    return _KNOWN.of(system, "", found).copy()
 
 
 def weights(system: Any) -> np.ndarray:
@@ -112,18 +111,8 @@ def default_step(scene: Any, y: np.ndarray | None = None) -> float:
     """`STEP` over the largest rate at states y (..., 2d), by default y0 or those of the domain, to two digits."""
     if y is not None:
         y = _few(y)
-        return _found(scene, y.tobytes(), lambda: _step_at(scene.between_impulses, y))
+        return _STARTED.of(scene, y.tobytes(), lambda: _step_at(scene.between_impulses, y))
     return _step_at(scene.between_impulses, None)
-
-
-def _found(system: Any, key: Any, make: Callable[[], Any]) -> Any:
-    """What was found at states of a system, found once."""
-    known = _STARTED.setdefault(system, {})
-    if key not in known:
-        if len(known) >= MOST_STARTED:
-            known.clear()
-        known[key] = make()
-    return known[key]
 
 
 def _few(y: np.ndarray) -> np.ndarray:
@@ -177,7 +166,7 @@ def started(system: Any, y0: np.ndarray) -> Any:
         made.dt, made.y0 = dt, rows[highest]
         return made
 
-    return _found(system, (dt, rows[highest].tobytes()), other)
+    return _STARTED.of(system, (dt, rows[highest].tobytes()), other)
 
 
 def known_scale(system: Any, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:

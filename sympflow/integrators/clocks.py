@@ -12,12 +12,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from sympflow.arguments import check_array
 from sympflow.arrays import Array, to_numpy
+from sympflow.hamiltonian.definition import Found
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
@@ -36,25 +36,18 @@ EVALUATIONS_EACH = 50  # and these for each step of the physical length dt withi
 STEPS_EACH = 6  # or as many as so many steps take
 COMPILED_FOR_ONE = 10  # compiled evaluations that are allowed for one on arrays, which takes a thousand times longer
 
-_TRANSFORMED: WeakKeyDictionary[HamiltonianSystem, dict[float, HamiltonianSystem]] = WeakKeyDictionary()
-_SCALES: WeakKeyDictionary[HamiltonianSystem, dict[float, float]] = WeakKeyDictionary()
+_TRANSFORMED, _SCALES = Found(), Found()
 
 
 def transformed_system(system: HamiltonianSystem, shift: float | None) -> HamiltonianSystem:
     """Return the transformed system, made once for each c."""
     c = default_shift(system) if shift is None else float(shift)
-    made = _TRANSFORMED.setdefault(system, {})
-    if c not in made:
-        made[c] = time_transformed(system, c)
-    return made[c]
+    return _TRANSFORMED.of(system, c, lambda: time_transformed(system, c))
 
 
 def scale_of(system: HamiltonianSystem, c: float) -> float:
     """Return ds/dt where the kinetic energy is c − E, at the energy E of the system's y0; worked out once."""
-    known = _SCALES.setdefault(system, {})
-    if c not in known:
-        known[c] = time_scale(system, c)
-    return known[c]
+    return _SCALES.of(system, c, lambda: time_scale(system, c))
 
 
 ARRAYS_ONLY = (
@@ -82,12 +75,12 @@ class LogarithmicClock(NamedTuple):
 
     # one step -------------------------------------------------------------------------------------
 
-    def step(self, y: Array, h: float | Array) -> Array:
+    def step(self, y: Array, h: float | Array, t: Any = 0.0) -> Array:
         """One step of the physical length h, with B = c − H(y)."""
         rows, lengths = _rows(y, h)
         return projected(self._reached(lifted(self.system, rows, self.shift), lengths)[0]).reshape(y.shape)
 
-    def inverse(self, y: Array, h: float | Array) -> Array:
+    def inverse(self, y: Array, h: float | Array, t: Any = 0.0) -> Array:
         """The states from which `step` leads to y."""
         rows, lengths = _rows(y, h)
         system, c = self.system, self.shift
@@ -99,7 +92,7 @@ class LogarithmicClock(NamedTuple):
                 break
         return x.reshape(y.shape)
 
-    def tangent(self, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+    def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian in [q, p], the realised step in s and B held fixed."""
         rows, lengths = _rows(to_numpy(y), h)
         end, sigma = self._reached(start := lifted(self.system, rows, self.shift), lengths)

@@ -311,24 +311,23 @@ class Splitting(FixedStep):
         """The times of the forces in a step of length 1, of a driven system."""
         return [] if self.clock != "physical" else self.composed(system).force_times()
 
+    def _placed(self, system: HamiltonianSystem) -> LogarithmicClock | Composition:
+        """The method on its clock, or on the physical one its composition."""
+        return self.on_clock(system) or self.composed(system)
+
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        clock = self.on_clock(system)
-        if clock is not None:
-            return clock.step(y, h)
+        if not self.keeps:
+            return self._placed(system).step(y, h, t)
         composition = self.composed(system)
         return composition.project(composition.step(composition.lift(y), h, t))
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         if self.keeps:
             raise TypeError(f"`method` {self.name!r} keeps {self.keeps}, without which a step cannot be undone.")
-        clock = self.on_clock(system)
-        return self.composed(system).inverse(y, h, t) if clock is None else clock.inverse(y, h)
+        return self._placed(system).inverse(y, h, t)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        clock = self.on_clock(system)
-        if clock is not None:
-            return clock.tangent(y, h)
-        known = None if self.keeps else self.composed(system).tangent(y, h, t)
+        known = None if self.keeps else self._placed(system).tangent(y, h, t)
         return super().tangent(system, t, y, h) if known is None else known
 
     def jvp(self, system: HamiltonianSystem, t: Any, y: Array, h: Array, W: np.ndarray) -> np.ndarray:
