@@ -21,7 +21,7 @@ from sympflow.integrators.base import Recorder
 from sympflow.integrators.contract import ENDED, FINISHED, Interrupted, Outcome, Problem, Steps, interrupted
 from sympflow.integrators.grid import MOST_OPEN_STEPS, Grid
 from sympflow.integrators.impulses import pieces_of
-from sympflow.integrators.interpolants import Batch, Constant
+from sympflow.integrators.interpolants import Batch, Piecewise
 from sympflow.integrators.runge_kutta import RungeKutta, hopeless
 
 MOST_STEPS = 10_000_000
@@ -196,7 +196,7 @@ class _Scipy(RungeKutta):
         elif failure:
             stats["failed_at"] = float(reached)
         if problem.dense_output:
-            outcome.sol = OdeSolution(times, interpolants) if interpolants else Constant(y0, t0)
+            outcome.sol = OdeSolution(times, interpolants) if interpolants else Piecewise([], y0, t0, t0)
         if stopped:
             raise interrupted(outcome, float(reached))
         return outcome

@@ -73,7 +73,7 @@ def test_the_array_form_of_a_written_triple_is_the_compiled_one():
         ({"splitting": "oblique"}, r"^`splitting` must be one of 'kinetic', 'linear', .*; got 'oblique'"),
         ({"clock": ["physical"]}, r"^`clock` must be one of 'physical', 'logarithmic'; got \['physical'\]"),
         ({"shift": 1.0}, r"^`shift` is for the clock 'logarithmic'"),
-        ({"parts": ["p**2/2"]}, r"^`parts` are for the splitting 'parts'"),
+        ({"parts": ["p**2/2"]}, r"^`parts` is for the splitting 'parts'"),
         ({"splitting": "parts", "compensated": True}, r"^`compensated` sums are for the splittings 'kinetic'"),
     ],
 )
