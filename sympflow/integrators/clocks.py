@@ -246,6 +246,8 @@ class PhysicalRun(Run):
         self.out[self.wanted == 0] = projected(self.start)
         self.delivered = np.full(len(rows), int((self.wanted == 0).sum()))
         self.kept: list[tuple[np.ndarray, np.ndarray]] = []
+        if len(self.wanted) and not problem.dense_output:
+            self.length = abs(float(self.wanted[-1]))  # nothing is asked for beyond
         self.stride = 1
         """Steps from one state of a chunk to the next: those between are made again where an output is due."""
         if self.stepper.compiled and times is not None and not problem.dense_output:

@@ -10,13 +10,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from sympflow.compiler import NotCompiled
-from sympflow.compiler.control import DOUBLE, POINTER, Code, Module, Rows, Value
-from sympflow.compiler.machine import compiled, host
+from sympflow.compiler.control import DOUBLE, POINTER, Code, Rows, Value
 from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
-from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.runs import Numbers, Room, begun, finished
 from sympflow.lazy import kept
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
@@ -96,8 +95,7 @@ class Field:
     @cached_property
     def function(self) -> Callable[..., None]:
         """f compiled: of addresses (y, out, time, numbers, room, data)."""
-        module, lettered = Module(host().fused), self.lettered
-        code = module.function("field_at", [POINTER] * 6)
+        code, lettered = begun("field_at", [POINTER] * 6), self.lettered
         y, out, time, numbers, room, data = code.arguments
         k, n = len(lettered.symbols.parameters), 2 * self.ndof
         given = [code.load(numbers, i) for i in range(k)]
@@ -113,8 +111,7 @@ class Field:
             rates = [code.load(numbers, k + i) for i in range(len(self.rates))]
             for i, x in enumerate(self.program(*(code.load(y, i) for i in range(n)), *given, *rates)):
                 code.store(code.operand(x, DOUBLE), out, i)
-        code.give()
-        return compiled(str(module), "field_at", ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 6))
+        return finished(code)
 
     def fill(self, y: Value, out: Value, g: Value, letters: Value, *data: Value) -> None:
         """f(y) into `out` by loops over the terms of each kind; `g` is room for ∇H."""

@@ -19,15 +19,15 @@ import sympy as sp
 
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
+from sympflow.compiler.control import INT, POINTER, Code, Type, Value
 from sympflow.compiler.functions import apply, fma, summed
-from sympflow.compiler.machine import address, host
+from sympflow.compiler.machine import address
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.kernels.array_splittings import ARRAYS, ArrayCode, Forces, FunctionSplitting
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
-from sympflow.kernels.runs import Numbers, Room, finished
+from sympflow.kernels.runs import Numbers, Room, begun, finished
 from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
@@ -609,7 +609,7 @@ class PairForces:
     @cached_property
     def _forces(self) -> Callable[..., None]:
         """The function of (n, P, sites, numbers, q, F, G) that adds F and G at P states to zeros."""
-        code = Module(host().fused).function("forces", [INT, INT, *[POINTER] * 5])
+        code = begun("forces", [INT, INT, *[POINTER] * 5])
         *_, F, G = code.arguments
         states = _States(self._law, code)
         with states.groups():
@@ -618,13 +618,12 @@ class PairForces:
             if self._has_gradient:
                 for i, j, pair in states.pairs(F):
                     states.add(G, (i, j), parts("hessian_vector", *pair), 1.0)
-        return finished(code, [INT, INT, *[POINTER] * 5])
+        return finished(code)
 
     @cached_property
     def _products(self) -> Callable[..., None]:
         """The function of (n, P, sites, numbers, q, F, v, DF, DG, K) that adds derivatives along K directions."""
-        types = [INT, INT, *[POINTER] * 7, INT]
-        code = Module(host().fused).function("products", types)
+        code = begun("products", [INT, INT, *[POINTER] * 7, INT])
         *_, F, v, DF, DG, K = code.arguments
         states = _States(self._law, code)
         with states.groups(), states.some(K) as (first, count):
@@ -644,7 +643,7 @@ class PairForces:
                         m = first + k
                         u = states.between(DF, i, j, m)
                         states.add(DG, (i, j), parts("hessian_vector", d, u, g), 1.0, m)
-        return finished(code, types)
+        return finished(code)
 
 
 class _States:

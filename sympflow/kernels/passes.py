@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sympflow.compiler.control import BOOL, INT, POINTER, Module
-from sympflow.compiler.machine import address, host
-from sympflow.kernels.runs import Lanes, finished, groups
+from sympflow.compiler.control import BOOL, INT, POINTER
+from sympflow.compiler.machine import address
+from sympflow.kernels.runs import Lanes, begun, finished, groups
 from sympflow.lazy import kept
 
 if TYPE_CHECKING:
@@ -66,8 +66,7 @@ def _sublevel_function(symbols: SymbolicHamiltonian) -> Callable[..., None] | No
 
 def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..., None]:
     """Compile the test of rows of n numbers, and of H and, in a plane, |L|, of (rows, n_rows, low, high, inside)."""
-    types = [POINTER, INT, POINTER, POINTER, POINTER]
-    code = Module(host().fused).function("within", types)
+    code = begun("within", [POINTER, INT, POINTER, POINTER, POINTER])
     rows, n_rows, low, high, result = code.arguments
     lanes = Lanes(code, n, LANES)
     inside = code.variable(code.constant(1, BOOL))
@@ -88,7 +87,7 @@ def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..
             any_out = any_out | each
         inside.value = inside.value & ~code.any(any_out)
     code.store(code.convert("zext", inside.value, "i64"), result)
-    return finished(code, types)
+    return finished(code)
 
 
 def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -102,8 +101,7 @@ def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 @cache
 def _products_function() -> Callable[..., None]:
-    types = [POINTER, INT, POINTER, INT, POINTER]
-    code = Module(host().fused).function("products", types)
+    code = begun("products", [POINTER, INT, POINTER, INT, POINTER])
     A, n, x, n_rows, out = code.arguments
     with code.over(n_rows) as i, code.over(n) as j:
         row, start = code.at(A, j * n), code.at(x, i * n)
@@ -111,4 +109,4 @@ def _products_function() -> Callable[..., None]:
         with code.over(n) as k:
             total.value = total.value + code.load(row, k) * code.load(start, k)
         code.store(total.value, out, i * n + j)
-    return finished(code, types)
+    return finished(code)

@@ -155,6 +155,13 @@ def test_a_trajectory_of_a_batch_is_the_one_alone(monkeypatch):
     np.testing.assert_array_equal(solve(kepler, "log_leapfrog", y0=y0, **options).y, alone)
 
 
+def test_a_run_ends_with_its_last_output():
+    kepler = systems.kepler()
+    whole, part = (solve(kepler, "log_leapfrog", (0.0, end), t_eval=[2.0], dt=0.1) for end in (2.0, 2000.0))
+    np.testing.assert_array_equal(whole.y, part.y)
+    assert whole.stats["n_steps"] == part.stats["n_steps"]
+
+
 def test_a_trajectory_that_ends_leaves_the_others():
     system, end = systems.henon_heiles(), [0.5, 10.0]
     y0 = np.array([[0.0, 0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 0.7]])  # one stays, one escapes
