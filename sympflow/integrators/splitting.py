@@ -192,12 +192,12 @@ class Splitting(FixedStep):
             check_one_of(name, value, known)
         if self.compensated and not SPLITTINGS[self.splitting].compensates:
             raise ValueError("`compensated` sums are for the splittings 'kinetic' and 'kepler': leave it out.")
-        for name, (of, known, check) in OWN_OPTIONS.items():
+        for name, (of, its, check) in OWN_OPTIONS.items():
             if getattr(self, name) is None:
                 continue
             check(getattr(self, name))
-            if getattr(self, of) != known:
-                raise ValueError(f"`{name}` is for the {of} {known!r}: leave it out.")
+            if getattr(self, of) != its:
+                raise ValueError(f"`{name}` is for the {of} {its!r}: leave it out.")
         if self.parts is not None:
             object.__setattr__(self, "parts", tuple(self.parts))
 
