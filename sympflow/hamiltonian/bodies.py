@@ -39,7 +39,7 @@ ASLANT = np.array([1.0, 0.6180339887498949, 0.3247179572447460])
 STRAIGHT, TINY = 1e-9, float(np.finfo(float).tiny)
 """Share of a velocity that is across the line between two bodies, below which they move along it."""
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
-"""Pairs up to which the energy at the end of a run is always looked at, and steps beside which it costs nothing."""
+"""Pairs up to which the ends of a run are always looked at, and steps beside which it costs nothing."""
 
 
 class PairsHamiltonian(LocalHamiltonian):
@@ -327,7 +327,9 @@ class PairsHamiltonian(LocalHamiltonian):
             yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values
 
     def may_pass(self, y: np.ndarray) -> bool:
-        """Return True if two bodies move along the line between them, in one of the states (..., 2d)."""
+        """Return True if two of not too many bodies move along the line between them, in one of the states (..., 2d)."""
+        if self.n_bodies * (self.n_bodies - 1) // 2 > CHEAP_PAIRS:
+            return False
         q, v = y[..., : self.ndof], y[..., self.ndof :] / np.repeat(self.inertia, self.dim)
         return any(_is_straight(*pairs.x).any() for pairs in self._pairs(q, v))
 

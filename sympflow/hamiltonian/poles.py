@@ -247,10 +247,9 @@ class PairsPoles(Poles):
     def __init__(self, pairs: Any) -> None:
         self._pairs, self._x = pairs, sp.Symbol("r", real=True)
         own = [s for s in pairs.of_distance.free_symbols if s.name == "r"]
-        self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if pairs.signed else self._x for s in own})
-        found = places(self._f, (self._x,))
-        self._places = [place for place in found if pairs.signed or place.cell != sp.sign(self._x)]
-        self._passing = pairs.dim > 1 and [place.cell for place in self._places] == [sp.sign(self._x)]
+        self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if self._on_a_line else self._x for s in own})
+        found, self._meeting = places(self._f, (self._x,)), sp.sign(self._x)
+        self._places = [place for place in found if pairs.signed or place.cell != self._meeting]
         self.watched = bool(self._places)
         self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
 
@@ -260,7 +259,8 @@ class PairsPoles(Poles):
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         q, end = y[..., : self._pairs.ndof], self._pairs.cutoff
         sums = np.zeros((*y.shape[:-1], len(self._places)))
-        if self._passing and not self._pairs.may_pass(y[[0, -1]]):
+        in_space = not self._on_a_line and [place.cell for place in self._places] == [self._meeting]
+        if in_space and not self._pairs.may_pass(y[[0, -1]]):
             return sums, sums[..., 0], None
         for i, j, x, letters in self._pairs.met(y):
             cells = self._cells(x, letters)
@@ -270,24 +270,33 @@ class PairsPoles(Poles):
         return sums, np.where(np.isnan(self._pairs.potential(q)), np.nan, 0.0), None
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
-        names = (self._x, *self._pairs.first, *self._pairs.second, *self._pairs.c)
+        names, cell = (self._x, *self._pairs.first, *self._pairs.second, *self._pairs.c), self._places[column].cell
+        f = self._f.xreplace({self._x: sp.Abs(self._x)}) if cell == self._meeting else self._f
         for _, _, x, letters in self._pairs.met(y, together=True):
             cells = self._cells(x, letters)[column]
+            x = x if self._on_a_line or cell == self._meeting else np.abs(x)  # noqa: PLW2901
             for k in np.flatnonzero(cells[0] != cells[1])[:MOST_MET]:
                 own = [float(np.broadcast_to(v, x.shape)[0, k]) for v in letters]
-                if infinite_between(self._f, self._places[column].cell, names, *([float(v), *own] for v in x[:, k])):
+                if infinite_between(f, cell, names, *([float(v), *own] for v in x[:, k])):
                     return True
         return False
 
     def name(self, column: int) -> str:
-        names = dict(zip(self._pairs.c, map(sp.Symbol, self._pairs.params), strict=False)) | {sp.Abs(self._x): self._x}
+        names = dict(zip(self._pairs.c, map(sp.Symbol, self._pairs.params), strict=False))
         return f"{_written(self._places[column].g.xreplace(names))} = 0 of two bodies"
 
     def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([x for _, _, x, _ in self._pairs.met(y)], axis=-1)
+        found = np.concatenate([x for _, _, x, _ in self._pairs.met(y)], axis=-1)
+        return found if self._on_a_line else np.abs(found)
+
+    @property
+    def _on_a_line(self) -> bool:
+        return self._pairs.dim == 1 and self._pairs.signed
 
     def _cells(self, x: np.ndarray, letters: Sequence[Any]) -> list[np.ndarray]:
-        return self._pairs.values_of("cells", [place.cell for place in self._places], self._x, x, letters)
+        cells, r = [place.cell for place in self._places], x if self._on_a_line else np.abs(x)
+        found = self._pairs.values_of("cells", cells, self._x, r, letters)
+        return [np.sign(x) if cell == self._meeting else value for cell, value in zip(cells, found, strict=True)]
 
 
 def _with_numbers(f: sp.Expr, letters: Sequence[sp.Symbol], params: Any) -> sp.Expr:
