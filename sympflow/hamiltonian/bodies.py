@@ -327,7 +327,7 @@ class PairsHamiltonian(LocalHamiltonian):
             yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values
 
     def may_pass(self, y: np.ndarray) -> bool:
-        """Return True if two of not too many bodies move along the line between them, in one of the states (..., 2d)."""
+        """Return True if two of not too many bodies move along their line, in one of the states (..., 2d)."""
         if self.n_bodies * (self.n_bodies - 1) // 2 > CHEAP_PAIRS:
             return False
         q, v = y[..., : self.ndof], y[..., self.ndof :] / np.repeat(self.inertia, self.dim)
