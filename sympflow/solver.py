@@ -362,9 +362,9 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
 
 def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
     """The solution of trajectories to whose parameters gradients flow: one run, whatever the values."""
-    columns = {name: np.ravel(value) for name, value in rows.values.items()}
-    followed = {name: rows.followed.get(name, as_tensor(column.copy())) for name, column in columns.items()}
-    parameter_values = np.stack([*columns.values()])
+    numbers = {name: as_tensor(value.copy()) for name, value in rows.values.items() if name not in rows.followed}
+    followed = {name: rows.followed[name] if name in rows.followed else numbers[name] for name in rows.values}
+    parameter_values = np.array([np.ravel(value) for value in rows.values.values()])
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)
     if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
         raise ValueError(

@@ -137,7 +137,7 @@ class Problem:
     parameter_values: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
     followed: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters whose gradients are wanted, tensors (N,), by name: `parameter_values` then are their values."""
+    """Tensors that broadcast with the batch, by the names of parameters: `parameter_values` then are their values."""
     progress: Progress | None = None
     """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None

@@ -29,7 +29,7 @@ from sympflow.integrators.contract import (
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.integrators.steppers import Stepper, compiled_loops
+from sympflow.integrators.steppers import Stepper, compiled_loops, no_loops_for
 from sympflow.schemes import CORRECTORS, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
@@ -293,10 +293,14 @@ class Splitting(FixedStep):
     def check_followed(self, problem: Problem) -> None:
         if self.clock != "physical" or self.overrides("step"):
             super().check_followed(problem)
+
+    def _followed_kernel(self, composition: Composition, problem: Problem) -> Any:
+        """The loops of a run through which gradients flow to parameters."""
         try:
-            if problem.backend == "array":
-                raise ValueError("`backend` is 'array'.")
-            self.composed(problem.system).kernel_by(bool(self.compensated), tuple(problem.followed))
+            array, y0 = problem.backend == "array", problem.y0
+            if reason := "`backend` is 'array'." if array else no_loops_for(y0, problem.system):
+                raise ValueError(reason)
+            return composition.kernel_by(bool(self.compensated), tuple(problem.followed))
         except ValueError as error:
             names = ", ".join(problem.followed)
             raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
@@ -397,18 +401,18 @@ class Splitting(FixedStep):
             yield differentiated(jacobian, times, states, lengths, system)
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        composition = self.composed(problem.system)
-        told: list[str] = []
-        compensated = bool(self.compensated)
-        names = tuple(problem.followed)
-        kernel = compiled_loops(
-            lambda: composition.kernel_by(compensated, names) if names else composition.kernel(compensated),
-            problem.y0,
-            problem.backend,
-            compensated,
-            told=told,
-            system=problem.system,
-        )
+        composition, told = self.composed(problem.system), list[str]()
+        if problem.followed:
+            kernel = self._followed_kernel(composition, problem)
+        else:
+            kernel = compiled_loops(
+                lambda: composition.kernel(bool(self.compensated)),
+                problem.y0,
+                problem.backend,
+                bool(self.compensated),
+                told=told,
+                system=problem.system,
+            )
         if problem.parameter_values is not None:
             kernel = kernel.varied(problem.parameter_values)
         return Stepper(self, problem, composition, kernel, told)

@@ -184,7 +184,7 @@ def compiled_loops(
     if backend == "array":
         reason = "`backend` is 'array': choose 'auto'."
     elif is_tensor(y0):
-        reason = _no_loops_for(y0, system)
+        reason = no_loops_for(y0, system)
     elif y0.dtype != np.float64:
         reason = f"`y0` is {y0.dtype}: use float64, or backend='array'."
     asked = reason is None
@@ -206,7 +206,7 @@ def compiled_loops(
     return None
 
 
-def _no_loops_for(y0: Array, system: Any) -> str | None:
+def no_loops_for(y0: Array, system: Any) -> str | None:
     """Why a tensor needs array operations, if it does."""
     if system is None:
         return "`y0` is a tensor: pass a NumPy array, or use backend='array'."

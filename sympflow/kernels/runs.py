@@ -47,6 +47,9 @@ Adjoint = Callable[[list[Value], list[Value], Numbers, Value, Value], tuple[list
 numbers, for those of the values after it."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
+OfValues = Callable[[Sequence[Value], Sequence[Value], Value], Sequence[Value]]
+"""``of_values(given, cotangents, kind)``: the cotangents of the values of parameters that are the last numbers given,
+for those of the numbers that a stage reads."""
 Over = Callable[[Callable[..., None], Numbers, Value, Value], None]
 """``over(each, numbers, kind, step)``: a stage of many states, ``each(body)`` executes ``body(values)`` for each of
 them; what is the same for all is computed before."""
@@ -190,33 +193,40 @@ def reverse_function(
     adjoint: Adjoint,
     width: int = 1,
     own: bool = False,
-    slopes: bool = False,
+    of_values: OfValues | None = None,
+    n_given: int = 0,
+    n_own: int = 0,
     closing: bool = True,
 ) -> Callable[..., None]:
     """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
 
     Returns a function of addresses and integers (table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved,
-    out, slopes): `rows` (n_rows, n_values) are the cotangents of the running states after `n_steps` steps, and become
-    those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than `first`. With `slopes`, what a
-    table of its own for every `width` trajectories would hold is added to that array, in the same order.
+    out, slopes, columns, starts, values): `rows` (n_rows, n_values) are the cotangents of the running states after
+    `n_steps` steps, and become those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than
+    `first`. With `of_values`, what a table of its own for every `width` trajectories would hold is added to `slopes`,
+    in the same order. From that, and from the numbers `columns` (n_given, link + 2) that are given, the last of which are
+    those that follow each state in `starts` (n_rows, n_out + n_own), `values` (n_rows, n_own) are the cotangents of the
+    latter.
     """
-    types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER]
+    types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, *[POINTER] * 5]
     code = Module(host().fused).function("reverse", types)
-    table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, derivatives = code.arguments
+    table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, slopes, columns, starts, values = (
+        code.arguments
+    )
     one, zero = code.constant(1, INT), code.constant(0, INT)
     lanes, outputs = Lanes(code, n_values, width), Lanes(code, n_out, width)
     with code.over(groups(code, n_rows, width)) as group:
         begin, length = group * width, (link + 2) * (size * width)
         place = code.at(table, group * length) if own else table
         column = ColumnStage(code, place, kinds, size, width if own else 1, width, _no_stage)
-        found = code.at(derivatives, group * length)
+        found = code.at(slopes, group * length)
         history = _History(code, kept, group, (n_steps - first) * link, n_values, width)
         cotangents = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
         n, saved = code.variable(n_steps), code.variable(n_saved)
 
         def pulled(j: Value, step: Value, state: list[Value], given: list[Value]) -> list[Value]:
             of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step)
-            for i, x in enumerate(of_numbers if slopes else ()):
+            for i, x in enumerate(of_numbers if of_values else ()):
                 at = j * (size * width) + i * width
                 code.store(code.load(found, at, x.type) + x, found, at)
             return of_state
@@ -247,6 +257,19 @@ def reverse_function(
                 r.value = code.select(opens, link, r.value)
             n.value = to
         lanes.store([x.value for x in cotangents], rows, begin, n_rows, one, zero)
+        if of_values is not None:
+            behind = Lanes(code, n_own, width)
+            own_values = behind.loaded(
+                starts, begin, n_rows, code.constant(n_out + n_own, INT), code.constant(n_out, INT)
+            )
+            totals = [code.variable(code.constant(0.0, lanes.type)) for _ in range(n_own)]
+            with code.over(link + 2) as j:
+                shared = [code.load(columns, (link + 2) * r + j) for r in range(n_given - n_own)]
+                numbers = [*(code.splat(x, width) for x in shared), *own_values]
+                of_column = [code.load(found, (j * size + i) * width, lanes.type) for i in range(size)]
+                for total, x in zip(totals, of_values(numbers, of_column, column.kind(j)), strict=True):
+                    total.value = total.value + x
+            behind.store([x.value for x in totals], values, begin, n_rows, one, zero)
     return finished(code, types)
 
 

@@ -433,7 +433,9 @@ class VariedKernel(SplittingKernel):
 
     def _with_values(self, y: np.ndarray) -> np.ndarray:
         """The states of a batch with the values behind them."""
-        return np.concatenate([y, np.tile(self._values, (len(y) // len(self._values), 1))], axis=1, dtype=np.float64)
+        values, times = self._values, len(y) // len(self._values)
+        values = values if times == 1 else np.tile(values, (times, 1))
+        return np.concatenate([y, values], axis=1, dtype=np.float64)
 
     def _functions(self) -> SplittingRollouts:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)

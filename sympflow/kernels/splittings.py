@@ -489,19 +489,18 @@ class SplittingCode(SplittingRollouts):
                     result.value = x
         return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
-    def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-        """From cotangents (m, size, N) of the numbers of columns to those of the values (n, N) that end a table."""
+    def _of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> list[Value]:
+        """See `sympflow.kernels.runs.OfValues`."""
         if self.timed:
-            return np.asarray(slopes[:, self.size - self._own :].sum(0))
-        found = np.zeros((self._own, slopes.shape[2]))
-        for k, columns in self._columns_of_kinds(self._kinds_of(table[..., 0])):
-            program = self._of_tables[k]
-            n = len(program.inputs) - len(table)
-            with np.errstate(all="ignore"):
-                rows = program(*table[:, columns], *slopes[columns, :n].swapaxes(0, 1))
-            for i, row in enumerate(rows):
-                found[i] += np.sum(row, axis=0)
-        return found
+            return [*cotangents[self.size - self._own :]]
+        code, type = kind.code, cotangents[0].type
+        found = [code.variable(code.constant(0.0, type)) for _ in range(self._own)]
+        for k, program in enumerate(self._of_tables):
+            n = len(program.inputs) - len(given)
+            with code.given(code.apply("eq", (kind, k))) if len(self._of_tables) > 1 else nullcontext():
+                for result, x in zip(found, program(*given, *cotangents[:n]), strict=True):
+                    result.value = code.operand(x, type)
+        return [x.value for x in found]
 
     @cached_property
     def _of_tables(self) -> list[Program]:
@@ -544,8 +543,8 @@ class SplittingCode(SplittingRollouts):
         """Compile the function of a name: "step", "reverse" and "slopes", each " own" too."""
         what, _, own = name.partition(" ")
         if what in ("reverse", "slopes"):
-            sizes = self.n_values, self.n_out, self.size
-            return reverse_function(*sizes, self.adjoint, width, bool(own), what == "slopes")
+            sizes, of_values = (self.n_values, self.n_out, self.size), self._of_values if what == "slopes" else None
+            return reverse_function(*sizes, self.adjoint, width, bool(own), of_values, self.given_numbers, self._own)
         if what != "step":
             return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
