@@ -175,7 +175,7 @@ def positive_numbers(name: str, values: Any) -> list[float]:
 
 def check_dt(dt: Any) -> None:
     """Raise unless `dt` is None or a step length."""
-    if dt is not None and not (real_number(dt) and 0 < dt <= LONGEST_STEP):
+    if dt is not None and not 0 < as_float(dt) <= LONGEST_STEP:
         raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
 
 
@@ -191,7 +191,7 @@ def as_float(value: Any) -> float:
 
 def check_positive(name: str, value: Any, most: float = sys.float_info.max) -> Any:
     """Return the argument `name`; raise unless it is a positive and finite real number."""
-    if not (real_number(value) and 0 < value <= most):
+    if not 0 < as_float(value) <= most:
         raise ValueError(f"`{name}` must be positive and finite; got {value!r}: give a number above 0.")
     return value
 

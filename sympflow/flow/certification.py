@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.compiler import NotCompiled
 from sympflow.flow.certificate import Certificate, Quantiles, upper_limit
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -179,7 +180,7 @@ def _orbit(flow: Any, system: HamiltonianSystem, y: np.ndarray, done: int, n: in
     orbit = np.empty((2 * n + 1, *y.shape), dtype=y.dtype)
     try:
         kernel = flow.kernel_for(system)
-    except ValueError:  # no compiled form
+    except NotCompiled:
         start = torch.from_numpy(y).to(flow.device)
         states = [flow.prepare(flow.dt, start)]
         for _ in range(n):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from sympflow.arrays import untransformed
+from sympflow.compiler import NotCompiled
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.records import Provenance, numbers_checksum, read
 from sympflow.flow.tables import PrimedShape, Tables, free_numbers
@@ -205,7 +206,7 @@ class FrozenNetwork(KnownFlow):
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         if compensated:
-            raise ValueError(UNCOMPENSATED)
+            raise NotCompiled(UNCOMPENSATED)
         return self._kernel
 
     @cached_property

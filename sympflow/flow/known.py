@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from sympflow.arrays import is_tensor, values
+from sympflow.compiler import NotCompiled
 from sympflow.flow.records import Provenance
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, recognised, without_friction
@@ -91,7 +92,8 @@ class KnownFlow:
         self.lattice_terms = {} if system.local is None else dict(system.local.terms)
         small = self.known_by(system)
         self.fingerprint, self.system_name = small.fingerprint, system.name
-        self.identity = Identity.of(small, domain)
+        in_common_units = domain is not None or np.isfinite(small.fingerprint).all()
+        self.identity = Identity.of(small, domain if in_common_units else small.domain)
 
     def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
         """The system whose H the flow keeps to know another: a few sites of a lattice, else that system itself."""
@@ -249,7 +251,7 @@ class KnownFlow:
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         """Return the compiled loops of the flow with its present weights, the same while these do not change."""
-        raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
+        raise NotCompiled(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count the evaluations of the system's own functions in a run; a network has none."""

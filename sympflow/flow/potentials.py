@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.arrays import jvp
+from sympflow.compiler import NotCompiled
 from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 from sympflow.lazy import announced, distribution, load_announced
 
@@ -266,30 +267,42 @@ def _short(name: Any) -> str:
     return text if len(text) < 60 else f"{text[:50]} …"
 
 
+def by_time(f: Callable[[Tensor], Tensor], like: Tensor) -> tuple[Tensor, Tensor]:
+    """f(0) and f'(0) of a function of a time ()."""
+    return jvp(f, like.new_zeros(()), like.new_ones(()))
+
+
 class Potential(nn.Module):
     """V(t, x), of which layers need three combinations; a new kind of potential provides these.
 
     Duties
     ------
-    1. `impulse(t, x)`: ∇V(t, x) − ∇V(0, x), shape (d, N).
-    2. `impulse_and_rate(t, x)`: the impulse, and ∂_tV(t, x) of shape (N,).
-    3. `impulse_and_tangent(t, x, dx)`: the impulse, and its derivative along a curve x(t) with velocity dx.
-    4. `to_dict()`: its architecture, JSON-able. For files it has a "type", the name by which the class is registered
+    1. `value(t, x)`: V(t, x), up to a constant, shape (N,).
+    2. `impulse(t, x)`: ∇V(t, x) − ∇V(0, x), shape (d, N).
+    3. `to_dict()`: its architecture, JSON-able. For files it has a "type", the name by which the class is registered
        with `register_potential`, and
-    5. `from_dict(ndof, plan, dtype)`, a class method, builds it again from that, untrained. The file is not to be
+    4. `from_dict(ndof, plan, dtype)`, a class method, builds it again from that, untrained. The file is not to be
        trusted: it checks the plan before it allocates anything.
+
+    `impulse_and_rate` and `impulse_and_tangent` differentiate the first two by forward mode; a class that knows a
+    faster way replaces them.
     """
 
     ndof: int
+
+    def value(self, t: Time, x: Tensor) -> Tensor:
+        raise NotImplementedError
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         raise NotImplementedError
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
-        raise NotImplementedError
+        """The impulse, and ∂_tV(t, x), shape (N,)."""
+        return self.impulse(t, x), by_time(lambda s: self.value(t + s, x), x)[1]
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
-        raise NotImplementedError
+        """The impulse, and its derivative along a curve x(t) with velocity dx."""
+        return by_time(lambda s: self.impulse(t + s, x + s * dx), x)
 
     def to_dict(self) -> dict[str, Any]:
         raise NotImplementedError
@@ -301,7 +314,7 @@ class Potential(nn.Module):
 
     def network(self, is_kick: bool) -> NetworkLayer:
         """Return the weights of a kick or drift of it for compiled loops; ValueError if there are none."""
-        raise ValueError(NO_NETWORK)
+        raise NotCompiled(NO_NETWORK)
 
     def trained(self) -> TrainedNetwork | None:
         """Return the network for compiled derivatives by its parameters; None if there are none."""
@@ -492,7 +505,7 @@ class MLPPotential(Potential):
         from sympflow.kernels.networks import NetworkLayer
 
         if self.features:
-            raise ValueError(
+            raise NotCompiled(
                 "`flow` has networks that take the time of the state, and these have no compiled form: use "
                 "backend='array'."
             )

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain, real_number
+from sympflow.compiler import NotCompiled
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.known import UNCOMPENSATED
@@ -538,7 +539,7 @@ class SympFlow(FlowMap):
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         if compensated:
-            raise ValueError(UNCOMPENSATED)
+            raise NotCompiled(UNCOMPENSATED)
         if self._network is None:
             self._network = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
         return self._network.current(self._compiled)
@@ -648,7 +649,7 @@ class SystemFlow(SympFlow):
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         if compensated:
-            raise ValueError(UNCOMPENSATED)
+            raise NotCompiled(UNCOMPENSATED)
         check_compilable(self.dtype, self.device)
         if self._loops is None or self._loops[0] is not system:
             self._loops = system, self._compiled_for(system)
@@ -656,7 +657,7 @@ class SystemFlow(SympFlow):
 
     def _compiled_for(self, system: HamiltonianSystem) -> Kernel:
         """The compiled loops of the flow on a system."""
-        raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
+        raise NotCompiled(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
 
 
 def _pairs_of_layers(

@@ -18,6 +18,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -111,14 +112,14 @@ class Composition(ABC, ArraySteps):
 
     def tangent_kernel(self, vectors: int) -> TangentKernel:
         """The compiled loops with k deviation vectors; a ValueError says why there are none."""
-        raise ValueError(
+        raise NotCompiled(
             f"`method` {self.method!r} has compiled deviation vectors on the splittings 'kinetic' and 'kepler' only: "
             "use backend='auto'."
         )
 
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
         """The same with the parameters of these names as numbers by which runs are differentiated."""
-        raise ValueError(f"`method` {self.method!r} has no compiled derivatives by parameters.")
+        raise NotCompiled(f"`method` {self.method!r} has no compiled derivatives by parameters.")
 
 
 MOST_GROWTH = 1.0
@@ -251,9 +252,9 @@ class KineticPotential(Composition):
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
         system = self.system
         if system.symbols is None:
-            raise ValueError(f"`system` {system.name!r} is not symbolic.")
+            raise NotCompiled(f"`system` {system.name!r} is not symbolic.")
         if system.kinetic_timed:
-            raise ValueError(f"`system` {system.name!r} has a kinetic energy that depends on t.")
+            raise NotCompiled(f"`system` {system.name!r} has a kinetic energy that depends on t.")
         kernel = _splitting_loops()(system, names).kernel(self.scheme, compensated)
         kernel.check_reverse()
         return kernel
@@ -667,7 +668,7 @@ class KeplerInteraction(Composition):
             rows = y.reshape(-1, y.shape[-1])
             lengths = np.broadcast_to(h, y.shape[:-1]).astype(float).ravel()
             ends, vectors = kernel.jvp(lengths, rows, W.reshape(*rows.shape, -1))
-        except ValueError:  # no compiled code, as of bodies without mass: `step` is differentiated
+        except NotCompiled:  # no compiled code, as of bodies without mass: `step` is differentiated
             return None
         return ends.reshape(y.shape), vectors.reshape(W.shape)
 

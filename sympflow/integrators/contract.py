@@ -41,6 +41,7 @@ import numpy as np
 
 from sympflow.arguments import MAX_ASKED_VALUES
 from sympflow.arrays import Array, is_tensor, jvp, to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.progress import Progress
@@ -315,7 +316,7 @@ class Integrator:
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
         """The compiled loops of steps with so many deviation vectors; a ValueError says why there are none."""
-        raise ValueError(f"`method` {self.name!r} has no compiled deviation vectors: use backend='auto'.")
+        raise NotCompiled(f"`method` {self.name!r} has no compiled deviation vectors: use backend='auto'.")
 
     def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:
         """The Jacobian (..., n, n) of a step from y in the phase space where steps are made; n = 2d but if extended."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag, check_number, check_one_of
 from sympflow.arrays import Array, to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -299,9 +300,9 @@ class Splitting(FixedStep):
         try:
             array, y0 = problem.backend == "array", problem.y0
             if reason := "`backend` is 'array'." if array else no_loops_for(y0, problem.system):
-                raise ValueError(reason)
+                raise NotCompiled(reason)
             return composition.kernel_by(bool(self.compensated), tuple(problem.followed))
-        except ValueError as error:
+        except NotCompiled as error:
             names = ", ".join(problem.followed)
             raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
 

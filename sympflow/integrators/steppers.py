@@ -20,6 +20,7 @@ from sympflow.arrays import (
     transformed,
     with_rows,
 )
+from sympflow.compiler import NotCompiled
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
 from sympflow.kernels.protocol import RunCheckpoint
@@ -194,7 +195,7 @@ def compiled_loops(
             if is_tensor(y0) and differentiable(y0):
                 loops.check_reverse()
             return loops
-        except ValueError as error:
+        except NotCompiled as error:
             reason = str(error)
     if backend == "compiled":
         raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None

@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import DOUBLE, POINTER, Code, Module, Rows, Value
 from sympflow.compiler.machine import compiled, host
 from sympflow.compiler.program import Program, adjoint, gradient, traced
@@ -64,7 +65,7 @@ class Field:
         assert symbols is not None
         forces = () if force is None else force.expressions
         if force is not None and not (forces and system.symbols):
-            raise ValueError("`system` has a force by a function, which is not compiled: use backend='array'.")
+            raise NotCompiled("`system` has a force by a function, which is not compiled: use backend='array'.")
         self.large = is_large(symbols) and force is None
         symbols = symbols if is_large(symbols) else symbols.parametric
         self.lettered = lettered(symbols, [symbols.H, *forces])

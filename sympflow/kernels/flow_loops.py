@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.collocation import Tableau
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.parts import ExactParts, SubFlow
@@ -68,12 +69,12 @@ class PrimedFlowKernel(Kernel):
 
     def __init__(self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False) -> None:
         if system.friction and compensated:
-            raise ValueError(
+            raise NotCompiled(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
         known = system.form is not None or (tables.level == CURVATURE and system.local is not None)
         if tables.level >= CURVATURE and not known:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
                 "use backend='array'."
             )

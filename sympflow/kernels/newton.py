@@ -16,6 +16,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value
 from sympflow.compiler.functions import added, fma, is_zero, where
 from sympflow.compiler.program import Program, gradient, traced
@@ -54,15 +55,15 @@ _KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneSte
 def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
     written = system.spelled
     if written is None:
-        raise ValueError(
+        raise NotCompiled(
             "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
             "or use backend='array'."
         )
     friction = system.friction
     if friction and compensated:
-        raise ValueError("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
+        raise NotCompiled("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
     if friction.kind == 2:
-        raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
+        raise NotCompiled("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
     symbols = written if is_large(written) else written.parametric
     of_time = with_letters(symbols, [symbols.H])
     code = newton_code(of_time, tableau, compensated, bool(friction))

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 import numpy as np
 import sympy as sp
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
 from sympflow.compiler.functions import added, apply, fma, summed
@@ -558,7 +559,7 @@ def pair_code(
 
 def _check_level(level: int) -> None:
     if level == POLYNOMIAL:
-        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+        raise NotCompiled("`scheme` has polynomials, which need a symbolic system: take one without them.")
 
 
 class PairCode(SharedRollouts):

@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import fma, summed, times
@@ -227,15 +228,15 @@ class PartsLoops:
 
     def __init__(self, parts: ExactParts) -> None:
         if parts.linear is not None and not parts.linear.dense:
-            raise ValueError("`system` has its normal modes by fast transforms, on arrays: use backend='array'.")
+            raise NotCompiled("`system` has its normal modes by fast transforms, on arrays: use backend='array'.")
         if not all(isinstance(part, PartFunctions) for part in parts.rest):
-            raise ValueError(
+            raise NotCompiled(
                 "`system` has parts that are not formulas, and exact flows of parts are compiled of formulas alone: "
                 "define it with from_sympy, or use backend='array'."
             )
         rest = sum(written_out(part.H, (*part.q, *part.p)) for part in parts.rest)
         if parts.ndof > MOST_IN_REGISTERS or rest > MOST_WRITTEN_OUT:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` is too large for compiled flows of its parts: {parts.ndof} degrees of freedom, about "
                 f"{rest:,} operations in its gradient, at most {MOST_IN_REGISTERS} and {MOST_WRITTEN_OUT}."
                 " Use backend='array'."
@@ -329,7 +330,7 @@ class PartsLoops:
     def _of(self, sequence: Sequence[SubFlow]) -> PartMaps:
         """The code of maps with what these have."""
         if any(map(has_gradient, sequence)) and not self.parts.has_force_gradient:
-            raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
+            raise NotCompiled("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
         filters = any(m.filters is not None for m in sequence)
         if filters not in self._maps:
             self._maps[filters] = PartMaps(self.parts, filters)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.protocol import Batch
@@ -282,4 +283,4 @@ class SplittingRollouts(Rollouts):
 
     def check_reverse(self) -> None:
         """Raise a ValueError, with the reason, where stages have no compiled reverse: see `SplittingCode.adjoint`."""
-        raise ValueError("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
+        raise NotCompiled("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")

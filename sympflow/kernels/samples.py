@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import DOUBLE, INT, Code, Value
 from sympflow.compiler.functions import apply, where
 from sympflow.hamiltonian.driving import Samples
@@ -20,7 +21,7 @@ def check_samples(samples: Samples) -> None:
     """Raise a ValueError if there are more than compiled code holds."""
     c = samples.c
     if c.size > MOST_SAMPLED:
-        raise ValueError(
+        raise NotCompiled(
             f"`params` has samples of {len(samples.x)} times, more than compiled code holds: give fewer than "
             f"{MOST_SAMPLED // len(c)}, or use backend='array'."
         )

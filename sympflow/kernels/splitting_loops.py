@@ -11,6 +11,7 @@ from weakref import WeakKeyDictionary, ref
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -75,7 +76,7 @@ class SplittingLoops:
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not (system.separable if symbols is None else symbols.separable):
-            raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
+            raise NotCompiled("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if symbols is not None:
             from sympflow.hamiltonian.recorded import check_recorded  # SymPy, which Numba functions do without
             from sympflow.kernels.terms import is_large
@@ -88,7 +89,7 @@ class SplittingLoops:
 
                 self._driving = driven_form(symbols if self._large else symbols.parametric)
                 if self._large and self._driving.means:
-                    raise ValueError(
+                    raise NotCompiled(
                         "`system` has many terms and a kinetic energy that depends on t: use backend='array'."
                     )
                 self._driving.check()
@@ -123,12 +124,12 @@ class SplittingLoops:
             self._compile = partial(function_code, system.ndof, *given, ndim)
         elif system.local is not None:
             if system.damping is not None and system.damping.ndim:
-                raise ValueError(
+                raise NotCompiled(
                     f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
                     "backend='array'."
                 )
             if system.local.arrays_only:
-                raise ValueError(
+                raise NotCompiled(
                     f"`system` has {system.local.arrays_only}, whose kicks are array operations: use 'array'."
                 )
             if system.local.loops == "pairs":
@@ -144,14 +145,14 @@ class SplittingLoops:
             self.traced = self._written is not None
         elif system.layered is not None:
             if system.friction:
-                raise ValueError(
+                raise NotCompiled(
                     f"`system` {system.name!r} has friction, and weights that torch follows: use backend='array'."
                 )
             self._has_force_gradient, self.tensors = False, system.layered.tensors
             self.work = system.layered.n_weights
             self._compile = partial(_layered_code, system.layered)
         else:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change them, "
                 "or define it with HamiltonianSystem.from_sympy, or use backend='array'."
             )
@@ -188,13 +189,13 @@ class SplittingLoops:
         variant = (level, compensated, monomials, varied, ranges)
         if variant not in self._variants:
             if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
-                raise ValueError(
+                raise NotCompiled(
                     "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
                     "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
                 )
             if level > FORCE_GRADIENT and not self._has_curvature:
                 what = "curvature terms" if level == CURVATURE else "polynomials"
-                raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
+                raise NotCompiled(f"`scheme` has {what}, which need a symbolic system: take one without them.")
             self._variants[variant] = self._made(*variant)
         return self._variants[variant]
 
@@ -343,7 +344,7 @@ class SplittingLoops:
 
 def _layered_code(layered: LayeredPotential, level: int, compensated: bool, monomials: Monomials) -> Any:
     if compensated:
-        raise ValueError("`compensated` sums are not compiled for weights that torch follows: leave it out.")
+        raise NotCompiled("`compensated` sums are not compiled for weights that torch follows: leave it out.")
     from sympflow.kernels.layered_splittings import LayeredCode
 
     return LayeredCode(layered)

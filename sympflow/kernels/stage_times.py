@@ -14,6 +14,7 @@ from typing import Any
 
 import sympy as sp
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import apply, where
 from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled, with_symbols
@@ -95,7 +96,7 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
         letters = {*found.values()}
         if not any(sp.diff(lettered, s).free_symbols & letters for s in letters):
             return lettered, found
-    raise ValueError(
+    raise NotCompiled(
         f"`system` has the kinetic energy {symbols.T}, which is not a sum of products of functions of {symbols.time} "
         "and of p: use an implicit method such as 'gauss_legendre6'."
     )

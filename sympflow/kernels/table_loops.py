@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
 from sympflow.compiler.functions import dot, fma, summed
 from sympflow.compiler.machine import address, host
@@ -202,7 +203,7 @@ def table_loops(
         return None
     try:
         return TableLoops(symbols, kicks, level, monomials, friction)
-    except ValueError:
+    except NotCompiled:
         return None
 
 
@@ -284,7 +285,7 @@ class _Maps:
 
 def _check_length(n: int) -> None:
     if n > MOST_OPERATIONS:
-        raise ValueError(f"`system` has a kick of {n} operations.")
+        raise NotCompiled(f"`system` has a kick of {n} operations.")
 
 
 def _product(A: Sequence[Sequence[Any]], x: Sequence[Any]) -> list[Any]:

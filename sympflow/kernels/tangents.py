@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, Value
 from sympflow.compiler.functions import dot, is_zero, summed
@@ -347,7 +348,7 @@ def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, ve
             codes[key] = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
     found = codes[key]
     if isinstance(found, str):
-        raise ValueError(found)
+        raise NotCompiled(found)
     return found
 
 
@@ -386,7 +387,7 @@ def step_tangents(
     n = y.shape[1]
     try:
         code = tangent_code(system, table.level, monomials, n, False)
-    except ValueError:
+    except NotCompiled:
         return None
     rows = np.empty((len(y), n * (1 + n)))
     rows[:, :n], rows[:, n:] = y, np.eye(n).reshape(-1)

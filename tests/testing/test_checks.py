@@ -40,17 +40,7 @@ def not_applicable(integrator):
     return skipped
 
 
-TAKE_LONG = ("adaptive_heun", "bosh3", "dopri8", "fehlberg2", "implicit_adams", "tao6")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(m, marks=pytest.mark.slow) if m in TAKE_LONG else m
-        for m in available()
-        if getattr(get(m), "splitting", "") != "kepler"
-    ],
-)
+@pytest.mark.parametrize("name", [m for m in available() if getattr(get(m), "splitting", "") != "kepler"])
 @pytest.mark.filterwarnings("ignore:Functional iteration did not converge")
 def test_built_in_methods_pass_and_skip_only_what_has_no_meaning(name):
     loose = 1e-3 if name == "adaptive_heun" else 1e-4  # of order 2: else it takes many times the others' steps
