@@ -204,9 +204,8 @@ def reverse_function(
     out, slopes, columns, starts, values): `rows` (n_rows, n_values) are the cotangents of the running states after
     `n_steps` steps, and become those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than
     `first`. With `of_values`, what a table of its own for every `width` trajectories would hold is added to `slopes`,
-    in the same order. From that, and from the numbers `columns` (n_given, link + 2) that are given, the last of which are
-    those that follow each state in `starts` (n_rows, n_out + n_own), `values` (n_rows, n_own) are the cotangents of the
-    latter.
+    in the same order. The numbers of columns are made of others, `columns` (n_given, link + 2), of which the last ones
+    follow each state in `starts` (n_rows, n_out + n_own): `values` (n_rows, n_own) are the cotangents of these.
     """
     types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, *[POINTER] * 5]
     code = Module(host().fused).function("reverse", types)
