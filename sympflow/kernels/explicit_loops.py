@@ -17,7 +17,7 @@ from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
-from sympflow.kernels.runs import Numbers, Room, reverse_function
+from sympflow.kernels.runs import Numbers, Room
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
 
@@ -183,26 +183,29 @@ class _InRegisters(_Explicit):
 
     @cached_property
     def _reverse(self) -> Program:
-        """The cotangents of a state, from it, the numbers of a step, and the cotangents of the state after it."""
+        """The cotangents of what a step is made of, from that, and from the cotangents of the state after it."""
         count = self.n_out + 1 + self.parameters + len(self.lettered.letters) * len(self.A) + len(self.field.rates)
-        found = adjoint(traced(self._advanced, *(f"x_{i}" for i in range(count))))
-        return Program(found.inputs, found.outputs[: self.n_out])
+        return adjoint(traced(self._advanced, *(f"x_{i}" for i in range(count))))
 
     @property
     def reversible(self) -> bool:  # type: ignore[override]
         return len(self.field.program) * len(self.A) <= MOST_REVERSED
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        *room: Room,
+        slopes: bool = False,
     ) -> tuple[list[Value], list[Value]]:
-        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
-        found = self._reverse(*values, *self._given(numbers, step.code, step), *cotangents)
-        return [step.code.operand(x, values[0].type) for x in found], []
-
-    def made(self, name: str, width: int) -> Callable[..., None]:
-        if name != "reverse":
-            return super().made(name, width)
-        return reverse_function(self.n_values, self.n_out, self.size, self.adjoint, width, closing=False)
+        n, program = self.n_out, self._reverse
+        program = Program(program.inputs, program.outputs[: n + (1 + self.parameters) * slopes])
+        found = program(*values, *self._given(numbers, step.code, step), *cotangents)
+        found = [step.code.operand(x, values[0].type) for x in found]
+        return found[:n], found[n + 1 :]
 
 
 class _InMemory(_Explicit):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.kernels.protocol import NOTHING, Batch
+from sympflow.kernels.protocol import Batch
 from sympflow.kernels.rollouts import aligned, zeros
 from sympflow.kernels.threads import BLOCK, NEVER, given, run_one, run_rows
 
@@ -32,7 +32,7 @@ class Recorded:
         self._n_steps, self._save = n_steps, given(save, np.int64)
         self._link = (len(table[1]) if isinstance(table, tuple) else table.shape[1]) - 2
         self._given, self._n_own = self._y0, (own := y0.shape[1] - code.n_out)
-        if own and len(y0) == 1:  # a table of all trajectories, which is prepared once
+        if own and len(y0) == 1 and not isinstance(table, tuple):  # one of all trajectories, which is prepared once
             self._table, self._y0 = table.copy(), self._y0[:, : code.n_out]
             self._table[len(table) - own :] = y0[0, code.n_out :, None]
         self._own = self._y0.shape[1] > code.n_out
@@ -75,7 +75,7 @@ class Recorded:
         """Run some rows, segment by segment: each begins with what the one before leaves."""
         code, n = self._code, i.stop - i.start
         history = self._histories[i.start] = []
-        running, finite = np.empty((n, 0 if self._whole else code.n_values)), self.n_finite[i]
+        running, finite = np.empty((n, 0 if self._whole else code.n_values - code.counted)), self.n_finite[i]
         for first, to in pairwise(self._ends):
             history.append(self._room(n, to) if self._whole else running.copy())
             chosen, kept = self._saved(first, to), history[-1] if self._whole else None
@@ -83,7 +83,7 @@ class Recorded:
             states = self.states[i, chosen]
             code.run(
                 self._table,
-                Batch(self._y0[i], to, self._save[chosen], states, found, first, running, NOTHING, stop, kept),
+                Batch(self._y0[i], to, self._save[chosen], states, found, first, running, np.zeros(n), stop, kept),
             )
             if first:
                 finite[:] = np.where(finite < first, finite, found)
@@ -139,7 +139,7 @@ class Recorded:
         entries, kinds = code.own_columns(table, y0[:, code.n_out :], width) if own else code.prepared(table)
         groups = -(-n // width)
         found = zeros(groups * len(kinds) * code.size * width if slopes and self._n_own else 1)
-        numbers = table if self._n_own else found
+        numbers = found if isinstance(table, tuple) else table
         rows = np.zeros((groups * width, code.n_values))  # lanes without a trajectory have no cotangents
         values = np.zeros((len(rows), self._n_own))
         if n < len(rows):
@@ -150,7 +150,7 @@ class Recorded:
             if not self._whole:
                 kept = self._room(n, to - first)
                 nothing = np.empty((n, 0, code.n_out)), np.empty(n, dtype=np.int64)
-                batch = Batch(y0, to, self._save[:0], *nothing, first, before, stop=stop, kept=kept)
+                batch = Batch(y0, to, self._save[:0], *nothing, first, before, np.zeros(n), stop, kept)
                 code.run(table, batch, False)
             chosen = slice(*self._save.searchsorted((first, to), "right").tolist())
             later, count = self._save[chosen], chosen.stop - chosen.start
