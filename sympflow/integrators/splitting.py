@@ -12,7 +12,6 @@ import numpy as np
 
 from sympflow.arguments import check_flag, check_number, check_one_of
 from sympflow.arrays import Array, to_numpy
-from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -30,7 +29,7 @@ from sympflow.integrators.contract import (
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.integrators.steppers import Stepper, compiled_loops, no_loops_for
+from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
 from sympflow.schemes import CORRECTORS, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
@@ -174,6 +173,7 @@ class Splitting(FixedStep):
     arrays_only: ClassVar[Any] = Trait(lambda splitting, clock: clock.arrays_only)
     tangent_holds: ClassVar[Any] = Trait(lambda splitting, clock: clock.tangent_holds)
     breakdown: ClassVar[Any] = Trait(lambda splitting, clock: splitting.breakdown or clock.breakdown)
+    follows: ClassVar[Any] = Trait(lambda splitting, clock: clock.on is None)
     takes_friction: ClassVar[Any] = Trait(lambda splitting, clock: splitting.takes_friction and clock.on is None)
     takes_driving: ClassVar[Any] = Trait(lambda splitting, clock: splitting.takes_driving and clock.on is None)
 
@@ -291,21 +291,6 @@ class Splitting(FixedStep):
         )
         return kernel is not None and bool(kernel.loops.values)
 
-    def check_followed(self, problem: Problem) -> None:
-        if self.clock != "physical" or self.overrides("step"):
-            super().check_followed(problem)
-
-    def _followed_kernel(self, composition: Composition, problem: Problem) -> Any:
-        """The loops of a run through which gradients flow to parameters."""
-        try:
-            array, y0 = problem.backend == "array", problem.y0
-            if reason := "`backend` is 'array'." if array else no_loops_for(y0, problem.system):
-                raise NotCompiled(reason)
-            return composition.kernel_by(bool(self.compensated), tuple(problem.followed))
-        except NotCompiled as error:
-            names = ", ".join(problem.followed)
-            raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
-
     def longest_step(self, system: HamiltonianSystem) -> float:
         return self.composed(system).longest_step() if self.clock == "physical" else super().longest_step(system)
 
@@ -403,17 +388,18 @@ class Splitting(FixedStep):
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition, told = self.composed(problem.system), list[str]()
+        compensated = bool(self.compensated)
         if problem.followed:
-            kernel = self._followed_kernel(composition, problem)
-        else:
-            kernel = compiled_loops(
-                lambda: composition.kernel(bool(self.compensated)),
-                problem.y0,
-                problem.backend,
-                bool(self.compensated),
-                told=told,
-                system=problem.system,
-            )
+            kernel = followed_loops(lambda names: composition.kernel_by(compensated, names), problem)
+            return Stepper(self, problem, composition, kernel)
+        kernel = compiled_loops(
+            lambda: composition.kernel(compensated),
+            problem.y0,
+            problem.backend,
+            compensated,
+            told=told,
+            system=problem.system,
+        )
         if problem.parameter_values is not None:
             kernel = kernel.varied(problem.parameter_values)
         return Stepper(self, problem, composition, kernel, told)

@@ -32,6 +32,7 @@ def rolled_out(
 
 def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
     """`Stepper.shorter` of tensors, differentiable by their lengths too."""
+    _check_steps(stepper)
     if transformed(y, h):
         return _by_arrays(stepper, y, h, t, *stepper.followed)
     if y.dtype != torch.float64:
@@ -117,13 +118,18 @@ def _by_arrays(stepper: Any, y: Tensor, h: Any, t: Any, *followed: Tensor) -> Te
     """A step by tensor operations, of which torch follows the parameters too."""
     if not stepper.problem.followed:  # weights are read by the functions themselves
         return stepper.arrays.step(y, h, t)
-    if stepper.system.friction:
-        raise ValueError(
-            "`params` with gradients of a system with friction have no second derivatives, and none at times between "
-            "two steps: choose times on the grid, or detach them."
-        )
+    _check_steps(stepper)
     batch = stepper.problem.y0.shape[:-1]
     return stepper.kernel.stepped(y, h, t, [x.to(y).expand(batch) for x in followed])
+
+
+def _check_steps(stepper: Any) -> None:
+    """Refuse steps by tensor operations where gradients flow to parameters and there are none."""
+    if stepper.problem.followed and not stepper.kernel.steps_tensors:
+        raise ValueError(
+            "`params` with gradients have no second derivatives, and none at times between two steps, where a system "
+            "has friction or the method is no splitting method: choose times on the grid, or detach them."
+        )
 
 
 def _pulled(

@@ -16,7 +16,7 @@ from sympflow.compiler.machine import compiled, host
 from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
+from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, parametric, terms_of
 from sympflow.kernels.runs import Numbers, Room
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
@@ -31,9 +31,12 @@ class Tableau(Protocol):
     B: Any
 
 
-def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKernel:
-    """The compiled loops of a method on a symbolic system; a ValueError says why there are none."""
-    field = _field(system)
+def explicit_kernel(system: HamiltonianSystem, tableau: Tableau, names: tuple[str, ...] = ()) -> OneStepKernel:
+    """The compiled loops of a method on a symbolic system; a ValueError says why there are none.
+
+    With `names` these parameters are numbers of columns.
+    """
+    field = _field(system, names)
     kind = _InMemory if field.large else _InRegisters
     A = tuple(tuple(map(float, row)) for row in tableau.A)
     code = kind(field, A, tuple(map(float, tableau.B)))
@@ -45,13 +48,14 @@ def compiled_field(system: HamiltonianSystem) -> CompiledField:
     return CompiledField(_field(system))
 
 
-def _field(system: HamiltonianSystem) -> Field:
-    if system not in _FIELDS:
-        _FIELDS[system] = Field(system)
-    return _FIELDS[system]
+def _field(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> Field:
+    fields = _FIELDS.setdefault(system, {})
+    if names not in fields:
+        fields[names] = Field(system, names)
+    return fields[names]
 
 
-_FIELDS: WeakKeyDictionary[HamiltonianSystem, Field] = WeakKeyDictionary()
+_FIELDS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[str, ...], Field]] = WeakKeyDictionary()
 
 
 class Field:
@@ -60,14 +64,16 @@ class Field:
     Terms of a kind are looped over if it is `large`; its code reads arrays `data`: those of the terms, and Γ.
     """
 
-    def __init__(self, system: HamiltonianSystem) -> None:
+    def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
         symbols, force = system.spelled, system.external_force
         assert symbols is not None
         forces = () if force is None else force.expressions
         if force is not None and not (forces and system.symbols):
             raise NotCompiled("`system` has a force by a function, which is not compiled: use backend='array'.")
         self.large = is_large(symbols) and force is None
-        symbols = symbols if is_large(symbols) else symbols.parametric
+        if force is not None and names:
+            raise NotCompiled("`system` has a force that is none of H.")
+        symbols = parametric(symbols, names)
         self.lettered = lettered(symbols, [symbols.H, *forces])
         self.ndof = system.ndof
         self._damping = system.friction.matrix(self.ndof) if system.friction else None

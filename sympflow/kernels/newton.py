@@ -24,7 +24,7 @@ from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
 from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, terms_of
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, parametric, terms_of
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
@@ -40,21 +40,23 @@ MOST_REVERSED = 40  # numbers of a state whose cotangents are in registers
 LONG = 4e6  # operations between two looks for a stop
 
 
-def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
+def implicit_kernel(
+    system: HamiltonianSystem, tableau: Tableau, compensated: bool = False, names: tuple[str, ...] = ()
+) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
 
-    A ValueError says why there are none.
+    With `names` these parameters are numbers of columns. A ValueError says why there are none.
     """
-    kernels = _KERNELS.setdefault(system, {})
-    if (tableau, compensated) not in kernels:
-        kernels[tableau, compensated] = _kernel(system, tableau, compensated)
-    return kernels[tableau, compensated]
+    kernels, key = _KERNELS.setdefault(system, {}), (tableau, compensated, names)
+    if key not in kernels:
+        kernels[key] = _kernel(system, *key)
+    return kernels[key]
 
 
-_KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneStepKernel]] = WeakKeyDictionary()
+_KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[Any, OneStepKernel]] = WeakKeyDictionary()
 
 
-def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
+def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool, names: tuple[str, ...]) -> OneStepKernel:
     written = system.spelled
     if written is None:
         raise NotCompiled(
@@ -66,7 +68,7 @@ def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> O
         raise NotCompiled("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
     if friction.kind == 2:
         raise NotCompiled("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
-    symbols = written if is_large(written) else written.parametric
+    symbols = parametric(written, names)
     of_time = with_letters(symbols, [symbols.H])
     code = newton_code(of_time, tableau, compensated, bool(friction))
     single = newton_code(of_time, tableau, False, False) if compensated else code
@@ -147,7 +149,7 @@ class NewtonCode(OneStep):
         return [float(x) for x in np.linalg.solve(np.array(self._tableau[0], dtype=float), np.ones(self.stages))]
 
     def _leftovers(self, end: Sequence[Any], mu: Sequence[Any]) -> list[Any]:
-        """The cotangents of the state before a step: Aᵀv = μ − Bλ for the Σ_i v_i that are added to λ, those of its end."""
+        """The cotangents of the state before a step: those of its end, λ, and Σ_i v_i, of which Aᵀv = μ − Bλ."""
         n, pairs = self.n_out, [*zip(self._leftover, self._tableau[1], strict=True)]
         return [x + _total([c * (mu[i * n + m] - b * x) for i, (c, b) in enumerate(pairs)]) for m, x in enumerate(end)]
 
@@ -295,16 +297,16 @@ class _InRegisters(NewtonCode):
         code, type, n, y = step.code, values[0].type, self.n_out, values[: self.n_out]
         K, *_, sizes, column = self._iterated(code, y, self.column(code, numbers, step))
         found = [code.operand(x, type) for x in self._pull(*y, *column, *K, *sizes, *cotangents[:n])]
-        zero, of_numbers = code.constant(0.0, type), []
+        zero, of_stages = code.constant(0.0, type), []
         for i in range(self.stages if slopes else 0):
             Y = [y[m] + _total([a * K[j * n + m] for j, a in enumerate(self._tableau[0][i])]) for m in range(n)]
-            of_numbers.append(self._pulled_field(Y, column, i, found[(1 + i) * n :][:n]))
-        of_numbers = [code.operand(_total(each), type) for each in zip(*of_numbers, strict=True)]
+            of_stages.append(self._pulled_field(Y, column, i, found[(1 + i) * n :][:n]))
+        of_numbers = [code.operand(_total(each), type) for each in zip(*of_stages, strict=True)]
         return [*found[:n], *[zero] * (self.n_values - n)], of_numbers
 
     def _pulled_field(self, Y: Sequence[Any], column: Sequence[Any], stage: int, mu: Sequence[Any]) -> list[Any]:
         """The cotangents of the parameters for those, μ, of the residuals of a stage."""
-        d, n, letters = self.ndof, self.n_out, len(self.lettered.letters)
+        d, letters = self.ndof, len(self.lettered.letters)
         start = self.size + stage * letters
         if self._damped:
             growths = column[self.size - 2 * d * (self.stages + 1) :]
@@ -408,13 +410,13 @@ class _InMemory(NewtonCode):
         slopes: bool = False,
     ) -> tuple[list[Value], list[Value]]:
         code, n, d, N, wide, zero = step.code, self.n_out, self.ndof, self.unknowns, self._wide, step.code.constant(0.0)
-        for i, x in enumerate(values[:n]):
-            room[0].store(x, i)
+        for k, x in enumerate(values[:n]):
+            room[0].store(x, k)
         *_, arguments = self._solved(room[0], numbers, step)
         state, K, column, M, Y, g, S, sizes, *_ = arguments
         end = cotangents[:n]
         if self._damped:
-            end = [*end[:d], *(x * code.load(column, self.size - d + i) for i, x in enumerate(end[d:]))]
+            end = [*end[:d], *(x * code.load(column, self.size - d + k) for k, x in enumerate(end[d:]))]
         code.outlined("filled", arguments, self._filled)
         with code.over(N) as i:
             code.store(1.0 / code.load(sizes, i), sizes, i)
@@ -422,24 +424,24 @@ class _InMemory(NewtonCode):
                 a, b = code.load(M, i * wide + j), code.load(M, j * wide + i)
                 code.store(b, M, i * wide + j)
                 code.store(a, M, j * wide + i)
-        for i, b in enumerate(self._tableau[1]):
-            for m, x in enumerate(end):
-                code.store(b * x, M, (i * n + m) * wide + N)
+        for k, weight in enumerate(self._tableau[1]):
+            for r, x in enumerate(end):
+                code.store(weight * x, M, (k * n + r) * wide + N)
         code.outlined("solve", [M, sizes], self._solve, rare=False)
-        mu = [code.load(M, i * wide + N) for i in range(N)]
+        mu = [code.load(M, k * wide + N) for k in range(N)]
         totals = [code.variable(zero) for _ in range(self.parameters if slopes else 0)]
         if slopes:
             letters, A = len(self.lettered.letters), code.array("A", np.ravel(self._tableau[0]))
             scale = code.array("scale", self._tableau[2])
             with code.over(self.stages) as i:
                 self._fill_stage(code, state, K, column, Y, A, i)
-                signs = [code.load(M, (i * n + m) * wide + N) for m in range(n)]
+                weights = [code.load(M, (i * n + m) * wide + N) for m in range(n)]
                 if self._damped:
                     grown = self._growths(code, column, i)[0]
-                    signs = [*signs[:d], *(x * code.load(grown, m) for m, x in enumerate(signs[d:]))]
+                    weights = [*weights[:d], *(x * code.load(grown, m) for m, x in enumerate(weights[d:]))]
                 given = [code.load(column, 1 + k) for k in range(self.parameters)]
                 given += [code.load(column, i * letters + (self.size + k)) for k in range(letters)]
-                found = self._field_reversed(*(code.load(Y, m) for m in range(n)), *given, *signs)
+                found = self._field_reversed(*(code.load(Y, m) for m in range(n)), *given, *weights)
                 factor = code.load(column) * code.load(scale, i)
                 for total, x in zip(totals, found, strict=True):
                     total.value = total.value + factor * x

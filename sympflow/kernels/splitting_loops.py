@@ -386,6 +386,10 @@ class SplittingKernel(Kernel):
         code: Any = self._functions()
         return Recorded(code, table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
 
+    @property
+    def steps_tensors(self) -> bool:
+        return not self.loops.friction
+
     def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
         """A step of tensors, with `values` of the parameters, by tensor operations: after `check_reverse`."""
         rows = self.loops.rows(replace(step_table(self.scheme), more=None))[..., 0]
