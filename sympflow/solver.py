@@ -29,7 +29,6 @@ from sympflow.arrays import (
     concatenate,
     finite_states,
     full_of_nan,
-    is_tensor,
     known_finite,
     lanes,
     last,
@@ -125,7 +124,7 @@ def solve(
         ``system.with_params(...)``, up to rounding with compensated sums, force gradients, friction or a drive.
         Otherwise trajectories are grouped by parameter values, and the groups run in sequence. A trained flow holds for
         its own parameters alone. Gradients flow to tensors that require them, by splitting methods on the splitting
-        "kinetic".
+        "kinetic", and where H does not depend on t by Gauss methods and Runge–Kutta methods of fixed steps.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
@@ -146,7 +145,7 @@ def solve(
         methods.
     backend : "auto", "compiled" or "array"
         "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states and, by
-        splitting methods, for tensors on the CPU; everything else with array operations, tensors on a GPU too. What ran
+        methods of fixed steps, for tensors on the CPU; everything else with array operations, tensors on a GPU too. What ran
         is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
@@ -198,8 +197,7 @@ def solve(
     >>> sol.y.shape
     (4, 101)
     """
-    if is_tensor(y0):
-        check_not_traced("solve")
+    check_not_traced("solve")
     system = given_system(system, params)
     given, chosen = options, None
     if tol is not None and isinstance(method, str) and "tol" in get(method).options():
@@ -289,7 +287,8 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
         error = float(np.max(np.abs(energy_change(sol)), initial=0.0))
     sol.stats["energy_error"] = error
     if error > tol:
-        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
+        remedy = "pass a smaller one" if sol.y.dtype.itemsize >= 8 else "float32 rounds off, compute in float64"
+        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: {remedy}."
         sol.message += f" {note}"
         warn(note, RuntimeWarning)
 

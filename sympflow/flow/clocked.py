@@ -30,7 +30,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
-    from sympflow.kernels.flow_loops import ClockedFlowKernel
+    from sympflow.flow.loops import ClockedFlowKernel
 
 
 class ClockPotential(Potential):
@@ -152,9 +152,9 @@ class ClockedFlow(SystemFlow):
         return self._numbers.current(lambda: tuple(to_numpy(self.clock.numbers).astype(float)[::-1].tolist()))
 
     def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
-        from sympflow.kernels.flow_loops import ClockedFlowKernel
+        from sympflow.flow.loops import ClockedFlowKernel
 
-        return ClockedFlowKernel(self.scheme, system, self.advance, self.clock_numbers)
+        return ClockedFlowKernel(self.scheme, system, self.advance)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)

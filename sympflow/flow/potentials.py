@@ -325,8 +325,8 @@ class MLPPotential(Potential):
     """V(t, x) = c · N(t/τ, x/s), N a multilayer perceptron of any depth whose input is x with t appended.
 
     N(t, x) = w · σ(W_n σ(… σ(K x + k t + b_1) …) + b_n). It has no output bias: a constant in V moves nothing.
-    Its x- and t-derivatives come from one forward and one reverse sweep through the layers, ∂_t∇V from carrying a
-    tangent along both, and the evaluations at t and at 0 share K x.
+    Its derivatives come from one forward and one reverse sweep through the layers, ∂_t∇V from carrying a tangent along
+    both, and the evaluations at t and at 0 share K x.
 
     Parameters
     ----------
@@ -530,7 +530,7 @@ class MLPPotential(Potential):
         flat = torch.cat([u.detach().reshape(-1) for u in units]).numpy()
         return TrainedNetwork(self.ndof + self.features, self.hidden, self.activation, flat)
 
-    # V and its derivatives at one time ---------------------------------------------------------------
+    # V, and the combinations that the layers use: t and 0 in one sweep --------------------------------------
 
     def value(self, t: Time, x: Tensor) -> Tensor:
         """V(t, x): (N,)."""
@@ -539,30 +539,6 @@ class MLPPotential(Potential):
         for W_l, b_l in zip(W, b[1:], strict=True):
             h = self._sigma.value(W_l @ h + b_l[:, None])
         return w @ h
-
-    def gradient(self, t: Time, x: Tensor) -> Tensor:
-        """∇V(t, x): (d, N)."""
-        K, r = self._sensitivity(t, x)[:2]
-        return K.T @ r
-
-    def rate(self, t: Time, x: Tensor) -> Tensor:
-        """∂_tV(t, x): (N,)."""
-        _, r, k = self._sensitivity(t, x)
-        return k @ r
-
-    def gradient_tangent(self, t: Time, x: Tensor, dt: float, dx: Tensor) -> Tensor:
-        """The derivative of ∇V along the direction (dt, dx): (d, N). With dx = 0, dt = 1 it is ∂_t∇V."""
-        K, k, b, W, w = self.folded()
-        a = K @ x + outer(k, t) + b[0][:, None]
-        _, dr = self._sweeps_tangent(a, K @ dx + dt * k[:, None], b, W, w)
-        return K.T @ dr
-
-    def hessian(self, t: Time, x: Tensor) -> Tensor:
-        """∇²V(t, x): (d, d, N)."""
-        basis = torch.eye(self.ndof, dtype=x.dtype, device=x.device)
-        return torch.stack([self.gradient_tangent(t, x, 0.0, e[:, None].expand_as(x)) for e in basis], 1)
-
-    # the combinations that the layers use: t and 0 in one sweep -------------------------------------------
 
     def _by_x(self, gradient: Tensor) -> Tensor:
         """The gradient with 0 in the rows of the features."""
@@ -590,11 +566,6 @@ class MLPPotential(Potential):
         return self._by_x(K.T @ (r_t - r_0)), self._by_x(K.T @ (dr_t - dr_0))
 
     # sweeps ---------------------------------------------------------------------------------------------
-
-    def _sensitivity(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """K, r = ∂V/∂a (h_1, N) for the first pre-activation a, and k."""
-        K, k, b, W, w = self.folded()
-        return K, self._sweeps(K @ x + outer(k, t) + b[0][:, None], b, W, w), k
 
     @staticmethod
     def _both_times(t: Time, a: Tensor, k: Tensor) -> Tensor:

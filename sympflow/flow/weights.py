@@ -71,6 +71,11 @@ def check_compilable(dtype: torch.dtype, device: torch.device) -> None:
         raise NotCompiled(f"`flow` is {dtype} on {device}: compiled flows are float64 on the CPU.")
 
 
+def doubles(values: Tensor) -> np.ndarray:
+    """The values as an array of float64."""
+    return values.detach().cpu().double().numpy()
+
+
 def checksum(tensors: Mapping[str, Tensor]) -> str:
     """SHA-256 of the tensors by name: their names, dtypes, shapes and little-endian bytes."""
     return numbers_checksum({name: value.detach().cpu().numpy() for name, value in tensors.items()})

@@ -192,7 +192,7 @@ def compiled_loops(
     if reason is None:
         try:
             loops = make()
-            if is_tensor(y0) and differentiable(y0):
+            if differentiable(y0):
                 loops.check_reverse()
             return loops
         except NotCompiled as error:
@@ -286,9 +286,9 @@ def rollout(
 
 def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
-    shape, tensor = getattr(y_next, "shape", None), is_tensor(y)
-    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == tensor:
-        if tensor and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
+    shape = getattr(y_next, "shape", None)
+    if shape == y.shape and y_next.dtype == y.dtype:
+        if is_tensor(y) and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
             raise TypeError(
                 "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
                 "whose step takes arrays only says so by `arrays_only`."

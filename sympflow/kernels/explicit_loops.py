@@ -6,18 +6,17 @@ import ctypes
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Protocol
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from sympflow.compiler import NotCompiled
-from sympflow.compiler.control import DOUBLE, POINTER, Code, Module, Rows, Value
-from sympflow.compiler.machine import compiled, host
+from sympflow.compiler.control import DOUBLE, POINTER, Code, Rows, Value
 from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, parametric, terms_of
-from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.runs import Numbers, Room, begun, finished
+from sympflow.lazy import kept
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
 
@@ -36,7 +35,7 @@ def explicit_kernel(system: HamiltonianSystem, tableau: Tableau, names: tuple[st
 
     With `names` these parameters are numbers of columns.
     """
-    field = _field(system, names)
+    field = field_of(system, names)
     kind = _InMemory if field.large else _InRegisters
     A = tuple(tuple(map(float, row)) for row in tableau.A)
     code = kind(field, A, tuple(map(float, tableau.B)))
@@ -45,17 +44,7 @@ def explicit_kernel(system: HamiltonianSystem, tableau: Tableau, names: tuple[st
 
 def compiled_field(system: HamiltonianSystem) -> CompiledField:
     """The vector field of a symbolic system, compiled, for one solver; a ValueError says why there is none."""
-    return CompiledField(_field(system))
-
-
-def _field(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> Field:
-    fields = _FIELDS.setdefault(system, {})
-    if names not in fields:
-        fields[names] = Field(system, names)
-    return fields[names]
-
-
-_FIELDS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[str, ...], Field]] = WeakKeyDictionary()
+    return CompiledField(field_of(system))
 
 
 class Field:
@@ -111,8 +100,7 @@ class Field:
     @cached_property
     def function(self) -> Callable[..., None]:
         """f compiled: of addresses (y, out, time, numbers, room, data)."""
-        module, lettered = Module(host().fused), self.lettered
-        code = module.function("field_at", [POINTER] * 6)
+        code, lettered = begun("field_at", [POINTER] * 6), self.lettered
         y, out, time, numbers, room, data = code.arguments
         k, n = len(lettered.symbols.parameters), 2 * self.ndof
         given = [code.load(numbers, i) for i in range(k)]
@@ -128,8 +116,7 @@ class Field:
             rates = [code.load(numbers, k + i) for i in range(len(self.rates))]
             for i, x in enumerate(self.program(*(code.load(y, i) for i in range(n)), *given, *rates)):
                 code.store(code.operand(x, DOUBLE), out, i)
-        code.give()
-        return compiled(str(module), "field_at", ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 6))
+        return finished(code)
 
     def fill(self, y: Value, out: Value, g: Value, letters: Value, *data: Value) -> None:
         """f(y) into `out` by loops over the terms of each kind; `g` is room for ∇H."""
@@ -152,11 +139,15 @@ class Field:
             code.store(force, out, m + d)
 
 
+field_of = kept(Field)
+
+
 class _Explicit(OneStep):
     """Steps of an explicit Runge–Kutta method."""
 
     def __init__(self, field: Field, A: tuple[tuple[float, ...], ...], B: tuple[float, ...]) -> None:
         super().__init__(field.lettered, 2 * field.ndof, len(field.rates))
+        self._given = field, A, B
         self.field, self.A, self.B = field, A[: len(B)], B
         self.work = 4.0 * len(B) * field.ndof
 
@@ -167,9 +158,9 @@ class _InRegisters(_Explicit):
     lanes = 8
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-        return self._advanced(*values, *self._given(numbers, values[0].code, step))
+        return self._advanced(*values, *self._numbers(numbers, values[0].code, step))
 
-    def _given(self, numbers: Numbers, code: Code, step: Value) -> list[Value]:
+    def _numbers(self, numbers: Numbers, code: Code, step: Value) -> list[Value]:
         """The numbers of a step: h, the parameters, the letters at each stage, the rates."""
         column = self.column(code, numbers, step)
         letters = [x for row in self.A for x in self.letters_at(column, sum(row))]
@@ -204,12 +195,12 @@ class _InRegisters(_Explicit):
         numbers: Numbers,
         kind: Value,
         step: Value,
+        slopes: bool,
         *room: Room,
-        slopes: bool = False,
     ) -> tuple[list[Value], list[Value]]:
         n, program = self.n_out, self._reverse
         program = Program(program.inputs, program.outputs[: n + (1 + self.parameters) * slopes])
-        found = program(*values, *self._given(numbers, step.code, step), *cotangents)
+        found = program(*values, *self._numbers(numbers, step.code, step), *cotangents)
         found = [step.code.operand(x, values[0].type) for x in found]
         return found[:n], found[n + 1 :]
 

@@ -953,9 +953,6 @@ class LatticeCode(SharedRollouts):
         self.memory = partial(LatticeInMemory, self._stages)
         self.work, self.terms = lattice.ndof, 1 + level
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return LatticeCode, self._given
-
     @cached_property
     def size(self) -> int:
         return len(self._stages.form.column)

@@ -13,7 +13,6 @@ from functools import cached_property, reduce
 from itertools import pairwise
 from operator import mul
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_larg
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
+from sympflow.lazy import kept
 
 __all__ = ["implicit_kernel", "newton_code"]
 
@@ -40,23 +40,14 @@ MOST_REVERSED = 40  # numbers of a state whose cotangents are in registers
 LONG = 4e6  # operations between two looks for a stop
 
 
+@kept
 def implicit_kernel(
     system: HamiltonianSystem, tableau: Tableau, compensated: bool = False, names: tuple[str, ...] = ()
 ) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
 
-    With `names` these parameters are numbers of columns. A ValueError says why there are none.
+    With `names` these parameters are numbers of columns. NotCompiled says why there are none.
     """
-    kernels, key = _KERNELS.setdefault(system, {}), (tableau, compensated, names)
-    if key not in kernels:
-        kernels[key] = _kernel(system, *key)
-    return kernels[key]
-
-
-_KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[Any, OneStepKernel]] = WeakKeyDictionary()
-
-
-def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool, names: tuple[str, ...]) -> OneStepKernel:
     written = system.spelled
     if written is None:
         raise NotCompiled(
@@ -105,6 +96,7 @@ class NewtonCode(OneStep):
         return self.n_out <= MOST_REVERSED and not self.data
 
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
+        self._given = lettered, tableau, compensated, damped
         self._tableau, self._compensated, self._damped = tableau, compensated, damped
         self._nodes, self.stages = stage_nodes(tableau), len(tableau[1])
         n = 2 * lettered.symbols.ndof
@@ -112,9 +104,6 @@ class NewtonCode(OneStep):
         self.unknowns = n * self.stages
         self.work = 4 * self.unknowns**3
         self.block = int(min(max(LONG / self.unknowns**3, 1), Rollouts.block))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return newton_code, (self.lettered, self._tableau, self._compensated, self._damped)
 
     def _changes(self, K: Sequence[Value]) -> Value:
         """Σ B_i K_i of one variable."""
@@ -291,8 +280,8 @@ class _InRegisters(NewtonCode):
         numbers: Numbers,
         kind: Value,
         step: Value,
+        slopes: bool,
         *room: Room,
-        slopes: bool = False,
     ) -> tuple[list[Value], list[Value]]:
         code, type, n, y = step.code, values[0].type, self.n_out, values[: self.n_out]
         K, *_, sizes, column = self._iterated(code, y, self.column(code, numbers, step))
@@ -406,8 +395,8 @@ class _InMemory(NewtonCode):
         numbers: Numbers,
         kind: Value,
         step: Value,
+        slopes: bool,
         *room: Room,
-        slopes: bool = False,
     ) -> tuple[list[Value], list[Value]]:
         code, n, d, N, wide, zero = step.code, self.n_out, self.ndof, self.unknowns, self._wide, step.code.constant(0.0)
         for k, x in enumerate(values[:n]):

@@ -14,7 +14,7 @@ from sympflow.compiler.control import Code, Value
 from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
-from sympflow.kernels.runs import Numbers, Room, reverse_function, step_function
+from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.threads import given
 
 if TYPE_CHECKING:
@@ -91,20 +91,8 @@ class OneStep(Rollouts):
         self.lettered, self.driven, self.ndof = lettered, symbols.time is not None, symbols.ndof
         self.parameters = len(symbols.parameters)
         self.size = 1 + self.parameters + self.driven + more
+        self.given = self.own = self.parameters
         super().__init__(n_values, 2 * symbols.ndof)
-
-    def adjoint(
-        self,
-        values: list[Value],
-        cotangents: list[Value],
-        numbers: Numbers,
-        kind: Value,
-        step: Value,
-        *room: Room,
-        slopes: bool = False,
-    ) -> tuple[list[Value], list[Value]]:
-        """The reverse of `stage`, with `slopes` by the parameters too: see `sympflow.kernels.runs.Adjoint`."""
-        raise NotImplementedError
 
     def own_entries(self, table: Columns, values: np.ndarray) -> Columns:
         """The columns of trajectories with their own values of the parameters."""
@@ -113,12 +101,6 @@ class OneStep(Rollouts):
         return entries, table[1]
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        what, _, own = name.partition(" ")
-        if what in ("reverse", "slopes"):
-            sizes, n, slopes = (self.n_values, self.n_out, self.size), self.parameters, what == "slopes"
-            of_values = (lambda given, cotangents, kind: cotangents[:n]) if slopes else None
-            adjoint, memory = partial(self.adjoint, slopes=slopes), self.place is not None
-            return reverse_function(*sizes, adjoint, width, bool(own), of_values, n, n, False, memory)
         if name != "step":
             return super().made(name, width)
         # All numbers follow the states in their rows, which have the count behind them.

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +28,7 @@ from sympflow.kernels.runs import Numbers
 from sympflow.kernels.stage_times import SymbolicLetters
 from sympflow.kernels.terms import MOST_IN_REGISTERS, written_out
 from sympflow.kernels.threads import given
+from sympflow.lazy import kept
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
@@ -172,11 +172,8 @@ class PartsCode(Rollouts):
 
     def __init__(self, maps: PartMaps, groups: Sequence[tuple[int, ...]]) -> None:
         super().__init__(2 * maps.ndof, 2 * maps.ndof)
-        self.maps, self.groups = maps, tuple(groups)
+        self.maps, self.groups = self._given = maps, tuple(groups)
         self.size = maps.size * max(map(len, groups))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return PartsCode, (self.maps, self.groups)
 
     def columns(self, groups: Sequence[Sequence[int]], entries: np.ndarray) -> Columns:
         """The columns (n, k, size) of groups of maps, whose numbers are (n, m, size), and their kinds (k,)."""
@@ -206,15 +203,10 @@ class PartsCode(Rollouts):
         return values
 
 
+@kept
 def parts_loops(parts: ExactParts) -> PartsLoops:
-    """The compiled loops of the parts of a system, made once; a ValueError says why there are none."""
-    loops = _LOOPS.get(parts)
-    if loops is None:
-        loops = _LOOPS[parts] = PartsLoops(parts)
-    return loops
-
-
-_LOOPS: WeakKeyDictionary[ExactParts, PartsLoops] = WeakKeyDictionary()
+    """The compiled loops of the parts of a system, made once; NotCompiled says why there are none."""
+    return PartsLoops(parts)
 
 
 class PartsLoops:

@@ -14,7 +14,7 @@ from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.protocol import Batch
-from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "zeros"]
@@ -85,6 +85,8 @@ class Rollouts(ABC):
         True if the last of `n_values` is a count, which is no part of the running state.
     closing : bool
         False if outputs are never closed, so that the code need not hold a stage for that.
+    given, own : int
+        Numbers of which a column is made, and how many of them, the last ones, each trajectory may have of its own.
     """
 
     size: Any
@@ -99,15 +101,39 @@ class Rollouts(ABC):
     block = BLOCK
     counted = False
     closing = True
+    given = own = 0
+
+    _given: tuple[Any, ...]
+    """The arguments of the class."""
 
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
         self._lock = threading.RLock()
         self._functions: dict[Any, Callable[..., None]] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._given
+
     @abstractmethod
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
+
+    def adjoint(
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
+    ) -> tuple[list[Value], list[Value]]:
+        """The reverse of `stage`, where there is one: see `sympflow.kernels.runs.Adjoint`."""
+        raise NotImplementedError
+
+    def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> Sequence[Value]:
+        """The cotangents of values that each trajectory has: see `sympflow.kernels.runs.OfValues`."""
+        return cotangents[: self.own]
 
     def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
         """One column of many states: see `sympflow.kernels.runs.Over`."""
@@ -159,16 +185,17 @@ class Rollouts(ABC):
         return found
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "run" or "kept", each " own" too, or "map"."""
-        memory, (what, _, own_tables) = self.place, name.partition(" ")
+        """Compile the function of a name: "run", "kept", "reverse" or "slopes", each " own" too, or "map"."""
+        sizes, memory, (what, _, own_tables) = (self.n_values, self.n_out, self.size), self.place, name.partition(" ")
         if name == "map":
-            return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
-        look, every = (None, self.block) if self.every is None else (self.look, self.every)
+            return map_function(*sizes, self.stage, width, memory, self.timed)
         own, kept = bool(own_tables), what == "kept"
+        if what in ("reverse", "slopes"):
+            asked = what == "slopes", self.closing, memory is not None
+            return reverse_function(*sizes, self.adjoint, width, own, *asked, self.of_values, self.given, self.own)
+        look, every = (None, self.block) if self.every is None else (self.look, self.every)
         over = self.over if self.chunked and not kept else None
-        return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over, kept
-        )
+        return run_function(*sizes, self.stage, width, own, memory, look, every, self.closing, over, kept)
 
     @cached_property
     def _places(self) -> np.ndarray:

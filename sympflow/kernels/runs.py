@@ -24,6 +24,7 @@ __all__ = [
     "Numbers",
     "Room",
     "assign",
+    "begun",
     "finished",
     "groups",
     "map_function",
@@ -42,9 +43,9 @@ Numbers = Callable[..., Any]
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 """``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
 `step` tells after how many whole steps the stage is executed."""
-Adjoint = Callable[[list[Value], list[Value], Numbers, Value, Value], tuple[list[Value], list[Value]]]
-"""``adjoint(values, cotangents, numbers, kind, step)``: the cotangents of the values before a stage, and of its
-numbers, for those of the values after it."""
+Adjoint = Callable[..., tuple[list[Value], list[Value]]]
+"""``adjoint(values, cotangents, numbers, kind, step, slopes, *room)``: the cotangents of the values before a stage, and
+with `slopes` of its numbers, for those of the values after it; with the room, where states are in memory."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
 OfValues = Callable[[Sequence[Value], Sequence[Value], Value], Sequence[Value]]
@@ -109,10 +110,9 @@ def run_function(
         trajectories side by side only whether it is `n_steps`, else −1. Where `keeps` is 1, `running` is left with the
         state of the run. Ends soon if ``stop[0]`` becomes 1.
     """
-    module = Module(host().fused)
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
     types += [POINTER] * kept + (MEMORY if memory else [])
-    code = module.function("run", types)
+    code = begun("run", types)
     table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite, running, keeps, stop = (
         code.arguments[:15]
     )
@@ -183,7 +183,7 @@ def run_function(
             _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
             state.keep(running, begin, n_rows)
-    return finished(code, types)
+    return finished(code)
 
 
 def reverse_function(
@@ -193,26 +193,27 @@ def reverse_function(
     adjoint: Adjoint,
     width: int = 1,
     own: bool = False,
+    slopes: bool = False,
+    closing: bool = True,
+    memory: bool = False,
     of_values: OfValues | None = None,
     n_given: int = 0,
     n_own: int = 0,
-    closing: bool = True,
-    memory: bool = False,
 ) -> Callable[..., None]:
     """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
 
     Returns a function of addresses and integers (table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved,
     out, slopes, columns, starts, values): `rows` (n_rows, n_values) are the cotangents of the running states after
     `n_steps` steps, and become those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than
-    `first`. With `of_values`, what a table of its own for every `width` trajectories would hold is added to `slopes`,
-    in the same order. The numbers of columns are made of others, `columns` (n_given, link + 2), of which the last ones
-    follow each state in `starts` (n_rows, n_out + n_own): `values` (n_rows, n_own) are the cotangents of these. Where
-    states were in `memory`, `MEMORY` follows, and `adjoint` is given the room too.
+    `first`. With `slopes`, what a table of its own for every `width` trajectories would hold is added to that array, in
+    the same order. The numbers of columns are made of others, `columns` (n_given, link + 2), of which the last ones
+    follow each state in `starts` (n_rows, n_out + n_own): `values` (n_rows, n_own) are the cotangents of these, by
+    `of_values`. Where states were in `memory`, `MEMORY` follows, and `adjoint` is given the room too.
     """
     types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, *[POINTER] * 5]
     types += MEMORY if memory else []
-    code = Module(host().fused).function("reverse", types)
-    table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, slopes, columns, starts, values = (
+    code = begun("reverse", types)
+    table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, derivatives, columns, starts, values = (
         code.arguments[:15]
     )
     more = Memory(code, width, code.arguments[15:], False).rooms[:1] if memory else []
@@ -222,14 +223,14 @@ def reverse_function(
         begin, length = group * width, (link + 2) * (size * width)
         place = code.at(table, group * length) if own else table
         column = ColumnStage(code, place, kinds, size, width if own else 1, width, _no_stage)
-        found = code.at(slopes, group * length)
+        found = code.at(derivatives, group * length)
         history = _History(code, kept, group, (n_steps - first) * link, n_values, width)
         cotangents = [code.variable(x) for x in lanes.loaded(rows, begin, n_rows)]
         n, saved = code.variable(n_steps), code.variable(n_saved)
 
         def pulled(j: Value, step: Value, state: list[Value], given: list[Value]) -> list[Value]:
-            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step, *more)
-            for i, x in enumerate(of_numbers if of_values else ()):
+            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step, slopes, *more)
+            for i, x in enumerate(of_numbers if slopes else ()):
                 at = j * (size * width) + i * width
                 code.store(code.load(found, at, x.type) + x, found, at)
             return of_state
@@ -260,11 +261,10 @@ def reverse_function(
                 r.value = code.select(opens, link, r.value)
             n.value = to
         lanes.store([x.value for x in cotangents], rows, begin, n_rows, one, zero)
-        if of_values is not None:
-            behind = Lanes(code, n_own, width)
-            own_values = behind.loaded(
-                starts, begin, n_rows, code.constant(n_out + n_own, INT), code.constant(n_out, INT)
-            )
+        if slopes and n_own:
+            assert of_values is not None
+            behind, stride = Lanes(code, n_own, width), code.constant(n_out + n_own, INT)
+            own_values = behind.loaded(starts, begin, n_rows, stride, code.constant(n_out, INT))
             totals = [code.variable(code.constant(0.0, lanes.type)) for _ in range(n_own)]
             with code.over(link + 2) as j:
                 shared = [code.load(columns, (link + 2) * r + j) for r in range(n_given - n_own)]
@@ -273,7 +273,7 @@ def reverse_function(
                 for total, slope in zip(totals, of_values(numbers, of_column, column.kind(j)), strict=True):
                     total.value = total.value + slope
             behind.store([x.value for x in totals], values, begin, n_rows, one, zero)
-    return finished(code, types)
+    return finished(code)
 
 
 def map_function(
@@ -291,7 +291,7 @@ def map_function(
     `MEMORY`: row i is mapped after ``steps[i % n_steps]`` whole steps; `out` may be `rows`.
     """
     types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
-    code = Module(host().fused).function("map", types)
+    code = begun("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
     state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
     column = ColumnStage(code, table, kinds, size, 1, width, stage)
@@ -303,7 +303,7 @@ def map_function(
             state.change(column, j, step)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return finished(code, types)
+    return finished(code)
 
 
 def _steps_of_lanes(code: Code, steps: Value, n_steps: Value, begin: Value, width: int) -> Value:
@@ -333,7 +333,7 @@ def step_function(
     Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
     """
     types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
-    code = Module(host().fused).function("steps", types)
+    code = begun("steps", types)
     table, n_columns, n_powers, x, h, t, rows, n_rows, out = code.arguments[:9]
     state = _state(code, n_values, n_out, width, memory, code.arguments[9:])
     alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
@@ -355,7 +355,7 @@ def step_function(
             state.change(lambda j, x, step, entries=entries: stage(x, entries.__getitem__, j, step), j, j)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return finished(code, types)
+    return finished(code)
 
 
 MEMORY = [INT, INT, POINTER, POINTER]
@@ -767,7 +767,13 @@ def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) 
 _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
 
 
-def finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+def begun(name: str, types: Sequence[Type]) -> Code:
+    """Begin the code of a function for this machine."""
+    return Module(host().fused).function(name, types)
+
+
+def finished(code: Code) -> Callable[..., None]:
     """End the code of a function, and compile it."""
     code.give()
-    return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *[_C[t.scalar] for t in types]))
+    types = [_C[x.type.scalar] for x in code.arguments]
+    return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *types))

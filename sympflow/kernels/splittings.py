@@ -22,7 +22,7 @@ from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gra
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, reverse_function, step_function
+from sympflow.kernels.runs import Numbers, Room, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
@@ -381,16 +381,13 @@ class SplittingCode(SplittingRollouts):
     """The compiled functions of splitting schemes on one system; `chunked` by default if no polynomials."""
 
     def __init__(self, splitting: Splitting, chunked: bool | None = None) -> None:
-        self._splitting = splitting
+        self._splitting, self._given = splitting, (splitting,)
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         super().__init__(2 * splitting.ndof * (1 + splitting.compensated), 2 * splitting.ndof)
         self.timed = splitting.timed
         self.chunked = self.timed or not splitting.polynomial if chunked is None else chunked
         self.lanes = 8 if self.chunked else 16  # chunks need not wait for each other, registers side by side do
-        self._own = splitting.own
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return SplittingCode, (self._splitting,)
+        self.given, self.own = len(splitting.numbers), splitting.own
 
     @cached_property
     def _kinds(self) -> Sequence[Any]:
@@ -400,7 +397,7 @@ class SplittingCode(SplittingRollouts):
     def size(self) -> int:
         """Numbers of a column that the code reads."""
         if self.timed:
-            letters = len(self._splitting.parameters) - self._own
+            letters = len(self._splitting.parameters) - self.own
             return len(self._splitting.numbers) - letters + CLOCK
         return max(len(kind.table.outputs) for kind in self._kinds)
 
@@ -442,7 +439,7 @@ class SplittingCode(SplittingRollouts):
     @cached_property
     def _clock(self) -> slice:
         """The places of the numbers of the time in a column: when the kick is, when step 0 begins, how long one is."""
-        end = self.size - self._own
+        end = self.size - self.own
         return slice(end - CLOCK, end)
 
     def _lettered(self, time: Any, given: Sequence[Any]) -> list[Any]:
@@ -472,9 +469,15 @@ class SplittingCode(SplittingRollouts):
         self._adjoints  # noqa: B018
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
     ) -> tuple[list[Value], list[Value]]:
-        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
         code, type = step.code, values[0].type
         zero = code.constant(0.0, type)
         found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
@@ -489,12 +492,11 @@ class SplittingCode(SplittingRollouts):
                     result.value = x
         return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
-    def _of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> list[Value]:
-        """See `sympflow.kernels.runs.OfValues`."""
+    def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> list[Value]:
         if self.timed:
-            return [*cotangents[self.size - self._own :]]
+            return [*cotangents[self.size - self.own :]]
         code, type = kind.code, cotangents[0].type
-        found = [code.variable(code.constant(0.0, type)) for _ in range(self._own)]
+        found = [code.variable(code.constant(0.0, type)) for _ in range(self.own)]
         for k, program in enumerate(self._of_tables):
             n = len(program.inputs) - len(given)
             with code.given(code.apply("eq", (kind, k))) if len(self._of_tables) > 1 else nullcontext():
@@ -506,7 +508,7 @@ class SplittingCode(SplittingRollouts):
     def _of_tables(self) -> list[Program]:
         """From the numbers of a table, and cotangents of those of a column, to cotangents of the values."""
         programs = [adjoint(kind.table) for kind in self._kinds]
-        return [Program(each.inputs, each.outputs[len(each.outputs) - self._own :]) for each in programs]
+        return [Program(each.inputs, each.outputs[len(each.outputs) - self.own :]) for each in programs]
 
     def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
         """A step of length h at t from tensors (..., 2d), by tensor operations.
@@ -529,26 +531,13 @@ class SplittingCode(SplittingRollouts):
             state = self._kinds[k].plain(*state, *self._kinds[k].table(*given))
         return torch.stack([x.expand(y.shape[:-1]) for x in state[: self.n_out]], dim=-1)
 
-    @property
-    def given_numbers(self) -> int:
-        """How many numbers of a column are given, from which those are computed that the code reads."""
-        return len(self._splitting.numbers)
-
-    def executed(self, given: Sequence[Any], values: list[Value]) -> list[Value]:
-        """The values after a stage of the last kind, by the numbers that are given."""
-        last = self._kinds[-1]
-        return last.body(*values, *last.table(*given))
-
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "step", "reverse" and "slopes", each " own" too."""
+        """Compile the function of a name, "step" too."""
         what, _, own = name.partition(" ")
-        if what in ("reverse", "slopes"):
-            sizes, of_values = (self.n_values, self.n_out, self.size), self._of_values if what == "slopes" else None
-            return reverse_function(*sizes, self.adjoint, width, bool(own), of_values, self.given_numbers, self._own)
         if what != "step":
             return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
-        powers = [1, *kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self._own]
+        powers = [1, *kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self.own]
         last, table = len(self._kinds) - 1, self._kinds[-1].table
 
         def column(time: Value, *given: Value) -> list[Any]:
@@ -560,7 +549,7 @@ class SplittingCode(SplittingRollouts):
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
             return self._executed(last, values, [numbers(i) for i in range(len(table.outputs))])
 
-        own_numbers = self._own if own else 0
+        own_numbers = self.own if own else 0
         return step_function(self.n_values, self.n_out, powers, own_numbers, column, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
@@ -609,7 +598,7 @@ class SplittingCode(SplittingRollouts):
         """The numbers of the columns of trajectories with their own values of the parameters."""
         if isinstance(table, tuple):
             return super().own_entries(table, values)
-        kinds, n = self._kinds_of(table), len(table) - self._own
+        kinds, n = self._kinds_of(table), len(table) - self.own
         values = np.broadcast_to(values.T[:, None], (values.shape[1], len(kinds), len(values)))
         rows = [*table[:n, :, None], *values]
         return np.moveaxis(self._entries(rows, kinds, values.shape[2:]), -1, 0), kinds

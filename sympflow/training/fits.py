@@ -25,7 +25,7 @@ from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.split import SplitFlow
-from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.sympflow import Drive, SympFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -541,9 +541,9 @@ class NetworkFit(LossFit):
         ValueError
             If no baseline has as many parameters.
         """
-        make = partial(SympFlow, system.ndof) if system.autonomous else partial(SympFlow.timed, system)
         like: Any = {"dtype": self.dtype, "device": self.device, "seed": self.seed, "scale": scaling}
-        flow = make(self.pairs, hidden=self.hidden, activation=self.activation, dt=dt, **like)
+        drawn: Any = {"hidden": self.hidden, "activation": self.activation, "dt": dt, "drive": Drive.of(system)}
+        flow = SympFlow(system.ndof, self.pairs, **drawn, **like)
         if not self.baseline:
             return flow
         if matching_widths(flow.ndof, flow.n_parameters) is None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, available, get
-from sympflow.arrays import concatenate, per_state, to_numpy
+from sympflow.arrays import concatenate, like, per_state, to_numpy
 from sympflow.integrators.base import FixedStep, Outcome, OwnSteps
 from sympflow.integrators.steppers import Stepper
 from sympflow.integrators.tableaux import ADAPTIVE, MULTISTEP
@@ -274,7 +274,7 @@ def hides_failures_of_batches(self, problem):
 
 
 def clock_in_the_step(self, system, t, y, h):
-    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * float(np.sin(t))))
+    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * like(np.sin(to_numpy(t)), y)))
 
 
 def first_event_only(self, problem):
