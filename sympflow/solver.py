@@ -145,8 +145,8 @@ def solve(
         methods.
     backend : "auto", "compiled" or "array"
         "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states and, by
-        methods of fixed steps, for tensors on the CPU; everything else with array operations, tensors on a GPU too. What ran
-        is in `stats["backend"]`.
+        methods of fixed steps, for tensors on the CPU; everything else with array operations, tensors on a GPU too.
+        What ran is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
