@@ -416,10 +416,10 @@ def _field_names(cls: type) -> tuple[str, ...]:
     return tuple(f.name for f in fields(cls))
 
 
-def method_class(base: type[M], class_name: str, module: str, **own: Any) -> type[M]:
+def method_class(base: type[M], class_name: str, module: str, kind: type[type] = type, **own: Any) -> type[M]:
     """Return the integrator class of a row of a table: a base with attributes of its own, by which it is documented."""
     own = {"__doc__": f"{own['source']}\n\n{base.__doc__}", "__module__": module, **own}
-    return dataclass(frozen=True, repr="__repr__" not in vars(base))(type(class_name, (base,), own))
+    return dataclass(frozen=True, repr="__repr__" not in vars(base))(kind(class_name, (base,), own))
 
 
 def method_text(integrator: Integrator, dt: float | None = None) -> str:

@@ -125,7 +125,7 @@ class GaussSteps(ArraySteps):
 
 def _gauss_method(name: str, class_name: str, stages: int, source: str) -> type[Gauss]:
     """The integrator class of the Gauss method of so many stages."""
-    own = {"order": 2 * stages, "tableau": gauss_legendre(stages), "source": f"{source}; {_SYMPLECTIC}"}
+    own: dict[str, Any] = {"order": 2 * stages, "tableau": gauss_legendre(stages), "source": f"{source}; {_SYMPLECTIC}"}
     return method_class(Gauss, class_name, __name__, name=name, **own)
 
 

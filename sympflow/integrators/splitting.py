@@ -25,6 +25,7 @@ from sympflow.integrators.contract import (
     differentiated,
     forward_tangent,
     in_blocks,
+    method_class,
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
@@ -495,18 +496,12 @@ copyreg.pickle(_ByTable, _reduced)
 
 
 def _new_class(kind: type[type], name: str, scheme: Scheme, splitting: str, clock: str, source: str) -> type[Splitting]:
-    namespace: dict[str, Any] = {
-        "name": name,
-        "order": scheme.order,
-        "scheme": scheme,
-        "source": source,
-        "splitting": splitting,
-        "clock": clock,
+    own: dict[str, Any] = {
         "__annotations__": {"splitting": str, "clock": str},
         "__doc__": f"{name}: order {scheme.order}, {source}\n\n{Splitting.__doc__}",
-        "__module__": __name__,
     }
-    return dataclass(frozen=True, repr=False)(kind(name, (Splitting,), namespace))
+    own |= {"name": name, "order": scheme.order, "scheme": scheme, "source": source}
+    return method_class(Splitting, name, __name__, kind, splitting=splitting, clock=clock, **own)
 
 
 def __getattr__(name: str) -> type[Splitting]:
