@@ -402,7 +402,7 @@ class _InMemory(NewtonCode):
         for k, x in enumerate(values[:n]):
             room[0].store(x, k)
         *_, arguments = self._solved(room[0], numbers, step)
-        state, K, column, M, Y, g, S, sizes, *_ = arguments
+        state, K, column, M, Y, _, _, sizes, *_ = arguments
         end = cotangents[:n]
         if self._damped:
             end = [*end[:d], *(x * code.load(column, self.size - d + k) for k, x in enumerate(end[d:]))]
