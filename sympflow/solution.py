@@ -232,7 +232,8 @@ class Solution(Shown):
             Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
             p₁, and "energy", which is left out where energy is not kept.
         """
-        y, kinds = to_numpy(self.y), (kinds,) if isinstance(kinds, str) else kinds
+        shown = self if self.system.shows_energy is self.system.keeps_energy else self.physical()
+        y, kinds = to_numpy(shown.y), (kinds,) if isinstance(kinds, str) else kinds
         error = None
         if self.system.shows_energy:
             with warnings.catch_warnings(action="ignore"):
