@@ -218,7 +218,7 @@ class SplitProblem:
 
     def frozen(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Offset (n,) and design (n, f) of numbers that are bound by Σ s = t alone, in their units."""
-        bare = [Column(c.n, 1, t, c.power, c.total if c.total == "always" else None) for c in self.columns]
+        bare = [Column(c.n, (0,), c.power, total="always" if c.total == "always" else None, dt=t) for c in self.columns]
         affine = [c.affine(np.array([t])) for c in bare]
         offset = np.concatenate([own[0, : (c.n + 1) // 2] for c, (own, _) in zip(bare, affine, strict=True)])
         blocks = [d[0, : (c.n + 1) // 2] / t**c.power for c, (_, d) in zip(bare, affine, strict=True)]
