@@ -29,7 +29,6 @@ from sympflow.learning.orbits import Method
 from sympflow.learning.reading import Run
 from sympflow.learning.regression import Regression
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
-from sympflow.learning.smoothing import smoothed
 from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
 from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
@@ -360,7 +359,7 @@ class _Search:
         self.held, rest = sorted(drawn[:count]), drawn[count:]
         values = np.cumsum([data.runs[i].y.size for i in rest])
         self.fitted = sorted(rest[: max(int(np.searchsorted(values, MOST_VALUES)), 1)])
-        self.smooth = smoothed(data)
+        self.smooth = data.smooth
         self.expected = self.smooth.sigma if self.known is None else self.known
         points = self.smooth.points
         if not len(points):
@@ -744,13 +743,15 @@ class _Search:
                 f"But without any model the data show noise of up to {self.smooth.sigma[worst]:.2g} there: leave "
                 "`noise` out, or give that."
             )
-        hint = diagnosis.hint(self.library, self.smooth, self.data, otherwise)
-        if self.doubt is not None and hint == otherwise:
-            hint = f"Of increments of trajectories {self.doubt.said} leaves {self.doubt.share:.1e} of the squares."
+        hint = diagnosis.hint(self.library, self.smooth, self.data)
+        if hint is None and self.doubt is not None:
+            hint = (
+                f"Of increments of trajectories {self.doubt.cause.said} leaves {self.doubt.share:.1e} of the squares."
+            )
         return (
             f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "
-            f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. {hint} The "
-            "best model and the path to it are in `system.discovery`."
+            f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. "
+            f"{hint or otherwise} The best model and the path to it are in `system.discovery`."
         )
 
 

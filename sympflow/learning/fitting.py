@@ -18,7 +18,7 @@ from sympflow.learning.shooting import FINEST, Fit, Problem, chosen_method, matc
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training.least_squares import Stop, never
 
-FIRST_POINTS, SKETCH_POINTS = 10, 30  # of the pieces that a fit begins with, and that one of all terms has
+FIRST_POINTS = 10  # of the pieces that a fit begins with
 MATCHED_POINTS = 24  # of those whose increments give its start
 MATCHED_STEPS = 60
 ROUNDS = 4  # of longer pieces, or of another noise
@@ -83,7 +83,6 @@ class Setting:
     # (2d,): The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is
     # given up
     rival: np.ndarray | None = None
-    sketch: bool = False  # True to end with orbits of a few points
 
     def plausible(self, noise: np.ndarray) -> bool:
         """True unless a model leaves so much (2d,) that it is rejected whatever its last digits are."""
@@ -149,7 +148,7 @@ def fitted(
     span = (
         former.span if former is not None else 0.0 if model.stepper is None else model.stepper.longest
     )  # a map of its own is fitted over all of a step
-    pieces = data.pieces(span=span) if span else data.pieces(SKETCH_POINTS if setting.sketch else FIRST_POINTS)
+    pieces = data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
     if former is None or not span:
         states = first_states(pieces, model, theta)
     else:
@@ -178,7 +177,7 @@ def fitted(
         orbits = np.concatenate(fit.orbits, axis=1)
         coarse = fit.step_error(np.maximum(sigma, EXACT * scales)) > STEP_ERROR
         finer = finer / 10 if coarse else finer
-        longer = 0.0 if setting.sketch else _span(model, data, method, theta, orbits, scales, sigma)
+        longer = _span(model, data, method, theta, orbits, scales, sigma)
         settled = np.allclose(sigma, before, rtol=SETTLED, atol=EXACT * scales.min())
         if longer <= 1.5 * span and settled and not coarse:
             break
@@ -187,6 +186,18 @@ def fitted(
         states = orbits[:, _starts(pieces.runs)].T
     assert made is not None
     return made
+
+
+def refitted(found: Fitted, data: Trajectories, setting: Setting) -> Fitted:
+    """The fit of the same model to other trajectories: by the same scheme, along pieces as long, from its numbers."""
+    scales = data.scales
+    pieces = data.pieces(span=found.span) if found.span else data.pieces(FIRST_POINTS)
+    problem = Problem(found.model, pieces, found.method, np.maximum(found.sigma, FINEST * scales), huber=setting.huber)
+    states = _states(found, data, pieces, problem.sigma, setting)
+    most = STEPS if found.model.stepper is None else OWN_STEPS
+    fit = minimized(problem, found.theta, states, iterations=most, gain=FINE, patience=1, stop=setting.stop)
+    sigma = problem.sigma if setting.noise is not None else np.maximum(fit.noise(), FINEST * scales)
+    return Fitted(found.model, fit.theta, sigma, fit, found.span, [cost / data.n_values for cost in fit.costs])
 
 
 def kept(found: Fitted) -> dict[str, Any]:
@@ -352,7 +363,7 @@ def left_out(found: Fitted, folds: Sequence[tuple[Trajectories, Trajectories]], 
     """The likelihood of held-out trajectories; of several divisions, each by a fit to the others from this one."""
     if len(folds) == 1:
         return judged(found, folds[0][1], setting)
-    parts = [judged(fitted(found.model, data, setting, found), held, setting) for data, held in folds]
+    parts = [judged(refitted(found, data, setting), held, setting) for data, held in folds]
     values, pairs = np.array([part.values for part in parts]), np.array([part.pairs for part in parts])
     share = np.average([part.correlation if part.pairs else 0.0 for part in parts], weights=pairs + 1e-300)
     loudness = math.sqrt(np.average([part.loudness**2 for part in parts], weights=values))

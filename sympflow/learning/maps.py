@@ -60,8 +60,8 @@ class NetworkFlow(VectorField):
     """
 
     separable = nystrom = lagrangian = linear = False
-    forces, drive = 0, None
-    parts = places = ()
+    forces = 0
+    parts = places = drives = ()
 
     def __init__(self, scaling: Scaling, pairs: int, width: int, palindromic: bool) -> None:
         self.scaling, self.pairs, self.width, self.palindromic = scaling, pairs, width, palindromic

@@ -39,9 +39,9 @@ class VectorField:
         """The states (2d, N) of observations."""
         return y
 
-    def frequency(self, theta: np.ndarray) -> float | None:
-        """The angular frequency of the drive; None without one."""
-        return None
+    def frequencies(self, theta: np.ndarray) -> list[float]:
+        """The angular frequencies of the drives."""
+        return []
 
 
 Force = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -107,16 +107,16 @@ class Model(VectorField):
         return 0 if self.force is None else self.force(np.zeros((2 * self.ndof, 1)))[0].shape[1]
 
     @cached_property
-    def drive(self) -> Drive | None:
-        """The part that depends on time."""
-        return next((part for part in self.parts if isinstance(part, Drive)), None)
+    def drives(self) -> tuple[Drive, ...]:
+        """The parts that depend on time."""
+        return tuple(part for part in self.parts if isinstance(part, Drive))
 
     def at(self, t: np.ndarray) -> Model:
-        return self if self.drive is None else replace(self, parts=tuple(part.at(t) for part in self.parts))
+        return replace(self, parts=tuple(part.at(t) for part in self.parts)) if self.drives else self
 
-    def frequency(self, theta: np.ndarray) -> float | None:
+    def frequencies(self, theta: np.ndarray) -> list[float]:
         shares = zip(self.parts, self.places, strict=True)
-        return next((p.frequency + float(theta[own][-1]) for p, own in shares if isinstance(p, Drive)), None)
+        return [part.frequency + float(theta[own][-1]) for part, own in shares if isinstance(part, Drive)]
 
     @property
     def separable(self) -> bool:
@@ -255,7 +255,7 @@ class FreeField(VectorField):
     """A vector field of polynomials that need not be Hamiltonian, to be compared with those that are."""
 
     separable = nystrom = lagrangian = False
-    linear, forces, drive = True, 0, None
+    linear, forces, drives = True, 0, ()
     stepper = None
 
     def __init__(self, scales: Any, degree: int) -> None:

@@ -597,7 +597,7 @@ class Drive(Part):
         """The terms of which the cosine or the sine is kept."""
         return Drive(self.base.subset(kept[: self.base.n] | kept[self.base.n : -1]), self.frequency)
 
-    def at(self, t: np.ndarray) -> Part:
+    def at(self, t: np.ndarray) -> Drive:
         return Drive(self.base, self.frequency, t)
 
     def _waves(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

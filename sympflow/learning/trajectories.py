@@ -31,9 +31,11 @@ from sympflow.learning.reading import (
     rows_of,
     width_of,
 )
+from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.show.cards import Card, Shown
 from sympflow.show.pictures import MOST_LINES, trajectory_figure
 from sympflow.show.style import saved
+from sympflow.storage.layout import imported
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -97,6 +99,7 @@ class Trajectories(Shown):
             - A table of pandas with a row for each time, or a CSV or Parquet file of one: columns for the trajectory,
               the time and the coordinates.
             - A Dataset of xarray as `to_xarray` makes it, or a NetCDF file or zarr store of one.
+            - A list of dictionaries or tables, one or more trajectories each; or of dictionaries of a row each.
 
             NaN marks a value that is missing. Points without any value are left out. A trajectory whose times all
             descend is turned around.
@@ -160,6 +163,14 @@ class Trajectories(Shown):
             order = "halves"
         elif isinstance(data, str | Path):
             return cls.read(opened(Path(data)), ndof, **given, **converted)
+        elif isinstance(data, list | tuple) and data and all(map(_is_named, data)):
+            if not any(np.ndim(value) for one in data for value in dict(one).values()):  # a row each
+                return cls.read(imported("pandas", "Reading rows").DataFrame(data), ndof, **given, **converted)
+            parts = [cls.read(one, ndof, **given, **converted) for one in data]
+            if len({part.names for part in parts}) > 1:
+                said = "; ".join(sorted({", ".join(part.names) for part in parts}))
+                raise ValueError(f"`data` has parts with different coordinates, {said}: give all the same names.")
+            return replace(parts[0], runs=tuple(run for part in parts for run in part.runs))
         else:
             found, names = list(of_arrays(data)), ()
         if not found:
@@ -219,6 +230,11 @@ class Trajectories(Shown):
             rates = np.concatenate([np.diff(run.y) / np.diff(run.t) for run in self.runs], axis=1)
             spread[missing] = np.nanstd(np.roll(rates, self.ndof, axis=0)[missing], axis=1)
         return np.where(spread > 0, spread, 1.0)
+
+    @cached_property
+    def smooth(self) -> Smooth:
+        """Smooth curves through the trajectories, with their slopes, and the noise."""
+        return smoothed(self.runs, self.velocities)
 
     @cached_property
     def time_scale(self) -> float:
@@ -412,6 +428,11 @@ def _cut(run: Run, points: int, span: float) -> Iterator[Run]:
 def _labelled(runs: Sequence[Run]) -> Iterator[Found]:
     for i, run in enumerate(runs):
         yield f"trajectory {i}", run.t, run.y
+
+
+def _is_named(data: Any) -> bool:
+    """True of a dictionary, a table or a Dataset."""
+    return isinstance(data, Mapping) or _is_a("pandas", "DataFrame", data)
 
 
 def _is_a(library: str, kind: str, data: Any) -> bool:

@@ -10,7 +10,6 @@ import sympflow
 from sympflow.learning.library import Library, coordinates, library_for, polynomials
 from sympflow.learning.orbits import Gauss, Method
 from sympflow.learning.shooting import Problem, minimized
-from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import damped_pendulum, pendulum
 
@@ -239,7 +238,7 @@ def test_outliers_are_left_to_hubers_loss():
 
 def test_noise_and_slopes_are_seen_without_a_model():
     _, y = measured(pendulum(), 0.02, n=20)
-    curves = smoothed(Trajectories.read((t, y)))
+    curves = Trajectories.read((t, y)).smooth
     np.testing.assert_allclose(curves.sigma, 0.02, rtol=0.25)
     field = pendulum().vector_field(curves.points)
     assert np.std(curves.slopes - field) < 0.1 * np.std(field)

@@ -19,7 +19,6 @@ from sympflow.learning.orbits import Gauss, Method, first_states
 from sympflow.learning.parts import Distances, Drive, FixedKinetic, Formula, Kinetic, Network, Polynomial, Waves
 from sympflow.learning.search import Replicas, Search, replica, without_growth
 from sympflow.learning.shooting import Problem, chosen_method, matched, minimized
-from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Session
@@ -598,7 +597,7 @@ def test_residuals_beyond_the_noise_of_the_data_are_not_explained():
     """Silent residuals of a model that fits nothing, as of pieces too short to tell, count by their size."""
     data = Trajectories.read(trajectories(4, 16, noise=0.01))
     wrong = Model(1, (FixedKinetic(np.eye(1)), Polynomial("q", [[2]], [1.0])))
-    setting = Setting(seen=smoothed(data).sigma)
+    setting = Setting(seen=data.smooth.sigma)
     held = left_out(fitted(wrong, data, setting), data.folds(), setting)
     assert len(held.losses) == 4
     assert held.excess > 2
@@ -670,7 +669,8 @@ def test_models_that_increments_rule_out_are_tried_last():
     data = Trajectories.read([(t, y + 0.003 * rng.normal(size=y.shape)) for t, y in runs])
     search = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0)
     names = ["polynomial", "network", "whole-polynomial", "whole-network"]
-    groups = [[c.name for c in some] for _, some in search._ask(names, Setting(), Session())]
+    asked = [group for name in names for group in search.constraints.groups(name)]
+    groups = [[c.name for c in some] for _, some in search._ask(asked, Setting(), Session())]
     assert groups[0][0] == "H(q, p) a polynomial of degree 4"
     assert all("network" in name for group in groups[1:3] for name in group)
     assert "T = ½ pᵀM⁻¹p, V a polynomial of degree 2" in groups[3]
