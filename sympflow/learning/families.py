@@ -9,12 +9,14 @@ from itertools import combinations, product
 from typing import Any
 
 import numpy as np
+import sympy
 
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.inertia import Inertia
+from sympflow.learning.library import coordinates_of
 from sympflow.learning.maps import NetworkFlow
 from sympflow.learning.models import Force, Model, drags
-from sympflow.learning.parts import Distances, Drive, FixedKinetic, Formula, Kinetic, Network, Part, Polynomial, Waves
+from sympflow.learning.parts import Distances, Drive, Fixed, Network, Part, Polynomial, Waves, kinetic, known_kinetic
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
 HARMONICS = (1, 2, 3, 4, 6, 8)
@@ -44,7 +46,7 @@ class Constraints:
     inverse_mass: np.ndarray | None  # (d, d)
     force: Force | None  # Friction or drag whose factors are to be learned, as `models.friction`
     periods: np.ndarray  # (2d,): Of the coordinates that are angles, infinite for the others
-    known: tuple[Formula, ...] = ()  # Parts of H
+    known: tuple[Fixed, ...] = ()  # Parts of H
     # (d, d): The covariance of the momenta along a trajectory, in their mean; None where it is not known
     momenta: np.ndarray | None = None
     flow_scaling: Scaling | None = None  # The units of a flow that is fitted itself, and its Δt; None for none
@@ -85,13 +87,13 @@ class Constraints:
     def kinetic(self) -> tuple[Part, ...]:
         """½ pᵀM⁻¹p, learned if it is not known."""
         if self.inverse_mass is not None:
-            return (FixedKinetic(self.inverse_mass),)
+            return (known_kinetic(self.inverse_mass),)
         if self.kinetic_is_known:
             return ()
-        T = Kinetic(self.scales[self.ndof :])
+        T = kinetic(self.scales[self.ndof :])
         if not self.velocities:
             return (T,)
-        unit = FixedKinetic(np.diag(np.eye(self.ndof)[0]))
+        unit = known_kinetic(np.diag(np.eye(self.ndof)[0]))
         return (unit, T.subset(np.arange(T.n) > 0)) if self.ndof > 1 else (unit,)
 
     def separated(self, *potential: Part) -> Model:
@@ -316,7 +318,7 @@ def families(constraints: Constraints, name: str | None) -> list[str]:
         raise ValueError("`drive` is of a separable H: leave out `separable`, or the `family`.")
     if constraints.frequencies and constraints.force is drags:
         raise ValueError("`drive` is learned beside friction, not beside drag: pass damping=True, or leave it out.")
-    if constraints.frequencies and any(not part.kicks for part in constraints.known):
+    if constraints.frequencies and not all(_kicks(part, constraints.ndof) for part in constraints.known):
         raise ValueError("`drive` is of H = ½ pᵀM⁻¹p + V(q, t), which `known` does not fit: leave out one of them.")
     if constraints.inverse_mass is not None and (
         constraints.separable is False or (name and not FAMILIES[name].separable)
@@ -338,6 +340,12 @@ def families(constraints: Constraints, name: str | None) -> list[str]:
     return [name for name, family in kinds.items() if only is None or family.separable == only]
 
 
+def _kicks(part: Fixed, ndof: int) -> bool:
+    """True of a V(q), or a T(p) whose masses are constant."""
+    x = coordinates_of(part.of, ndof)
+    return part.of == "q" or (part.of == "p" and not sympy.hessian(part.expression(part.theta, x), x).free_symbols)
+
+
 def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate | None:
     """The same model with T = ½ p²; None if its T is not learned."""
     parts = candidate.model.parts
@@ -347,7 +355,7 @@ def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate 
         return None
     rest = tuple(part for part in parts if part.of != "p")
     kind = candidate.name.replace("T = ½ pᵀM⁻¹p", "T = ½ p²")
-    return Candidate(kind, replace(candidate.model, parts=(FixedKinetic(np.eye(constraints.ndof)), *rest)))
+    return Candidate(kind, replace(candidate.model, parts=(known_kinetic(np.eye(constraints.ndof)), *rest)))
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:

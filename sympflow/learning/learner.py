@@ -16,8 +16,9 @@ from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.families import Constraints, families
 from sympflow.learning.fitting import LAG, Setting, limit_of, noise_of
+from sympflow.learning.library import Library, Terms, coordinates_of
 from sympflow.learning.models import drags, friction, frictions
-from sympflow.learning.parts import Formula
+from sympflow.learning.parts import Fixed
 from sympflow.learning.search import Search, frequencies_of
 from sympflow.learning.trajectories import FEW, Trajectories, periods_of
 from sympflow.storage.identity import digest
@@ -254,7 +255,7 @@ def _periods(period: Any, d: int) -> np.ndarray:
     return periods
 
 
-def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
+def _formulas(known: Any, d: int) -> tuple[Fixed, ...]:
     """The parts of a system that is a part of H."""
     if not isinstance(known, HamiltonianSystem):
         raise TypeError(f"`known` must be a HamiltonianSystem, a part of H; got {known!r}.")
@@ -264,18 +265,20 @@ def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
             f"`known` must be a symbolic system of {d} degrees of freedom that depends on no time and has no friction: "
             "define it by HamiltonianSystem.from_sympy."
         )
-    q, p = symbols.q, symbols.p
-    parts = [("y", symbols.H, (*q, *p))]
+    parts = [("y", symbols.H)]
     if symbols.V is not None and symbols.T is not None:
-        parts = [("q", symbols.V, q), ("p", symbols.T, p)]
+        parts = [("q", symbols.V), ("p", symbols.T)]
     values = {v: known.params[v.name] for v in symbols.H.free_symbols if v.name in known.params}
-    return tuple(Formula(of, f.subs(values), names) for of, f, names in parts if f.free_symbols & set(names))
+    values |= dict(zip((*symbols.q, *symbols.p), coordinates_of("y", d), strict=True))
+    written = ((of, f.subs(values, simultaneous=True)) for of, f in parts)
+    moving = ((of, Library([f], d)) for of, f in written if f.free_symbols & {*coordinates_of(of, d)})
+    return tuple(Fixed(Terms(library, of), np.ones(1)) for of, library in moving)
 
 
 def _identity(
     data: Trajectories, constraints: Constraints, setting: Setting, options: dict[str, Any]
 ) -> dict[str, Any]:
     """The description that a search must share with the one that it goes on with."""
-    known = [str(part.formula) for part in constraints.known]
+    known = [str(part.expression(part.theta, coordinates_of(part.of, data.ndof))) for part in constraints.known]
     of_data = digest([data, constraints.inverse_mass, constraints.periods, setting.noise])
     return {"config": json.dumps(options), "architecture": json.dumps(known), "system": of_data}

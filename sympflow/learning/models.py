@@ -9,14 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+import sympy
 
 from sympflow.learning.parts import Drive, Linear, Part, Polynomial
-
-if TYPE_CHECKING:
-    import sympy
 
 NEWTON = 8  # steps by which momenta are found of velocities
 
@@ -230,8 +228,6 @@ class Model(VectorField):
 
     def expression(self, theta: np.ndarray) -> sympy.Expr:
         """H in q1 … qd, p1 … pd, or q and p."""
-        import sympy
-
         names = [f"{c}{i + 1}" if self.ndof > 1 else c for c in "qp" for i in range(self.ndof)]
         y = sympy.symbols(names, real=True)
         shares = zip(self.parts, self.places, strict=True)
@@ -271,16 +267,11 @@ class FreeField(VectorField):
     def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         """The vector field."""
         m, N = y.shape
-        rows = theta.reshape(m, -1)
-        powers, K = self.polynomial.tables(y), self.polynomial.n
-        terms = self.polynomial.monomials(powers, self.polynomial.exponents)
-        slopes = np.empty((m, m, N)) if slope else None
-        if slopes is not None:
-            for j in range(m):
-                factor, left = self.polynomial.derivatives[j,]
-                slopes[:, j] = (rows * factor) @ self.polynomial.monomials(powers, left)
+        rows, K = theta.reshape(m, -1), self.polynomial.n
+        terms = self.polynomial.functions(y)
         columns = np.zeros((m, self.n, N)) if by_parameters else None
         if columns is not None:
             for i in range(m):
                 columns[i, i * K : (i + 1) * K] = terms
+        slopes = np.stack([rows @ by for by in self.polynomial.derivatives(y)[0]], axis=1) if slope else None
         return Linear(rows @ terms, slopes, columns)

@@ -299,7 +299,7 @@ class Search:
         smooth = sample(self.folds[0][0])
         queue = [(family.linear, [c for one in of for c in self._sparse(one, smooth)]) for family, of in groups]
         linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
-        drives = ()
+        drives: tuple[Drive, ...] = ()
         if not (self.constraints.frequencies or self.data.velocities or self.late()):
             drives = self._drives()
         models = [candidate.model for candidate in linear]
@@ -607,7 +607,8 @@ class Search:
         domain: Domain
         domain, states = self._domain()
         energies = model.hamiltonian(found.theta, states.T)
-        start, options = 0.0, {}
+        start = 0.0
+        options: dict[str, Any] = {}
         frequencies = model.frequencies(found.theta)
         if frequencies:
             period = 2 * math.pi / frequencies[0] if len(frequencies) == 1 else None

@@ -16,7 +16,7 @@ from sympflow.learning.learner import MOST_VALUES, _constraints, _cut, _divided,
 from sympflow.learning.library import Library, Terms
 from sympflow.learning.models import Model, drags, friction
 from sympflow.learning.orbits import Gauss, Method, first_states
-from sympflow.learning.parts import Distances, Drive, FixedKinetic, Formula, Kinetic, Network, Polynomial, Waves
+from sympflow.learning.parts import Distances, Drive, Fixed, Network, Polynomial, Waves, kinetic, known_kinetic
 from sympflow.learning.search import Replicas, Search, replica, without_growth
 from sympflow.learning.shooting import Problem, chosen_method, matched, minimized
 from sympflow.learning.trajectories import Trajectories
@@ -43,7 +43,7 @@ def trajectories(n, points, rate=0.0, noise=0.0, span=2.0, seed=0):
 
 def quartic(data, force=None):
     q, p = data.scales
-    return Model(1, (Kinetic([p]), Polynomial.up_to(4, "q", [q])), force)
+    return Model(1, (kinetic([p]), Polynomial.up_to(4, "q", [q])), force)
 
 
 def problem(model, data, sigma, **options):
@@ -132,7 +132,7 @@ def test_noise_and_standard_errors_are_those_of_the_data():
     deviations, sigmas = [], []
     for seed in range(6):
         data = Trajectories.read(trajectories(8, 15, noise=0.02, seed=seed))
-        model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+        model = Model(1, (known_kinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
         theta, fit = problem(model, data, np.full(2, 0.02))
         found = minimized(fit, theta, first_states(data))
         deviations.append((found.theta - [STIFF / 2, QUARTIC / 4]) / np.sqrt(np.diag(found.covariance())))
@@ -178,7 +178,8 @@ PARTS = [
     Distances.between(np.array([[0], [1]]), (-2, 0, 1), 1.3),
     Distances(np.array([[0, 1]]), [(0, None, -1), (0, None, 0), (0, None, 3)], 1.3),
     Inertia(Waves.up_to(1, 1, "q", np.ones(1), np.array([2 * np.pi]), constant=True)),
-    Formula("q", sympy.sin(Q[0]) * Q[1] ** 2, Q),
+    Fixed(Terms(Library([sympy.sin(Q[0]) * Q[1] ** 2], 2), "q"), np.ones(1)),
+    kinetic([1.3, 0.9]),
     Terms(Library([Q[0] ** 2 * Q[1], sympy.cos(Q[0] - Q[1]), 1 / Q[1]], 2), "q"),
     Terms(Library([Q[0] ** 2, Q[0] * Q[1]], 2), "q"),
 ]
@@ -209,7 +210,7 @@ def test_a_fit_ends_within_an_orbit_when_its_time_is_up(part):
     """At any step: the time is asked for at every point of the orbits, and what was fitted is kept."""
     t = np.linspace(0, 20, 101)
     data = Trajectories.read([(t, np.stack([a * np.cos(t), np.sin(t), -a * np.sin(t), np.cos(t)])) for a in (0.5, 1)])
-    model, asked = Model(2, (Kinetic([1.0, 1.0]), part)), []
+    model, asked = Model(2, (kinetic([1.0, 1.0]), part)), []
     for most in (0, 3, 40, 400):
         asked.clear()
 
@@ -505,7 +506,7 @@ def test_orbits_that_diverge_are_left_out_of_the_region_of_a_flow():
 
 def test_replicas_tell_how_certain_a_prediction_is():
     data = Trajectories.read(trajectories(8, 15, noise=0.02))
-    model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+    model = Model(1, (known_kinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
     found = fitted(model, data, Setting())
     thetas = np.stack([replica((model, data, Setting(), found.theta, 0), k) for k in range(6)])
     replicas = Replicas(model, found.method, found.theta, thetas, 8)
@@ -525,7 +526,7 @@ def test_bands_cover_the_truth_as_often_as_they_say():
     times = np.linspace(0, 4, 5)
     field = lambda t, y: [y[1] / MASS, -STIFF * y[0] - QUARTIC * y[0] ** 3]  # noqa: E731
     true = solve_ivp(field, (0, 4), [0.5, 0.0], t_eval=times, rtol=1e-12, atol=1e-13).y
-    model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+    model = Model(1, (known_kinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
     inside = []
     for seed in range(20):
         data = Trajectories.read(trajectories(9, 15, noise=0.05, seed=seed))
@@ -585,7 +586,7 @@ def test_chaotic_trajectories_are_followed_in_pieces():
     t = np.linspace(0, 100, 251)
     y = sympflow.solve(system, "kahan_li8", (0, 100), y0, t_eval=t, dt=0.05).y
     data = Trajectories.read((t, y + 5e-3 * np.random.default_rng(0).normal(size=y.shape)))
-    model = Model(2, (FixedKinetic(np.eye(2)), Polynomial("q", [[2, 0], [0, 2], [2, 1], [0, 3]], [1.0, 1.0])))
+    model = Model(2, (known_kinetic(np.eye(2)), Polynomial("q", [[2, 0], [0, 2], [2, 1], [0, 3]], [1.0, 1.0])))
     found = fitted(model, data, Setting())
     assert 5 < found.span < 50
     errors = np.sqrt(np.diag(found.fit.covariance()))
@@ -596,7 +597,7 @@ def test_chaotic_trajectories_are_followed_in_pieces():
 def test_residuals_beyond_the_noise_of_the_data_are_not_explained():
     """Silent residuals of a model that fits nothing, as of pieces too short to tell, count by their size."""
     data = Trajectories.read(trajectories(4, 16, noise=0.01))
-    wrong = Model(1, (FixedKinetic(np.eye(1)), Polynomial("q", [[2]], [1.0])))
+    wrong = Model(1, (known_kinetic(np.eye(1)), Polynomial("q", [[2]], [1.0])))
     setting = Setting(seen=data.smooth.sigma)
     held = left_out(fitted(wrong, data, setting), data.folds(), setting)
     assert len(held.losses) == 4
@@ -641,7 +642,7 @@ def test_networks_grow_no_steps():
     runs = [(np.linspace(0, 1, 41), np.stack([q, np.sign(q + shift)])) for shift in (0.0, 0.01)]
     data = Trajectories.read(runs)
     network = Network("q", 3, data.scales[:1])
-    model = Model(1, (FixedKinetic(np.eye(1)), network))
+    model = Model(1, (known_kinetic(np.eye(1)), network))
     theta = matched(model, model.start(np.random.default_rng(0)), data, 1 / data.scales, 60)
     a = np.abs(theta[3:])
     assert a.max() < 40
