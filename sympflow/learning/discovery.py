@@ -9,7 +9,6 @@ Bayesian criterion decides, which counts how many terms there were to choose fro
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -18,7 +17,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import plain, real_number, warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -27,8 +26,8 @@ from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.orbits import Method
 from sympflow.learning.reading import Run
-from sympflow.learning.regression import Regression
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
+from sympflow.learning.smoothing import Smooth
 from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
 from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
@@ -76,8 +75,96 @@ STARTS = 4
 """Regressions from which the search begins at most."""
 HIGHEST = 30
 """Degree of polynomials, at most."""
+CORRELATED = 4
+"""Smoothed slopes that count as one, for their errors are correlated."""
 OF_A_FLOW = 5.0
 """Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are no noise."""
+
+
+class Regression:
+    """y ≈ X θ for few of the columns of X (n, K), of whose n errors some count as independent."""
+
+    def __init__(self, X: np.ndarray, y: np.ndarray, independent: float) -> None:
+        self.lengths = np.linalg.norm(X, axis=0)
+        self.lengths[self.lengths == 0] = 1.0
+        X = X / self.lengths
+        self.G, self.b, self.yy = X.T @ X, X.T @ y, float(y @ y)
+        self.n = independent
+        self.count = len(y)
+
+    @classmethod
+    def of_slopes(cls, library: Library, smooth: Smooth, scales: np.ndarray) -> Regression:
+        """ẋ ≈ Σ θ_k J∇f_k(x) at smoothed states, each coordinate in its spread."""
+        X = library.fields(smooth.points) / scales[:, None]
+        y = (smooth.slopes / scales).ravel()
+        return cls(X.reshape(len(y), -1), y, len(y) / CORRELATED)
+
+    @classmethod
+    def of_values(cls, library: Library, x: np.ndarray, values: np.ndarray) -> Regression:
+        """H ≈ Σ θ_k f_k + const at states x."""
+        X = library.values(x)
+        return cls(X - X.mean(0), values - values.mean(), len(values))
+
+    def _solve(self, active: list[int]) -> tuple[np.ndarray, float]:
+        theta = np.linalg.lstsq(self.G[np.ix_(active, active)], self.b[active], rcond=1e-13)[0]
+        left = self.yy - 2 * theta @ self.b[active] + theta @ self.G[np.ix_(active, active)] @ theta
+        return theta, max(float(left), 1e-16 * self.yy)
+
+    def coefficients(self, active: list[int]) -> np.ndarray:
+        return self._solve(active)[0] / self.lengths[active]
+
+    def errors(self, active: list[int]) -> np.ndarray:
+        """Standard errors of the coefficients."""
+        variance = self._solve(active)[1] / max(self.n - len(active), 1)
+        return np.sqrt(variance * np.diag(np.linalg.pinv(self.G[np.ix_(active, active)]))) / self.lengths[active]
+
+    def misfit(self, active: list[int]) -> float:
+        """Root mean square of what is left."""
+        return math.sqrt(self._solve(active)[1] / self.count)
+
+    def criterion(self, active: list[int]) -> float:
+        penalty = math.log(max(self.n, 3)) + 2 * math.log(len(self.b))
+        return self.n * math.log(self._solve(active)[1] / self.yy) + len(active) * penalty
+
+    def forward(self, most: int, among: Sequence[int] | None = None) -> list[int]:
+        """Terms added one at a time, each the one that leaves least, and dropped again while the criterion falls."""
+        active: list[int] = []
+        usable = range(len(self.b)) if among is None else among
+        for _ in range(min(most, len(usable))):
+            wider = min(([*active, k] for k in usable if k not in active), key=lambda a: self._solve(a)[1])
+            if active and self.criterion(wider) >= self.criterion(active):
+                break
+            active = wider
+            while len(active) > 1:
+                fewer = self._fewer(active)
+                if self.criterion(fewer) >= self.criterion(active):
+                    break
+                active = fewer
+        return active
+
+    def backward(self, most: int, among: Sequence[int] | None = None) -> list[int]:
+        """Terms dropped one at a time from all of them, while the criterion falls or there are more than `most`."""
+        active = [*range(len(self.b))] if among is None else [*among]
+        while len(active) > 1:
+            theta, _ = self._solve(active)
+            inverse = np.linalg.pinv(self.G[np.ix_(active, active)], rcond=1e-13)
+            least = int(np.argmin(theta**2 / np.maximum(np.diag(inverse), 1e-300)))
+            fewer = active[:least] + active[least + 1 :]
+            if len(active) <= most and self.criterion(fewer) >= self.criterion(active):
+                break
+            active = fewer
+        return active
+
+    def _fewer(self, active: list[int]) -> list[int]:
+        """The model without the term that is missed least."""
+        return min(([j for j in active if j != k] for k in active), key=lambda a: self._solve(a)[1])
+
+    def nested(self, active: list[int]) -> list[list[int]]:
+        """Models of one term to all, each with one dropped from the next."""
+        path = [active]
+        while len(path[0]) > 1:
+            path.insert(0, self._fewer(path[0]))
+        return path
 
 
 @dataclass(frozen=True)
@@ -317,7 +404,7 @@ def discover(
     scene = {"domain": domain or around, "y0": trajectories.states[0]}
     system = _system(discovery, trajectories.ndof, name=name, t_span=(0.0, first.span), dt=STEP / search.rate, **scene)
     if discovery.remark:
-        warnings.warn(discovery.remark, stacklevel=3)
+        warn(discovery.remark)
     return system
 
 
@@ -830,5 +917,5 @@ def _of_flow(
     )
     system = _system(discovery, flow.ndof, name=name, domain=found, y0=x[0], dt=flow.dt / 10)
     if not explains:
-        warnings.warn(remark, stacklevel=4)
+        warn(remark)
     return system

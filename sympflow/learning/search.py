@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from sympflow.arguments import floats
+from sympflow.arguments import floats, warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
@@ -32,6 +32,7 @@ from sympflow.learning.fitting import (
     judged,
     kept,
     left_out,
+    refitted,
     restored,
 )
 from sympflow.learning.lagrangian import told
@@ -152,11 +153,9 @@ def without_growth(found: Fitted) -> Fitted:
     errors = np.sqrt(np.diag(covariance))
     worst = int(np.argmin(np.where(growing, theta / errors, np.inf)))
     if theta[worst] < -GROWS * errors[worst]:
-        warnings.warn(
+        warn(
             f"`damping` is {theta[worst]:.2g} ± {errors[worst]:.1g} by the data, whose energy grows: it is taken as 0. "
-            "Look at the order of the times and the sign of the momenta, or leave `damping` out.",
-            UserWarning,
-            stacklevel=5,
+            "Look at the order of the times and the sign of the momenta, or leave `damping` out."
         )
     moved = covariance[:, growing] @ np.linalg.pinv(covariance[np.ix_(growing, growing)]) @ theta[growing]
     return replace(found, theta=np.where(growing, 0.0, theta - moved))
@@ -283,7 +282,7 @@ class Search:
         candidate, self.final, _ = self.winner
         if not deadline.over():
             smooth = replace(setting, seen=None) if self.winner[2].lag else setting
-            found = fitted(candidate.model, self.whole or self.all, smooth, self.final)
+            found = refitted(self.final, self.whole or self.all, smooth, longer=True)
             shorter = found.span < self.final.span or not math.isfinite(found.fit.cost)
             self.final = self.final if setting.stop() and shorter else found
         self.final = without_growth(self.final)
@@ -439,22 +438,18 @@ class Search:
         if held.explained:
             share = float(np.min(self.winner[1].sigma / self.data.scales))
             if share > SILENT:
-                warnings.warn(
+                warn(
                     f"The best model, {candidate.name}, explains next to nothing: the noise that it leaves is "
                     f"{share:.0%} of the spread of every coordinate or more. Points may be in no order, of other "
-                    "trajectories or too far apart; else there is only noise.",
-                    UserWarning,
-                    stacklevel=4,
+                    "trajectories or too far apart; else there is only noise."
                 )
             elif self.unseen:
-                warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
+                warn(remark_on(self.unseen))
             return
         if not math.isfinite(held.loudness):
-            warnings.warn(
+            warn(
                 f"The time budget ended before the best model, {candidate.name}, was compared with held-out "
-                "trajectories: give it more.",
-                UserWarning,
-                stacklevel=4,
+                "trajectories: give it more."
             )
             return
         said = (
@@ -475,7 +470,7 @@ class Search:
                     f"{free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
                 )
             if free.remedy:
-                warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=4)
+                warn(f"{said} {free.remedy}")
                 return
         smooth = self._whole(self.data).smooth
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
@@ -484,7 +479,7 @@ class Search:
         library = library_for(None, self.data.ndof, 4, smooth.points)[0]
         drives = [self.constraints.driven(w) for w in candidate.model.frequencies(self.winner[1].theta)]
         found = hint(library, smooth, self.data, self.constraints.force, drives)
-        warnings.warn(f"{said} {found or otherwise}", UserWarning, stacklevel=4)
+        warn(f"{said} {found or otherwise}")
 
     def freedom(self, setting: Setting) -> Freedom | None:
         """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
@@ -540,11 +535,7 @@ class Search:
             if len(thetas) > 1 and session.deadline.over():
                 break
         if len(thetas) < n:
-            warnings.warn(
-                f"The time budget ended the bootstrap after {len(thetas)} of {n} replicas: bands are rough.",
-                UserWarning,
-                stacklevel=4,
-            )
+            warn(f"The time budget ended the bootstrap after {len(thetas)} of {n} replicas: bands are rough.")
         return Replicas(model, self.final.method, self.final.theta, np.stack(thetas), len(self.all.runs))
 
     # the flow ---------------------------------------------------------------------------------------------------------
@@ -650,17 +641,15 @@ class Search:
         if system.separable and system.autonomous and self._is_worse(flow):
             flow, told = self._collocated(system, dt), []
         for warning in told:
-            warnings.warn(str(warning.message), warning.category, stacklevel=3)
+            warn(str(warning.message), warning.category)
         flow.figures = {**flow.figures, **self.figures(flow.dt)}
         whole = system.autonomous and not isinstance(system, DoubledSystem)
         flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole and not session.deadline.over() else None
         if self._is_worse(flow):
             error, noise = flow.figures["one_step_error"], flow.figures["noise"]
-            warnings.warn(
+            warn(
                 f"The flow is worse than the H that was learned: its one-step error is {error:.1e}, the noise "
-                f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme.",
-                UserWarning,
-                stacklevel=4,
+                f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme."
             )
         flow.history = self.history
         physical = system.physical if isinstance(system, DoubledSystem) else system
@@ -702,7 +691,7 @@ class Search:
             except ValueError as error:
                 if dt is None:
                     raise
-                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+                warn(f"{error} The flow that was made has its own.")
             return train(system, None, progress=session.progress, seed=self.seed, **options)
 
     def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
@@ -718,7 +707,7 @@ class Search:
             try:
                 return SympFlow.collocated(system, dt=dt, states=states)
             except ValueError as error:
-                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+                warn(f"{error} The flow that was made has its own.")
         return SympFlow.collocated(system, dt=step, states=states)
 
     def _is_worse(self, flow: FlowMap) -> bool:

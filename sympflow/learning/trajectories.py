@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_ASKED_VALUES, floats, plain, real_number
+from sympflow.arguments import MAX_ASKED_VALUES, floats, plain, real_number, warn
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.reading import (
     OBSERVED,
@@ -297,11 +296,9 @@ class Trajectories(Shown):
                     "machine: give `units`, or numbers nearer to 1."
                 )
             if seen.size and abs(seen.mean()) > FAR * seen.std() > 0:
-                warnings.warn(
+                warn(
                     f"`trajectories` have {name} about {seen.mean():.3g}, {abs(seen.mean()) / seen.std():.1g} times "
-                    "its spread, by which powers of it lose their digits: subtract that from it.",
-                    UserWarning,
-                    stacklevel=4,
+                    "its spread, by which powers of it lose their digits: subtract that from it."
                 )
 
     def split(self, share: float = 0.2, seed: int = 0) -> tuple[Trajectories, Trajectories]:
