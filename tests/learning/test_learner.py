@@ -428,11 +428,11 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sympflow.learn(runs, dt=0.5, checkpoint=path, callback=interrupt)
+        sympflow.learn(runs, dt=0.5, family="polynomial", checkpoint=path, callback=interrupt)
     data = Trajectories.read(runs)
     search = Search(data, data.folds(0.2, 0), _constraints(data, None, None, False, None, None), Setting(), 0)
     with pytest.raises(ValueError, match="`resume` is a run with another"):
-        sympflow.learn(trajectories(6, 12, noise=0.02), dt=0.5, resume=path)
+        sympflow.learn(trajectories(6, 12, noise=0.02), dt=0.5, family="polynomial", resume=path)
     state = checkpoints.read(path)
     assert state["step"] == 2
     name, numbers = next(iter(state["optimizer"].items()))
@@ -459,11 +459,18 @@ T = np.linspace(0, 10, 51)
 CLOCKS = {
     "drive": (lambda t, q, p: [p, -q - q**3 + 0.3 * np.cos(1.7 * t)], r"drive=1\.(69|70)", {"drive": True}),
     "stiffness": (lambda t, q, p: [p, -(1 + 0.3 * np.cos(2.3 * t)) * q], r"drive=2\.(29|30)", {"drive": 2.3}),
+    "two drives": (
+        lambda t, q, p: [p, -q + 0.3 * np.cos(1.7 * t) + 0.2 * np.sin(2.9 * t)],
+        r"drive=\[1\.(69|70)\d*, 2\.(89|90)",
+        {"drive": True},
+    ),
     "drag": (lambda t, q, p: [p, -q - q**3 - 0.3 * abs(p) * p], 'damping="quadratic"', {"damping": "quadratic"}),
 }
 
 
-@pytest.fixture(scope="module", params=["drive", pytest.param("stiffness", marks=pytest.mark.slow), "drag"])
+@pytest.fixture(
+    scope="module", params=["drive", pytest.param("stiffness", marks=pytest.mark.slow), "two drives", "drag"]
+)
 def forced(request):
     """Noisy trajectories of what no H(q, p) explains, with the remedy that a warning names."""
     field, remedy, options = CLOCKS[request.param]
