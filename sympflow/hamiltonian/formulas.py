@@ -172,7 +172,7 @@ class TracedHamiltonian:
             symbols = SymbolicHamiltonian(in_symbols(self.H.program), time="t" if self.time else None)
         except (NotRecorded, ValueError, TypeError):
             return None
-        return symbols if (symbols.ndof, symbols.separable) == (self.ndof, self.separable) else None
+        return symbols if symbols.ndof == self.ndof and symbols.separable >= self.separable else None
 
     @cached_property
     def size(self) -> int:

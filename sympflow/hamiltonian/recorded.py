@@ -11,6 +11,7 @@ from typing import Any
 import sympy as sp
 from sympy.core.relational import Relational
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
 from sympflow.compiler.program import Program, Traced
 from sympflow.hamiltonian.removable import sinc
@@ -18,7 +19,7 @@ from sympflow.hamiltonian.removable import sinc
 __all__ = ["NotRecorded", "calculated", "can_be_recorded", "check_recorded", "in_symbols"]
 
 
-class NotRecorded(ValueError):
+class NotRecorded(NotCompiled):
     """A function in an expression is in no table of the compiler."""
 
 
@@ -115,7 +116,7 @@ def check_recorded(f: sp.Expr) -> None:
     """Raise a ValueError with the term of an expression of which `calculated` has no rule for a function."""
     for term in sp.Add.make_args(f):
         if not can_be_recorded(term):
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` has the term {term}, for which there is no compiled function: use backend='array'."
             )
 

@@ -259,6 +259,10 @@ class SymbolicHamiltonian(Definition):
         return any(each.at_root or len(each.times(-FAR, FAR, FAR / MOST_POINTS)) for each in self._switches)
 
     @cached_property
+    def may_jump(self) -> bool:  # type: ignore[override]
+        return bool(self.samples or self._switches)
+
+    @cached_property
     def _switches(self) -> list[Switch]:
         """Borders at which H may jump in t alone."""
         if self.time is None:

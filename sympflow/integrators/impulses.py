@@ -26,7 +26,7 @@ def landings(
     integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True
 ) -> tuple[str, list[float]]:
     """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut."""
-    if system.autonomous or not math.isfinite(t1) or t0 == t1:
+    if not system.definition.may_jump or not math.isfinite(t1) or t0 == t1:
         return "", []
     dt, label = integrator.step_length(system), integrator.label if integrator.forces_at_ends(system) else None
     step, said = (dt or system.dt) / 4, ""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import INT, Rows, Value
 from sympflow.compiler.functions import is_zero
@@ -188,7 +189,7 @@ class Terms:
         """The terms, refused where the formulas of all kinds have too many operations."""
         n = sum(4 * sp.count_ops(family.f) for family in self._families)
         if n > MOST_COMPILED:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` has so many terms of different kinds, about {n:,} operations, that it is not compiled. Give "
                 "it by Numba functions that loop over its terms: HamiltonianSystem(V, ndof=…, gradient=…, "
                 "hessian_vector=…), or use backend='array'."
