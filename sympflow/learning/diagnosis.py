@@ -18,12 +18,10 @@ from sympflow.learning.parts import Drive, Polynomial
 from sympflow.learning.smoothing import Smooth
 from sympflow.learning.trajectories import Trajectories
 
-BETTER = 0.5
-"""Share of the misfit that another reading of the data must leave at most, to be worth a word."""
+BETTER = 0.5  # Share of the misfit that another reading of the data must leave at most, to be worth a word
 MUCH_BETTER = 0.1
 """The same of a vector field that is not Hamiltonian: a sum that has more terms leaves less by itself."""
-ALIKE = 1.2
-"""Factor by which a reading may leave more than the best, and is named if it stands before it."""
+ALIKE = 1.2  # Factor by which a reading may leave more than the best, and is named if it stands before it
 FRICTION = (
     "Friction p' = -γp with γ = {} would leave much less: the data are dissipative, areas of phase space shrink as "
     "exp(-γt), and no symplectic map explains them. Learn a flow with damping."
@@ -42,12 +40,10 @@ NOT_HAMILTONIAN = (
     "A vector field of cubic polynomials that is not Hamiltonian fits much better: the data are no motion of a "
     "Hamiltonian in these coordinates, or these are not canonical."
 )
-PER_NUMBER = 4
-"""Values of half of the trajectories that there are at least for a number of a fit with a drive."""
+PER_NUMBER = 4  # Values of half of the trajectories that there are at least for a number of a fit with a drive
 FREQUENCIES = 1000
 """Halves of the angular frequency π over the longest time, up to which that of a drive is looked for."""
-MOST_SLOPES = 3000
-"""Points by which reasons are looked for."""
+MOST_SLOPES = 3000  # Points by which reasons are looked for
 MOST_DRIVES, SWEEPS = 2, 2
 """Drives that are looked for, and how often the frequency of each is refined beside the others."""
 

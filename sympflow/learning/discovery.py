@@ -37,46 +37,28 @@ from sympflow.training.session import Session
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RADIANS = 6.0
-"""Length of the pieces that are shot through, in the mean angular rate of the data: about one period."""
+RADIANS = 6.0  # Length of the pieces that are shot through, in the mean angular rate of the data: about one period
 FLOOR = 1e-6
 """Least noise, over the spread of a coordinate: below it a formula would explain the errors of the scheme."""
-STEP = 0.1
-"""Step of the system that is made, in the mean angular rate of the data."""
-STEP_SHARE = 0.02
-"""Error of the scheme from one point to the next, over the noise."""
-STEPS = 40
-"""Most steps of a fit."""
-SETTLED = 0.05
-"""Change of the noise, relative, that ends its estimation."""
-CONVERGED = 1e-7
-"""Decrease of the squares, relative, at which a fit ends."""
-UNEXPLAINED = 1.3
-"""Residual over the noise from which a model does not explain the data."""
-QUIET = 0.5
-"""Residual over the noise that was given, below which that is too large."""
-LOUD = 1.5
-"""Residual over the noise that is seen without a model, up to which that may be all."""
-BEYOND = 2
-"""Terms by which the path goes on beyond the model that is chosen."""
-WORTH = 0.5
-"""Gain of a term by the linear model, over its penalty, from which it is tried."""
-DOUBTED = 8
-"""Most terms of the only model that is fitted where no H explains the data."""
-SKETCHED = 8
-"""Steps of the fits of models on the path with fewer terms than the one that was chosen."""
+STEP = 0.1  # Step of the system that is made, in the mean angular rate of the data
+STEP_SHARE = 0.02  # Error of the scheme from one point to the next, over the noise
+STEPS = 40  # Most steps of a fit
+SETTLED = 0.05  # Change of the noise, relative, that ends its estimation
+CONVERGED = 1e-7  # Decrease of the squares, relative, at which a fit ends
+UNEXPLAINED = 1.3  # Residual over the noise from which a model does not explain the data
+QUIET = 0.5  # Residual over the noise that was given, below which that is too large
+LOUD = 1.5  # Residual over the noise that is seen without a model, up to which that may be all
+BEYOND = 2  # Terms by which the path goes on beyond the model that is chosen
+WORTH = 0.5  # Gain of a term by the linear model, over its penalty, from which it is tried
+DOUBTED = 8  # Most terms of the only model that is fitted where no H explains the data
+SKETCHED = 8  # Steps of the fits of models on the path with fewer terms than the one that was chosen
 HOPELESS = 10.0
 """Criterion for each value, above that of the chosen model, at which the path ends: a residual 150 times as large."""
-MOST_VALUES = 20_000
-"""Values to which models are fitted on the way; the one that is chosen is fitted to all."""
-COMPARED = 2000
-"""States over which terms are compared, and of a flow's Hamiltonian."""
-STARTS = 4
-"""Regressions from which the search begins at most."""
-HIGHEST = 30
-"""Degree of polynomials, at most."""
-CORRELATED = 4
-"""Smoothed slopes that count as one, for their errors are correlated."""
+MOST_VALUES = 20_000  # Values to which models are fitted on the way; the one that is chosen is fitted to all
+COMPARED = 2000  # States over which terms are compared, and of a flow's Hamiltonian
+STARTS = 4  # Regressions from which the search begins at most
+HIGHEST = 30  # Degree of polynomials, at most
+CORRELATED = 4  # Smoothed slopes that count as one, for their errors are correlated
 OF_A_FLOW = 5.0
 """Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are no noise."""
 

@@ -26,15 +26,13 @@ WIDTHS = (6, 12, 24)
 WHOLE_WIDTHS = (12, 24, 40)
 FLOW_SIZES = ((2, 6, False), (2, 6, True), (3, 10, True), (5, 12, True))
 """Pairs of layers, of half of them where it is palindromic, neurons of each, and True for palindromic SympFlows."""
-POWERS = ((-1,), (-2, -1, 0, 1, 2))
-"""Powers of distances, 0 for the logarithm."""
+POWERS = ((-1,), (-2, -1, 0, 1, 2))  # Powers of distances, 0 for the logarithm
 CHANGING = 0.5
 """Variance of the total momentum along a trajectory, over the sum of those of its parts, where it is not constant."""
 MOST_TERMS = 400
 ASSUMED = {"radians": 2 * np.pi, "degrees": 360.0}
 """Periods of angles that are tried where none is known."""
-FLAT = 0.02
-"""Spread of an angle, over its period, from which its cosine is told from a parabola."""
+FLAT = 0.02  # Spread of an angle, over its period, from which its cosine is told from a parabola
 
 
 @dataclass(frozen=True)

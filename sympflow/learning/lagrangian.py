@@ -18,14 +18,11 @@ from sympflow.learning.parts import Network, Part, Polynomial
 from sympflow.learning.reading import Run
 from sympflow.learning.trajectories import Trajectories
 
-POINTS = 24
-"""Number of points of a piece along which p is followed."""
+POINTS = 24  # Number of points of a piece along which p is followed
 STEPS, HALVINGS, SETTLED = 12, 6, 1e-2
 """Gauss–Newton steps for masses, halvings of one, and the gain of a step that ends them."""
-CORRELATED = 4
-"""Residuals along smooth curves that count as one."""
-DEGREE = 4
-"""Degree of the polynomial in place of a potential that is not linear in its numbers."""
+CORRELATED = 4  # Residuals along smooth curves that count as one
+DEGREE = 4  # Degree of the polynomial in place of a potential that is not linear in its numbers
 
 
 def lagrangian_start(model: Model, data: Trajectories, theta: np.ndarray) -> tuple[np.ndarray, Trajectories]:

@@ -21,8 +21,7 @@ from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.learning.models import VectorField
 from sympflow.learning.orbits import Orbit, Over, Stepper
 
-ON_TIME = 1e-9
-"""Share of Δt by which a time may exceed it and still counts as Δt."""
+ON_TIME = 1e-9  # Share of Δt by which a time may exceed it and still counts as Δt
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,10 @@ import numpy as np
 
 from sympflow.learning.reading import Run
 
-FEWEST = 6
-"""Points of a coordinate from which a curve is made; with fewer there are differences."""
+FEWEST = 6  # Points of a coordinate from which a curve is made; with fewer there are differences
 WIDTHS = (5, 7, 9, 13, 19, 27, 39, 55)
 """Points of the windows in which a polynomial is fitted, for the value and the slope in their middle."""
-WINDOW, DEGREE = 6, 3
-"""Points of a window from which the noise is estimated, and the degree of all polynomials."""
+WINDOW, DEGREE = 6, 3  # Points of a window from which the noise is estimated, and the degree of all polynomials
 
 
 @dataclass(frozen=True)

@@ -28,25 +28,19 @@ from sympflow.learning.shooting import increments_left, matched
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training.least_squares import Stop, never
 
-DEGREES = (1, 2, 3)
-"""Degrees of the polynomial fields that need not be Hamiltonian."""
+DEGREES = (1, 2, 3)  # Degrees of the polynomial fields that need not be Hamiltonian
 DOUBTFUL, DAMPED = 0.6, 0.9
 """Share of the squares of increments, left by another reading of the data, or by forces beside those of H, below which
 orbits are to decide."""
 PLAINER = 1.5
 """Factor by which friction or another order of columns may leave more than a field without any structure, and one that
 stands before another in the list may leave more."""
-POINTS = 24
-"""Number of points of a piece whose increments are compared."""
-LONG = 10
-"""Such pieces in a part of a trajectory that is smoothed."""
-COMPARED = 2000
-"""Points of trajectories that are compared."""
-PER_NUMBER = 3.0
-"""Values that there are at least for a number of a model."""
+POINTS = 24  # Number of points of a piece whose increments are compared
+LONG = 10  # Such pieces in a part of a trajectory that is smoothed
+COMPARED = 2000  # Points of trajectories that are compared
+PER_NUMBER = 3.0  # Values that there are at least for a number of a model
 MOST_NUMBERS = 400
-LIKELY = 8
-"""Models beside which forces are tried."""
+LIKELY = 8  # Models beside which forces are tried
 
 
 class Cause(Enum):
