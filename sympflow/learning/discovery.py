@@ -9,6 +9,7 @@ Bayesian criterion decides, which counts how many terms there were to choose fro
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -17,7 +18,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import plain, real_number, warn
+from sympflow.arguments import check_positive, checked_count, checked_number, plain, warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -363,18 +364,14 @@ def discover(
     trajectories.check_moving()
     period = reading.get("period")
     trajectories.check_angles(None if period is None else np.isinf(periods_of(period, trajectories.ndof)))
-    if not (real_number(held_out) and 0 <= held_out < 1):
-        raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
-    if piece is not None and not (real_number(piece) and piece > 0):
-        raise ValueError(f"`piece` must be a positive time; got {piece!r}: leave it out for about one period.")
+    checked_number("held_out", held_out, "at least 0 and less than 1, as 0.2", lambda share: 0 <= share < 1)
+    if piece is not None:
+        check_positive("piece", piece)
     if progress is not None and not callable(progress):
         raise TypeError(f"`progress` must be a function of a line of text; got {progress!r}: leave it out.")
-    degree, most_terms, seed = plain(degree), plain(most_terms), plain(seed)
-    for argument, value, least in (("degree", degree, 1), ("most_terms", most_terms, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(f"`{argument}` must be an integer, {least} or more; got {value!r}.")
-    if degree > HIGHEST:
-        raise ValueError(f"`degree` must be at most {HIGHEST}; got {degree!r}: give other `terms`.")
+    degree = checked_count("degree", plain(degree), 1, HIGHEST, f"an integer from 1 to {HIGHEST}")
+    most_terms = checked_count("most_terms", plain(most_terms), 1, sys.maxsize, "an integer, 1 or more")
+    seed = checked_count("seed", plain(seed), 0, sys.maxsize, "an integer, 0 or more")
     huber = limit_of(loss)
     say = progress or (lambda _: None)
     search = _Search(trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, say, session)

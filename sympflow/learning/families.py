@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy
@@ -69,11 +69,12 @@ class Constraints:
     def groups(self, name: str) -> Iterator[Group]:
         """The models of a family, and the same where q would be angles that nobody told of."""
         family, d = FAMILIES[name], self.ndof
-        yield family, [*family.models(self)]
+        yield Group(family, [*family.models(self)])
         for said, period in () if self.angles_known or not family.angular else ASSUMED.items():
             if ((self.scales[:d] > FLAT * period) & (self.scales[:d] < period)).all():
                 wrapped = replace(self, periods=np.where(np.arange(2 * d) < d, period, np.inf), angles_known=True)
-                yield family, [replace(c, kind=f"{c.kind}, q angles in {said}") for c in family.models(wrapped)]
+                models = (replace(c, kind=f"{c.kind}, q angles in {said}") for c in family.models(wrapped))
+                yield Group(family, [*models], assumed=True)
 
     def at_rest(self, bodies: np.ndarray) -> bool:
         """True unless the total momentum of bodies (n, dim) is seen to change, as it cannot by forces between them."""
@@ -276,8 +277,14 @@ class Family:
         return self.observed in ("both", "qv" if constraints.velocities else "qp")
 
 
-Group = tuple[Family, list[Candidate]]
-"""A family with its models, or some of them."""
+class Group(NamedTuple):
+    """The models of a family."""
+
+    family: Family
+    models: list[Candidate]
+    assumed: bool = False  # True where q would be angles, which nobody told
+
+
 FAMILIES = {
     "central": Family(True, _central),
     "pairs": Family(True, _pairs),

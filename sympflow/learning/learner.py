@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, floats, plain
+from sympflow.arguments import check_dt, check_flag, checked_count, floats, plain
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.families import Constraints, families
@@ -143,9 +144,11 @@ def learn(
     data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()
     data.check_angles(None if period is None else np.isinf(periods_of(period, data.ndof)))
-    seed, damping, drive, replicas = plain(seed), plain(damping), plain(drive), plain(replicas)
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
+    damping, drive, dt, count = plain(damping), plain(drive), plain(dt), "an integer, 0 or more"
+    seed = checked_count("seed", plain(seed), 0, sys.maxsize, count)
+    replicas = checked_count("replicas", plain(replicas), 0, sys.maxsize, count)
+    if replicas == 1:
+        raise ValueError("`replicas` must be 0, or 2 or more; got 1: 20 give useful bands.")
     constraints = _constraints(data, separable, mass, damping, period, known)
     frequencies = () if isinstance(drive, bool) else tuple(floats("drive", drive).ravel().tolist())
     if not all(0 < frequency < math.inf for frequency in frequencies):
@@ -153,9 +156,7 @@ def learn(
             f"`drive` must be True, for frequencies that are found, a positive one or several, or False; got {drive!r}."
         )
     huber = limit_of(loss)
-    dt = plain(dt)
-    if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
-        raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
+    check_dt(dt)
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, WorkerPool(workers))
     smooth = data.smooth
     rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
@@ -170,8 +171,6 @@ def learn(
     folds = [(_cut(one, rate), _cut(others, rate)) for one, others in _divided(data, seed)]
     if len(folds) == 1:
         folds = [(_few(folds[0][0], seed), _few(folds[0][1], seed))]
-    if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0 or replicas == 1:
-        raise ValueError(f"`replicas` must be an integer, 0, or 2 or more; got {replicas!r}: 20 give useful bands.")
     options: dict[str, Any] = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
     options["drive"] = constraints.frequencies
     identity = _identity(data, constraints, setting, options)

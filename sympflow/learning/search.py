@@ -255,8 +255,8 @@ class Search:
             deadline = deadline.part(1 - max(TABLE_SHARE, min(0.6, TABLE_SECONDS / session.time_budget)))
         self.late = deadline.over
         setting = replace(self.setting, stop=deadline.over)
-        groups = [group for name in names for group in self.constraints.groups(name)]
-        with session.bar(sum(len(group) for _, group in groups), "Models") as self.bar:
+        groups = sorted((g for name in names for g in self.constraints.groups(name)), key=lambda group: group.assumed)
+        with session.bar(sum(len(group.models) for group in groups), "Models") as self.bar:
             queue = self._ask(groups, setting, session)
             if self.best is not None:
                 self.final, self.cut = self.winner[1], deadline.over()
@@ -296,7 +296,7 @@ class Search:
         that leave much more of increments than the best of all are the last.
         """
         smooth = sample(self.folds[0][0])
-        queue = [(family.linear, [c for one in of for c in self._sparse(one, smooth)]) for family, of in groups]
+        queue = [(g.family.linear, [c for one in g.models for c in self._sparse(one, smooth)]) for g in groups]
         linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
         drives: tuple[Drive, ...] = ()
         if not (self.constraints.frequencies or self.data.velocities or self.late()):
@@ -317,7 +317,7 @@ class Search:
         hopeless = [id(linear[k]) for k in squares if squares[k] > HOPELESS * squares[place]]
         kept = [(kind, [c for c in some if id(c) not in hopeless]) for kind, some in queue]
         # H = T(p) + V(q) is tried first, unless functions H(q, p) alone explain increments; networks last
-        separable = [family.separable for family, _ in groups]
+        separable = [group.family.separable for group in groups]
         apart = not any(of and kind and apart for (kind, of), apart in zip(kept, separable, strict=True))
         judged = [any(id(c) in map(id, linear) for c in of) for _, of in queue]
         order = sorted(range(len(groups)), key=lambda i: (not judged[i], apart and separable[i]))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_ASKED_VALUES, floats, plain, real_number, warn
+from sympflow.arguments import MAX_ASKED_VALUES, checked_count, floats, plain, warn
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.reading import (
     OBSERVED,
@@ -139,10 +139,8 @@ class Trajectories(Shown):
         >>> Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]))).ndof
         1
         """
-        if ndof is not None and not (real_number(ndof) and 1 <= ndof < MAX_ASKED_VALUES and ndof == int(ndof)):
-            raise ValueError(
-                f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}: or leave it out."
-            )
+        if ndof is not None:
+            checked_count("ndof", ndof, 1, MAX_ASKED_VALUES, "a positive integer, the degrees of freedom, or left out")
         if observed not in OBSERVED:
             raise ValueError(f"`observed` must be one of {', '.join(OBSERVED)}; got {observed!r}.")
         if observed != "qp" and velocity_mass is not None:
