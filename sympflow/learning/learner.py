@@ -94,7 +94,7 @@ def learn(
         of period 2π/ω where ω is one, beside friction or none, not beside drag.
     period : float or array_like of shape (d,), optional
         Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none. Angles that
-        were wrapped are continued.
+        were wrapped are continued. Without one, angles in radians or degrees are tried as well.
     known : HamiltonianSystem, optional
         A part of H, symbolic; the rest is learned. Its kinetic energy, if it has one, is taken for the whole.
     family : str, optional
