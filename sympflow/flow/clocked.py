@@ -30,7 +30,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
-    from sympflow.kernels.flow_loops import ClockedFlowKernel
+    from sympflow.flow.loops import ClockedFlowKernel
 
 
 class ClockPotential(Potential):
@@ -152,7 +152,7 @@ class ClockedFlow(SystemFlow):
         return self._numbers.current(lambda: tuple(to_numpy(self.clock.numbers).astype(float)[::-1].tolist()))
 
     def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
-        from sympflow.kernels.flow_loops import ClockedFlowKernel
+        from sympflow.flow.loops import ClockedFlowKernel
 
         return ClockedFlowKernel(self.scheme, system, self.advance)
 

@@ -36,7 +36,7 @@ from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts,
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
-    from sympflow.kernels.flow_loops import SplitFlowKernel
+    from sympflow.flow.loops import SplitFlowKernel
 
 MOST_KEPT = 64  # steps whose maps are kept
 KINDS_OF_MODES = ("oscillator", "hyperbolic", "free", "idle")
@@ -296,7 +296,7 @@ class SplitFlow(SystemFlow):
         flow = self.bound(system)
         frozen = flow.frozen()
         if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
-            from sympflow.kernels.flow_loops import SplitFlowKernel
+            from sympflow.flow.loops import SplitFlowKernel
 
             check_compilable(*frozen.placement)
             frozen.kernel = SplitFlowKernel(frozen, flow.parts, flow.dt)

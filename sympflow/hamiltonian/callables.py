@@ -58,6 +58,8 @@ class CallableHamiltonian(Definition):
 
     library: str = ""
     untraced: str = ""
+    guard: Callable[[], None] | None = None
+    """Raises a ValueError if something else has changed that the system is made of."""
     _scene: tuple[Any, ...] = (None, None, None, (0.0, 1.0))
     _functions: tuple[Any, Any, Any, Any]
     _potential: Any
@@ -79,8 +81,8 @@ class CallableHamiltonian(Definition):
         functions = potential, hamiltonian, gradient, hessian_vector
         for (name, arguments), function in zip(_ARGUMENTS.items(), functions, strict=True):
             _check_callable(name, function, gradient)
-            if timed and function is not None and not _is_numba(function):
-                _check_arguments(name, function, f"t, {arguments}")
+            if function is not None and not _is_numba(function):
+                _check_arguments(name, function, arguments, timed)
         if potential is None and (gradient is not None or hessian_vector is not None):
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
         self.ndof, self.given, self.timed = ndof, bool(check), timed
@@ -251,6 +253,8 @@ class CallableHamiltonian(Definition):
 
     def check_unchanged(self) -> None:
         """Raise a ValueError if the function has another value than when it was traced."""
+        if self.guard is not None:
+            self.guard()
         if self.layered is not None:
             state, t, _ = self._known
             expected = float(self.layered.value(state[None, : self.ndof])[0])
@@ -568,7 +572,8 @@ def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
     if shape is None or tuple(shape) != expected:
         raise ValueError(
             f"`{name}` must return shape {expected} for a state part of shape {tuple(x.shape)}; got "
-            f"{type(value).__name__ if shape is None else tuple(shape)}. Reduce over the last axis only."
+            f"{type(value).__name__ if shape is None else tuple(shape)}. Reduce over the last axis only: write "
+            "q[..., 0] in place of q[0], and NumPy's functions in place of those of `math`."
         )
     if library(value) is not library(x):
         given, got = ("a torch tensor", "NumPy's") if tensor else ("a NumPy array", "torch's")
@@ -612,16 +617,18 @@ class _OverTimes:
         return self.function(beside(t, states[0]) if is_tensor(states[0]) else float(t), *states)
 
 
-def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:
+def _check_arguments(name: str, function: Callable[..., Any], arguments: str, timed: bool) -> None:
     """Raise a TypeError if it is known that a function does not take these arguments."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
         return
+    arguments = f"t, {arguments}" if timed else arguments
     try:
         signature.bind(*arguments.split(","))
     except TypeError as error:
-        raise TypeError(f"`{name}` of a driven system is called with ({arguments}), the time first: {error}.") from None
+        time = "the time first" if timed else "without the time, which a driven system gives where time=True is passed"
+        raise TypeError(f"`{name}` is called with ({arguments}), {time}: {error}.") from None
 
 
 def _time_difference(value: Callable[[Any], Array], t: Any) -> Array:

@@ -138,9 +138,11 @@ class KineticPotential(Composition):
     def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem) -> None:
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
+            is_sum = system.written is not None and system.written.separable
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
-                f"{system.definition.instead}."
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is "
+                + ("given by one function: define it with V as `potential` and M as `mass`, or " if is_sum else "not: ")
+                + f"use {system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
@@ -247,14 +249,9 @@ class KineticPotential(Composition):
         return np.concatenate([q, p], axis=-1), np.concatenate([U, P], axis=-2)
 
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
-        system = self.system
-        if system.symbols is None:
-            raise NotCompiled(f"`system` {system.name!r} is not symbolic.")
-        if system.kinetic_timed:
-            raise NotCompiled(f"`system` {system.name!r} has a kinetic energy that depends on t.")
-        kernel = _splitting_loops()(system, names).kernel(self.scheme, compensated)
-        kernel.check_reverse()
-        return kernel
+        if self.system.kinetic_timed:
+            raise NotCompiled(f"`system` {self.system.name!r} has a kinetic energy that depends on t.")
+        return _splitting_loops()(self.system, names).kernel(self.scheme, compensated)
 
     def kernel(self, compensated: bool) -> Kernel:
         return _splitting_loops()(self.system).kernel(self.scheme, compensated)

@@ -35,7 +35,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from sympflow.schemes import Scheme
     from sympflow.storage.runs import RunStore
 
+M = TypeVar("M", bound="Integrator")
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
 
@@ -138,7 +139,7 @@ class Problem:
     parameter_values: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
     followed: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters whose gradients are wanted, tensors (N,), by name: `parameter_values` then are their values."""
+    """Tensors that broadcast with the batch, by the names of parameters: `parameter_values` then are their values."""
     progress: Progress | None = None
     """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None
@@ -229,7 +230,7 @@ class Integrator:
         """Raise a ValueError where gradients do not flow to parameters."""
         raise ValueError(
             f"`params` has {', '.join(problem.followed)}, to which no gradient flows through method {self.name!r}: use "
-            "a splitting method on the splitting 'kinetic', such as 'kahan_li8', or detach them."
+            "a splitting method on the splitting 'kinetic', such as 'kahan_li8', a Gauss method, or detach them."
         )
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
@@ -413,6 +414,12 @@ def differentiated(
 @cache
 def _field_names(cls: type) -> tuple[str, ...]:
     return tuple(f.name for f in fields(cls))
+
+
+def method_class(base: type[M], class_name: str, module: str, kind: type[type] = type, **own: Any) -> type[M]:
+    """Return the integrator class of a row of a table: a base with attributes of its own, by which it is documented."""
+    own = {"__doc__": f"{own['source']}\n\n{base.__doc__}", "__module__": module, **own}
+    return dataclass(frozen=True, repr="__repr__" not in vars(base))(kind(class_name, (base,), own))
 
 
 def method_text(integrator: Integrator, dt: float | None = None) -> str:

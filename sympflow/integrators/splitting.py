@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, check_number, check_one_of
+from sympflow.arguments import check_flag, check_one_of, check_positive
 from sympflow.arrays import Array, to_numpy
-from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -26,11 +25,12 @@ from sympflow.integrators.contract import (
     differentiated,
     forward_tangent,
     in_blocks,
+    method_class,
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.integrators.steppers import Stepper, compiled_loops
-from sympflow.schemes import CORRECTORS, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
+from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
+from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
     from sympflow.kernels.tangents import TangentKernel
@@ -173,6 +173,7 @@ class Splitting(FixedStep):
     arrays_only: ClassVar[Any] = Trait(lambda splitting, clock: clock.arrays_only)
     tangent_holds: ClassVar[Any] = Trait(lambda splitting, clock: clock.tangent_holds)
     breakdown: ClassVar[Any] = Trait(lambda splitting, clock: splitting.breakdown or clock.breakdown)
+    follows: ClassVar[Any] = Trait(lambda splitting, clock: clock.on is None)
     takes_friction: ClassVar[Any] = Trait(lambda splitting, clock: splitting.takes_friction and clock.on is None)
     takes_driving: ClassVar[Any] = Trait(lambda splitting, clock: splitting.takes_driving and clock.on is None)
 
@@ -192,29 +193,14 @@ class Splitting(FixedStep):
             check_one_of(name, value, known)
         if self.compensated and not SPLITTINGS[self.splitting].compensates:
             raise ValueError("`compensated` sums are for the splittings 'kinetic' and 'kepler': leave it out.")
-        if self.shift is not None:
-            checked_shift(self.shift)
-            if self.clock == "physical":
-                raise ValueError("`shift` is for the clock 'logarithmic': leave it out.")
-        if self.omega is not None:
-            check_number("omega", self.omega)
-            if self.splitting != "copies":
-                raise ValueError("`omega` is for the splitting 'copies': leave it out.")
-            if not self.omega > 0:
-                raise ValueError(f"`omega` must be positive; got {self.omega!r}.")
-        if self.corrector is not None:
-            if isinstance(self.corrector, bool) or self.corrector not in CORRECTORS:
-                raise ValueError(f"`corrector` must be an order, 3, 5, … 17; got {self.corrector!r}: take 17.")
-            if self.splitting != "kepler":
-                raise ValueError("`corrector` is for the splitting 'kepler': leave it out.")
-        if self.parts is None:
-            return
-        sequence = isinstance(self.parts, list | tuple)
-        if not sequence or not all(isinstance(part, str) for part in self.parts) or not self.parts:
-            raise TypeError(f"`parts` must be a sequence of expressions; got {self.parts!r}: pass a list of strings.")
-        if self.splitting != "parts":
-            raise ValueError("`parts` are for the splitting 'parts': leave them out.")
-        object.__setattr__(self, "parts", tuple(self.parts))
+        for name, (of, its, check) in OWN_OPTIONS.items():
+            if getattr(self, name) is None:
+                continue
+            check(getattr(self, name))
+            if getattr(self, of) != its:
+                raise ValueError(f"`{name}` is for the {of} {its!r}: leave it out.")
+        if self.parts is not None:
+            object.__setattr__(self, "parts", tuple(self.parts))
 
     def __repr__(self) -> str:
         changed = (f for f in fields(self) if getattr(self, f.name) != f.default)
@@ -241,6 +227,20 @@ class Splitting(FixedStep):
     def kicks_and_drifts(self) -> Scheme | None:
         plain = self.splitting == "kinetic" and self.clock == "physical" and not self.overrides("step")
         return self.scheme if plain else None
+
+    def multiplier(self, z: np.ndarray) -> np.ndarray:
+        scheme = self.kicks_and_drifts
+        if scheme is None or scheme.level == POLYNOMIAL:
+            return super().multiplier(z)
+        q, p, x = np.array([1 + 0 * z, 0 * z]), np.array([0 * z, 1 + 0 * z]), z**2  # q and hp of two orbits
+        for kind, b, g, c, *_ in scheme.substeps:
+            if kind == "drift":
+                q = q + b * p
+            else:
+                p = p - (b * x - g * x**2 + c * x**3) * q
+        half_trace = (q[0] + p[1]) / 2
+        root = np.emath.sqrt(half_trace**2 - 1)
+        return half_trace + np.where(np.sin(z) < 0, -root, root)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count those of a scheme of kicks and drifts; a stepper counts those of other parts too."""
@@ -271,17 +271,6 @@ class Splitting(FixedStep):
             lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
         )
         return kernel is not None and bool(kernel.loops.values)
-
-    def check_followed(self, problem: Problem) -> None:
-        if self.clock != "physical" or self.overrides("step"):
-            super().check_followed(problem)
-        try:
-            if problem.backend == "array":
-                raise NotCompiled("`backend` is 'array'.")
-            self.composed(problem.system).kernel_by(bool(self.compensated), tuple(problem.followed))
-        except NotCompiled as error:
-            names = ", ".join(problem.followed)
-            raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
 
     def longest_step(self, system: HamiltonianSystem) -> float:
         return self.composed(system).longest_step() if self.clock == "physical" else super().longest_step(system)
@@ -377,12 +366,13 @@ class Splitting(FixedStep):
             yield differentiated(jacobian, times, states, lengths)
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        composition = self.composed(problem.system)
-        told: list[str] = []
+        composition, told = self.composed(problem.system), list[str]()
         compensated = bool(self.compensated)
-        names = tuple(problem.followed)
+        if problem.followed:
+            kernel = followed_loops(lambda names: composition.kernel_by(compensated, names), problem)
+            return Stepper(self, problem, composition, kernel)
         kernel = compiled_loops(
-            lambda: composition.kernel_by(compensated, names) if names else composition.kernel(compensated),
+            lambda: composition.kernel(compensated),
             problem.y0,
             problem.backend,
             compensated,
@@ -407,6 +397,26 @@ class Splitting(FixedStep):
         composition = self.composed(system)
         for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
             yield times, composition.project(states), lengths
+
+
+def _check_parts(parts: Any) -> None:
+    sequence = isinstance(parts, list | tuple)
+    if not sequence or not all(isinstance(part, str) for part in parts) or not parts:
+        raise TypeError(f"`parts` must be a sequence of expressions; got {parts!r}: pass a list of strings.")
+
+
+def _check_corrector(corrector: Any) -> None:
+    if isinstance(corrector, bool) or corrector not in CORRECTORS:
+        raise ValueError(f"`corrector` must be an order, 3, 5, … 17; got {corrector!r}: take 17.")
+
+
+OWN_OPTIONS: dict[str, tuple[str, str, Callable[[Any], Any]]] = {
+    "shift": ("clock", "logarithmic", checked_shift),
+    "omega": ("splitting", "copies", partial(check_positive, "omega")),
+    "corrector": ("splitting", "kepler", _check_corrector),
+    "parts": ("splitting", "parts", _check_parts),
+}
+"""The options of one splitting, or clock, and their checks."""
 
 
 # classes of triples -------------------------------------------------------------------------------
@@ -500,18 +510,12 @@ copyreg.pickle(_ByTable, _reduced)
 
 
 def _new_class(kind: type[type], name: str, scheme: Scheme, splitting: str, clock: str, source: str) -> type[Splitting]:
-    namespace: dict[str, Any] = {
-        "name": name,
-        "order": scheme.order,
-        "scheme": scheme,
-        "source": source,
-        "splitting": splitting,
-        "clock": clock,
+    own: dict[str, Any] = {
         "__annotations__": {"splitting": str, "clock": str},
         "__doc__": f"{name}: order {scheme.order}, {source}\n\n{Splitting.__doc__}",
-        "__module__": __name__,
     }
-    return dataclass(frozen=True, repr=False)(kind(name, (Splitting,), namespace))
+    own |= {"name": name, "order": scheme.order, "scheme": scheme, "source": source}
+    return method_class(Splitting, name, __name__, kind, splitting=splitting, clock=clock, **own)
 
 
 def __getattr__(name: str) -> type[Splitting]:

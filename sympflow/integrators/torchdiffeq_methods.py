@@ -10,7 +10,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,12 +28,21 @@ from sympflow.arrays import (
 )
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
-from sympflow.integrators.contract import ENDED, ByVectorField, Integrator, Outcome, Problem, Steps, finished
+from sympflow.integrators.contract import (
+    ENDED,
+    ByVectorField,
+    Integrator,
+    Outcome,
+    Problem,
+    Steps,
+    finished,
+    method_class,
+)
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
-from sympflow.integrators.steppers import Stepper, compiled_loops
+from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
 Visit = Callable[[Interpolant], bool]
@@ -518,28 +527,14 @@ class _Nodes(Trace):
 def torchdiffeq_method(name: str) -> type[Integrator]:
     """The integrator class of torchdiffeq's solver of that name."""
     if name in MULTISTEP:
-        doc = f"torchdiffeq's `{name}`: {Adams.__doc__}"
-        return _named(name, Adams, {"order": MULTISTEP[name], "source": doc.partition("\n")[0], "__doc__": doc})
+        first = (Adams.__doc__ or "").partition("\n")[0]
+        own: dict[str, Any] = {"order": MULTISTEP[name], "source": f"torchdiffeq's `{name}`: {first}"}
+        return method_class(Adams, _class_name(name), __name__, name=name, **own)
     tableau = (ADAPTIVE | FIXED)[name]
     base: type[Integrator] = Adaptive if name in ADAPTIVE else FixedGrid
     source = f"torchdiffeq's `{name}`, order {tableau.order}: {tableau.source}"
-    return _named(
-        name,
-        base,
-        {
-            "order": tableau.order,
-            "tableau": tableau,
-            "A": tableau.A,
-            "B": tableau.B,
-            "source": source,
-            "__doc__": f"{source}\n\n{base.__doc__}",
-        },
-    )
-
-
-def _named(name: str, base: type[Integrator], namespace: dict[str, Any]) -> type[Integrator]:
-    namespace |= {"name": name, "__module__": __name__}
-    return dataclass(frozen=True)(type(_class_name(name), (base,), namespace))
+    own = {"order": tableau.order, "tableau": tableau, "A": tableau.A, "B": tableau.B, "source": source}
+    return method_class(base, _class_name(name), __name__, name=name, **own)
 
 
 def _class_name(method: str) -> str:
@@ -565,18 +560,28 @@ class FixedGrid(ExplicitStep, FixedStep):
     """
 
     compiles: ClassVar[bool] = True
+    follows: ClassVar[bool] = True
     tableau: ClassVar[Tableau]
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        told: list[str] = []
+        told, arrays = list[str](), OwnSteps(self, problem)
+        make = partial(self.compiled, problem.system, "explicit_kernel", self.tableau)
+        if problem.followed:
+            return Stepper(self, problem, arrays, followed_loops(make, problem))
         kernel = compiled_loops(
-            lambda: self.compiled(problem.system, "explicit_kernel", self.tableau),
+            make,
             problem.y0,
             problem.backend,
             told=told,
             system=problem.system,
         )
-        return Stepper(self, problem, OwnSteps(self, problem), kernel, told)
+        return Stepper(self, problem, arrays, kernel, told)
+
+    def multiplier(self, z: np.ndarray) -> np.ndarray:
+        K: list[np.ndarray] = []
+        for row in self.A[: len(self.B)]:
+            K.append(1j * z * (1 + (weighted(row, K) if K else 0.0)))
+        return 1 + weighted(self.B, K)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return {"force_evaluations": len(self.B) * (n_steps + n_extra), "hessian_evaluations": 0}
