@@ -276,7 +276,7 @@ REAL = " real numbers"
 good = {
     from_gradient: lambda q: (1 + 1e-8) * q,  # not exactly that of V: like the others it is not traced
     from_potential: lambda q: (q**2).sum(-1) / 2,
-    from_hamiltonian: lambda q, p: ((q**2).sum(-1) + (p**2).sum(-1)) * (1 + 1e-8 * np.sort(q)[..., 0] ** 2) / 2,
+    from_hamiltonian: lambda q, p: ((q**2).sum(-1) + (p**2).sum(-1)) / (2 if (q < 9).all() else 3),
     from_numba: numba_gradient,
 }
 
@@ -318,7 +318,7 @@ CALLABLES = {
     "H not reduced": (from_hamiltonian, lambda q, p: q * p, ValueError, f"{H} shape"),
     "H NaN": (
         from_hamiltonian,
-        lambda q, p: (q * p).sum(-1) * (-1 - (q * p).sum(-1) ** 2) ** 0.5,
+        lambda q, p: (q * p).sum(-1) * math.nan,
         None,
         "non-finite|not finite|underflow|Newton",
     ),

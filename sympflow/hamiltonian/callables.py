@@ -58,6 +58,8 @@ class CallableHamiltonian(Definition):
 
     library: str = ""
     untraced: str = ""
+    guard: Callable[[], None] | None = None
+    """Raises a ValueError if something else has changed that the system is made of."""
     _scene: tuple[Any, ...] = (None, None, None, (0.0, 1.0))
     _functions: tuple[Any, Any, Any, Any]
     _potential: Any
@@ -251,6 +253,8 @@ class CallableHamiltonian(Definition):
 
     def check_unchanged(self) -> None:
         """Raise a ValueError if the function has another value than when it was traced."""
+        if self.guard is not None:
+            self.guard()
         if self.layered is not None:
             state, t, _ = self._known
             expected = float(self.layered.value(state[None, : self.ndof])[0])

@@ -22,7 +22,7 @@ from sympflow.hamiltonian.expression import ELEMENTARY
 JUMP = 1e-9
 """Share of the largest value by which both sides of an end of an interval differ where samples jump."""
 
-MOST_TURNS = 1000
+MOST_TURNS = 10_000
 """Periods of samples, and zeros of a function, beyond which jumps are not listed."""
 
 # samples -------------------------------------------------------------------------------------------

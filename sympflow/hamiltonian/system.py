@@ -757,8 +757,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
             return
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
+        self.definition.check_unchanged()
         if kind in self._tested:
-            self.definition.check_unchanged()
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 

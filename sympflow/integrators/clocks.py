@@ -178,7 +178,7 @@ def reach(
     """The states step(σ), σ from 0 to `longest`, whose time is `target`, and σ: the secant method within brackets."""
     d = start.shape[1] // 2 - 1
     eps = float(np.finfo(start.dtype).eps)
-    tolerance = 2 * eps * np.maximum(np.abs(target), np.abs(start[:, d]))
+    tolerance = 4 * eps * np.maximum(np.abs(target), np.abs(start[:, d]))
     low, high = np.zeros_like(longest), longest.copy()
     sign = np.sign(longest)
     sigma = np.where((guess - low) * sign < 0, low, np.where((guess - high) * sign > 0, high, guess))

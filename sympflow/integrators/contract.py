@@ -35,7 +35,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from sympflow.schemes import Scheme
     from sympflow.storage.runs import RunStore
 
+M = TypeVar("M", bound="Integrator")
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
 
@@ -413,6 +414,12 @@ def differentiated(
 @cache
 def _field_names(cls: type) -> tuple[str, ...]:
     return tuple(f.name for f in fields(cls))
+
+
+def method_class(base: type[M], class_name: str, module: str, kind: type[type] = type, **own: Any) -> type[M]:
+    """Return the integrator class of a row of a table: a base with attributes of its own, by which it is documented."""
+    own = {"__doc__": f"{own['source']}\n\n{base.__doc__}", "__module__": module, **own}
+    return dataclass(frozen=True, repr="__repr__" not in vars(base))(kind(class_name, (base,), own))
 
 
 def method_text(integrator: Integrator, dt: float | None = None) -> str:

@@ -16,7 +16,7 @@ from sympflow.integrators.contract import Integrator, Interrupted, Outcome, Prob
 from sympflow.integrators.grid import EPS, jumps_met
 
 Run = Callable[[Integrator, Problem], tuple[Outcome, Problem]]
-MOST_LANDINGS = 2000
+MOST_LANDINGS = 20_000
 """Jumps at which a run is cut; one with more is not, and warns."""
 ASIDE = 64 * EPS
 """Share of the times between which a run goes on from a jump, or ends before it, so that H is that of one side."""
@@ -32,6 +32,12 @@ def landings(
     step, said = (dt or system.dt) / 4, ""
     if dt is None:  # its steps may be longer than a pulse
         times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
+        if times:
+            said = (
+                f"`t_span` ({t0:g}, {t1:g}): H of {system.name!r} jumps in t, at t = {times[0]:.6g} and {len(times):,} "
+                f"times or more, where {integrator.name!r} ends no step: it is of first order there, or leaps over a "
+                "pulse. Solve in shorter intervals, or by a fixed `dt` that divides all pieces between jumps."
+            )
     else:
         said, times = jumps_met(system, t0, t1, dt, label)
     able = able and len(times) <= MOST_LANDINGS and not integrator.forces_beyond(system)

@@ -100,16 +100,6 @@ class Piecewise(DenseOutput):
         return _horner([c[k] for c in coefficients], x.reshape(-1, *[1] * self.y0.ndim))
 
 
-class Constant(DenseOutput):
-    """The dense output of an interval of length zero."""
-
-    def __init__(self, y: Array, t: float) -> None:
-        self.y, self.t_min, self.t_max = y, t, t
-
-    def states(self, times: np.ndarray) -> Array:
-        return stack([self.y] * len(times), axis=0) if times.size else self.y[None][:0]
-
-
 class Batch(DenseOutput):
     """The dense output of a batch by those of its parts, NaN after the end of a part.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, check_number, check_one_of
+from sympflow.arguments import check_flag, check_one_of, check_positive
 from sympflow.arrays import Array, to_numpy
 from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -26,6 +26,7 @@ from sympflow.integrators.contract import (
     differentiated,
     forward_tangent,
     in_blocks,
+    method_class,
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
@@ -192,29 +193,14 @@ class Splitting(FixedStep):
             check_one_of(name, value, known)
         if self.compensated and not SPLITTINGS[self.splitting].compensates:
             raise ValueError("`compensated` sums are for the splittings 'kinetic' and 'kepler': leave it out.")
-        if self.shift is not None:
-            checked_shift(self.shift)
-            if self.clock == "physical":
-                raise ValueError("`shift` is for the clock 'logarithmic': leave it out.")
-        if self.omega is not None:
-            check_number("omega", self.omega)
-            if self.splitting != "copies":
-                raise ValueError("`omega` is for the splitting 'copies': leave it out.")
-            if not self.omega > 0:
-                raise ValueError(f"`omega` must be positive; got {self.omega!r}.")
-        if self.corrector is not None:
-            if isinstance(self.corrector, bool) or self.corrector not in CORRECTORS:
-                raise ValueError(f"`corrector` must be an order, 3, 5, … 17; got {self.corrector!r}: take 17.")
-            if self.splitting != "kepler":
-                raise ValueError("`corrector` is for the splitting 'kepler': leave it out.")
-        if self.parts is None:
-            return
-        sequence = isinstance(self.parts, list | tuple)
-        if not sequence or not all(isinstance(part, str) for part in self.parts) or not self.parts:
-            raise TypeError(f"`parts` must be a sequence of expressions; got {self.parts!r}: pass a list of strings.")
-        if self.splitting != "parts":
-            raise ValueError("`parts` are for the splitting 'parts': leave them out.")
-        object.__setattr__(self, "parts", tuple(self.parts))
+        for name, (of, its, check) in OWN_OPTIONS.items():
+            if getattr(self, name) is None:
+                continue
+            check(getattr(self, name))
+            if getattr(self, of) != its:
+                raise ValueError(f"`{name}` is for the {of} {its!r}: leave it out.")
+        if self.parts is not None:
+            object.__setattr__(self, "parts", tuple(self.parts))
 
     def __repr__(self) -> str:
         changed = (f for f in fields(self) if getattr(self, f.name) != f.default)
@@ -409,6 +395,26 @@ class Splitting(FixedStep):
             yield times, composition.project(states), lengths
 
 
+def _check_parts(parts: Any) -> None:
+    sequence = isinstance(parts, list | tuple)
+    if not sequence or not all(isinstance(part, str) for part in parts) or not parts:
+        raise TypeError(f"`parts` must be a sequence of expressions; got {parts!r}: pass a list of strings.")
+
+
+def _check_corrector(corrector: Any) -> None:
+    if isinstance(corrector, bool) or corrector not in CORRECTORS:
+        raise ValueError(f"`corrector` must be an order, 3, 5, … 17; got {corrector!r}: take 17.")
+
+
+OWN_OPTIONS: dict[str, tuple[str, str, Callable[[Any], Any]]] = {
+    "shift": ("clock", "logarithmic", checked_shift),
+    "omega": ("splitting", "copies", partial(check_positive, "omega")),
+    "corrector": ("splitting", "kepler", _check_corrector),
+    "parts": ("splitting", "parts", _check_parts),
+}
+"""The options of one splitting, or clock, and their checks."""
+
+
 # classes of triples -------------------------------------------------------------------------------
 
 
@@ -500,18 +506,12 @@ copyreg.pickle(_ByTable, _reduced)
 
 
 def _new_class(kind: type[type], name: str, scheme: Scheme, splitting: str, clock: str, source: str) -> type[Splitting]:
-    namespace: dict[str, Any] = {
-        "name": name,
-        "order": scheme.order,
-        "scheme": scheme,
-        "source": source,
-        "splitting": splitting,
-        "clock": clock,
+    own: dict[str, Any] = {
         "__annotations__": {"splitting": str, "clock": str},
         "__doc__": f"{name}: order {scheme.order}, {source}\n\n{Splitting.__doc__}",
-        "__module__": __name__,
     }
-    return dataclass(frozen=True, repr=False)(kind(name, (Splitting,), namespace))
+    own |= {"name": name, "order": scheme.order, "scheme": scheme, "source": source}
+    return method_class(Splitting, name, __name__, kind, splitting=splitting, clock=clock, **own)
 
 
 def __getattr__(name: str) -> type[Splitting]:

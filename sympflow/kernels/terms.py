@@ -8,6 +8,7 @@ however many there are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,7 +50,8 @@ def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
     return bool(len(operations) * each ** {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0) > MOST_OPERATIONS)
 
 
-def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
+@lru_cache(maxsize=64)
+def written_out(f: sp.Expr, variables: tuple[sp.Symbol, ...]) -> int:
     """Operations of ∇f, roughly: those of each term as often as it has variables."""
     known = set(variables)
     return sum(sp.count_ops(term) * len(term.free_symbols & known) for term in sp.Add.make_args(f))

@@ -54,10 +54,10 @@ class TableStep:
                 f"`system` {system.name!r} must have a kinetic energy ½ pᵀM⁻¹p for its table to be fitted by "
                 "Gauss–Newton steps: use optimizer='bfgs'."
             )
-        self.ndof, self.sequence, driven = system.ndof, tuple(sequence), not system.autonomous
-        self.balanced = driven and not system.friction
+        self.ndof, self.sequence, self._driven = system.ndof, tuple(sequence), not system.autonomous
+        self.balanced = self._driven and not system.friction
         self._times_inverse_mass, self._friction = partial(_velocity, system, 1.0), system.friction
-        if driven and system.friction:
+        if self._driven and system.friction:
             self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
         self._forces_of = system, level, monomials, compiled
         n, terms = len(sequence), len(monomials) or level
@@ -82,8 +82,9 @@ class TableStep:
     def _opened(self, y: np.ndarray, t0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """The positions and momenta on which maps are applied, (q, t, s) and (p, 1, E) in time: (D, P) each."""
         q, p = y[: self.ndof], y[self.ndof :]
-        if t0 is None:
+        if not self._driven:
             return q, p
+        assert t0 is not None
         zero = np.zeros((1, p.shape[1]))
         return np.concatenate([q, t0[None], zero]), np.concatenate([p, zero + 1, zero])
 

@@ -16,18 +16,6 @@ AIRY = HamiltonianSystem.from_sympy("p**2/2 - airyai(q)", y0=[1.0, 0.0])
 
 
 @pytest.mark.parametrize("method", sorted(SCHEMES))
-@pytest.mark.parametrize("batch", [(), (3, 5)])
-def test_compiled_and_array_results_agree_to_rounding(method, batch):
-    y0 = HH.domain.sample(15, 4).reshape(3, 5, 4)[(0,) * (2 - len(batch))]
-    kwargs = {"t_span": (0.0, 10.02), "y0": y0, "dt": 0.1, "save_every": 7}
-    compiled, array = (solve(HH, method, backend=b, **kwargs) for b in ("compiled", "array"))
-    assert (compiled.stats["backend"], array.stats["backend"]) == ("compiled", "numpy")
-    np.testing.assert_array_equal(compiled.t, array.t)
-    # 100 steps of up to 17 stages, each adding an ulp, amplified at most some tens of times by the flow
-    np.testing.assert_allclose(compiled.y, array.y, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("method", sorted(SCHEMES))
 def test_evaluations_are_counted_as_they_are_made(method):
     calls = {"force": 0, "hessian": 0}
 
@@ -115,13 +103,6 @@ def test_steps_are_counted_once():
     sol = solve(HH, "verlet", (0.0, 10.0), dt=0.1, t_eval=[0.05, 10.0])
     assert sol.stats["n_steps"] == 100
     assert solve(HH, "verlet", (0.0, 10.03), dt=0.1).stats["n_steps"] == 101
-
-
-def test_compensated_summation_lowers_the_error_of_rounding():
-    # Kahan-Li 8 at dt = 0.05 has no error of truncation above rounding: what is left in H is round-off
-    kwargs = {"t_span": (0.0, 5000.0), "dt": 0.05, "t_eval": np.linspace(2500, 5000, 100)}
-    plain, compensated = (solve(HH, "kahan_li8", compensated=c, **kwargs).energy_error() for c in (False, True))
-    assert np.sqrt((compensated**2).mean()) < 0.5 * np.sqrt((plain**2).mean())
 
 
 BODIES = HamiltonianSystem.pairs("-m1*m2/r", masses=[1.0, 0.5, 0.3], dim=2)
