@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import cached_property, partial
 from itertools import pairwise
+from operator import mul
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,7 +24,7 @@ from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
 from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, terms_of
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, parametric, terms_of
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
@@ -36,6 +37,7 @@ ROUNDING = 1e-9  # increments below this that no longer shrink are rounding
 SMALLEST = 1e-150  # of a size whose reciprocal is multiplied by other numbers
 MOST_IN_REGISTERS = 4  # unknowns
 ABREAST = 4  # numbers of a row of a matrix that are changed together
+MOST_REVERSED = 40  # numbers of a state whose cotangents are in registers
 LONG = 4e6  # operations between two looks for a stop
 
 Cells = Any
@@ -43,10 +45,12 @@ Cells = Any
 
 
 @kept
-def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
+def implicit_kernel(
+    system: HamiltonianSystem, tableau: Tableau, compensated: bool = False, names: tuple[str, ...] = ()
+) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
 
-    NotCompiled says why there are none.
+    With `names` these parameters are numbers of columns. NotCompiled says why there are none.
     """
     written = system.spelled
     if written is None:
@@ -59,7 +63,7 @@ def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bo
         raise NotCompiled("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
     if friction.kind == 2:
         raise NotCompiled("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
-    symbols = written if is_large(written) else written.parametric
+    symbols = parametric(written, names)
     of_time = with_letters(symbols, [symbols.H])
     code = newton_code(of_time, tableau, compensated, bool(friction))
     single = newton_code(of_time, tableau, False, False) if compensated else code
@@ -91,6 +95,10 @@ class NewtonCode(OneStep):
 
     counted = True
 
+    @property
+    def reversible(self) -> bool:  # type: ignore[override]
+        return self.n_out <= MOST_REVERSED and not self.data
+
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
         self._given = lettered, tableau, compensated, damped
         self.tableau, self.compensated, self.damped = tableau, compensated, damped
@@ -110,6 +118,22 @@ class NewtonCode(OneStep):
         slope = gradient(program.outputs[0], y)
         rows = [gradient(x, y[i:]) for i, x in enumerate(slope)]
         return Program(program.inputs, [*slope, *(entry for row in rows for entry in row)])
+
+    @cached_property
+    def field_reversed(self) -> Program:
+        """The derivatives of J∇H·μ by the parameters, from q, p, the parameters and the letters, and from μ."""
+        symbols, n, d = self.lettered.symbols, self.n_out, self.ndof
+        program = recorded(self.lettered.expressions, (*symbols.q, *symbols.p, *self.lettered.given))
+        recording, slope = program.inputs[0].recording, gradient(program.outputs[0], program.inputs[:n])
+        mu = [recording.input(f"mu_{m}") for m in range(n)]
+        total = _total([*map(mul, mu[:d], slope[d:]), *(-(x * y) for x, y in zip(mu[d:], slope[:d], strict=True))])
+        parameters = program.inputs[n : n + self.parameters]
+        return Program([*program.inputs, *mu], gradient(total, parameters))
+
+    @cached_property
+    def leftover(self) -> list[float]:
+        """Numbers c with Σ_i c_i A_ij = 1."""
+        return [float(x) for x in np.linalg.solve(np.array(self.tableau[0], dtype=float), np.ones(self.stages))]
 
 
 class _Iteration:
@@ -148,25 +172,33 @@ class _Iteration:
 
     def execute(self, sized: bool = False) -> Any:
         """Change K; the relative size of the change. `sized` if the sizes of the unknowns are known."""
+        self.fill(sized)
+        self.solve()
+        return self._moved()
+
+    def fill(self, sized: bool = False) -> None:
+        """The equations for K into M, and the sizes."""
         for i in self.each(self.s):
             self._assemble(i)
         if not sized:
             self._fill_sizes()
-        self.solve()
-        return self._moved()
+
+    def _fill_stage(self, i: Any) -> None:
+        """The state of a stage into Y."""
+        for m in self.each(self.n):
+            x = self.cell(self.y[m])
+            for j in self.each(self.s):
+                x.value = x.value + self.A[i * self.s + j] * self.K[j * self.n + m]
+            self.Y[m] = x.value
+        for m in self.each(self.d) if self.method.damped else ():
+            self.Y[m + self.d] = self.Y[m + self.d] * self._growth(i + self.s + 1, m)
 
     def _assemble(self, i: Any) -> None:
         """The equations of a stage."""
-        n, d, s, K, damped = self.n, self.d, self.s, self.K, self.method.damped
-        for m in self.each(n):
-            x = self.cell(self.y[m])
-            for j in self.each(s):
-                x.value = x.value + self.A[i * s + j] * K[j * n + m]
-            self.Y[m] = x.value
-        for m in self.each(d) if damped else ():
-            self.Y[m + d] = self.Y[m + d] * self._growth(i + s + 1, m)
+        n, d, s = self.n, self.d, self.s
+        self._fill_stage(i)
         self.fill_slopes(i)
-        for m in self.each(d) if damped else ():  # rows e^{γτ} ∂H/∂q, columns ∂p/∂P
+        for m in self.each(d) if self.method.damped else ():  # rows e^{γτ} ∂H/∂q, columns ∂p/∂P
             up = self._growth(i, m)
             self.g[m] = self.g[m] * up
             for k in self.each(d):
@@ -178,12 +210,45 @@ class _Iteration:
             for m in self.each(d):
                 other, unknown = m + (1 - part) * d, i * n + m + part * d
                 row = unknown * self.wide
-                self.M[row + self.N] = K[unknown] - signed * self.g[other]
+                self.M[row + self.N] = self.K[unknown] - signed * self.g[other]
                 for filling in range(self.N + 1, self.wide):
                     self.M[row + filling] = 0.0
                 for j in self.each(s):
                     self.fill_row(-(signed * self.A[i * s + j]), other * n, row + j * n)
                 self.M[row + unknown] = self.M[row + unknown] + 1.0
+
+    def pulled(self, end: Sequence[Any], slopes: bool) -> list[Any]:
+        """The cotangents of y, and with `slopes` of the parameters, for those λ of the state after the step.
+
+        By the transposed equations, for μ: those of y are λ + Σ_i v_i, of which Aᵀv = μ − Bλ.
+        """
+        n, d, N, wide, method = self.n, self.d, self.N, self.wide, self.method
+        weights = method.tableau[1]
+        if method.damped:
+            end = [*end[:d], *(x * self.column[method.size - d + k] for k, x in enumerate(end[d:]))]
+        self.fill()
+        for i in self.each(N):
+            self.sizes[i] = 1.0 / self.sizes[i]
+            for j in self.each(i):
+                a, b = i * wide + j, j * wide + i
+                self.M[a], self.M[b] = self.M[b], self.M[a]
+        for k, x in enumerate(b * x for b in weights for x in end):
+            self.M[k * wide + N] = x
+        self.solve()
+        mu = [self.M[k * wide + N] for k in range(N)]
+        pairs = [*enumerate(zip(method.leftover, weights, strict=True))]
+        found = [x + _total([c * (mu[i * n + m] - b * x) for i, (c, b) in pairs]) for m, x in enumerate(end)]
+        totals = [self.cell(0.0) for _ in range(method.parameters if slopes else 0)]
+        for i in self.each(self.s) if slopes else ():
+            self._fill_stage(i)
+            of_stage = [self.M[(i * n + m) * wide + N] for m in range(n)]
+            if method.damped:
+                of_stage[d:] = [x * self._growth(i, m) for m, x in enumerate(of_stage[d:])]
+            factor = self.column[0] * self.scale[i]
+            by_parameters = method.field_reversed(*(self.Y[m] for m in range(n)), *self.given_at(i), *of_stage)
+            for total, x in zip(totals, by_parameters, strict=True):
+                total.value = total.value + factor * x
+        return [*found, *(total.value for total in totals)]
 
     def _growth(self, i: Any, m: Any) -> Any:
         """e^{γτ} at stage i, and its reciprocal at i + s + 1."""
@@ -271,9 +336,9 @@ class _Looped(_Iteration):
     """The same in machine code, over numbers in memory; terms of a kind are looped over too, by the arrays `data`."""
 
     def __init__(self, method: _InMemory, wide: int, *places: Value) -> None:
-        self.code, self.data = places[0].code, places[8:]
+        self.code, self.places, self.data = places[0].code, places, places[8:]
         super().__init__(method, wide, *(Rows(x, DOUBLE) for x in places[:8]))
-        self.terms = method.terms
+        self.looped, self.terms = method, method.terms
 
     def each(self, n: int) -> Iterator[Value]:
         with self.code.over(n) as i:
@@ -284,6 +349,12 @@ class _Looped(_Iteration):
 
     def array(self, name: str, values: Any) -> Cells:
         return Rows(self.code.array(name, values), DOUBLE)
+
+    def fill(self, sized: bool = False) -> None:
+        def filled(*places: Value) -> None:
+            _Iteration.fill(_Looped(self.looped, self.wide, *places))
+
+        self.code.outlined("filled", self.places, filled)
 
     def fill_row(self, factor: Any, i: Any, j: Any) -> None:
         type = Type("double", ABREAST if self.n % ABREAST == 0 else 2)
@@ -319,13 +390,41 @@ class _InRegisters(NewtonCode):
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """One step: y, the errors of compensated sums, and the count of iterations."""
-        code = values[0].code
-        column: list[Any] = [*self.column(code, numbers, step), *[0.0] * (self.stages * len(self.lettered.letters))]
-        found = self._iteration(values[:-1], [0.0] * self.unknowns, column)
-        found.fill_letters()
-        found.K, taken, solved = self._iterated(code, values[: self.n_out], column)
+        found, taken, solved = self._solved(values[:-1], numbers, step)
         found.advance(solved)
         return [*found.y, values[-1] + taken]
+
+    def _solved(self, y: list[Value], numbers: Numbers, step: Value) -> tuple[_Iteration, Value, Value]:
+        """A step whose K are known, the iterations taken, and where they converged."""
+        code, letters = y[0].code, self.stages * len(self.lettered.letters)
+        column: list[Any] = [*self.column(code, numbers, step), *[0.0] * letters]
+        found = self._iteration(y, [0.0] * self.unknowns, column)
+        found.fill_letters()
+        found.K, taken, solved = self._iterated(code, y[: self.n_out], column)
+        return found, taken, solved
+
+    def adjoint(
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
+    ) -> tuple[list[Value], list[Value]]:
+        code, type, n = step.code, values[0].type, self.n_out
+        found, *_ = self._solved(values[:n], numbers, step)
+        given = [*found.y, *found.column, *found.K, *cotangents[:n]]
+        ends = 0, n, n + len(found.column), len(given) - n, None
+
+        def pulled(*numbers: Any) -> list[Any]:
+            y, column, K, end = (numbers[i:j] for i, j in pairwise(ends))
+            return self._iteration(y, K, [*column]).pulled(end, slopes)
+
+        results = traced(pulled, *(f"x_{i}" for i in range(len(given))))(*given)
+        results = [code.operand(x, type) for x in results]
+        return [*results[:n], *[code.constant(0.0, type)] * (self.n_values - n)], results[n:]
 
     def _iteration(
         self, y: Sequence[Any], K: Sequence[Any], column: list[Any], sizes: Sequence[Any] = ()
@@ -393,31 +492,48 @@ class _InMemory(NewtonCode):
 
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
         """One step in place: y, the errors of compensated sums, and the count of iterations."""
+        found, taken, solved = self._solved(room, numbers, step)
+        found.advance(solved)
+        room.add(taken, room.size - 1)
+
+    def _solved(self, room: Room, numbers: Numbers, step: Value) -> tuple[_Iteration, Value, Value]:
+        """The same as in registers."""
         code = room.code
         rooms = [room.part(sum(self._sizes[:i]), room.work) for i in range(7)]
-        arguments = [room.state, *rooms, *(room.data(i) for i in range(len(self.data)))]
-        whole = _Looped(self, self._wide, *arguments)
+        found = _Looped(self, self._wide, room.state, *rooms, *(room.data(i) for i in range(len(self.data))))
         for i, x in enumerate(self.column(code, numbers, step)):
-            whole.column[i] = x
-        whole.fill_letters()
-        whole.clear(whole.K, self.unknowns)
-        whole.clear(whole.S, self.n_out**2)
-
-        def executed(*places: Value) -> Value:
-            size: Value = _Looped(self, self._wide, *places).execute()
-            return size
+            found.column[i] = x
+        found.fill_letters()
+        found.clear(found.K, self.unknowns)
+        found.clear(found.S, self.n_out**2)
 
         def iteration(values: list[Value]) -> tuple[Value, list[Value]]:
             before, taken, _ = values
-            size = code.outlined("iteration", arguments, executed, DOUBLE, rare=False)
+            size = found.execute()
             small = (size <= TOLERANCE) | ((size <= ROUNDING) & (0.5 * before <= size))
             taken = taken + 1.0
             return ~small & (size < np.inf) & (taken < MOST_ITERATIONS), [size, taken, small]
 
         start = [code.constant(np.inf), code.constant(0.0), code.constant(0, BOOL)]
         _, taken, small = code.repeat(start, iteration)
-        whole.advance(small)
-        room.add(taken, room.size - 1)
+        return found, taken, small
+
+    def adjoint(
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
+    ) -> tuple[list[Value], list[Value]]:
+        n, zero = self.n_out, step.code.constant(0.0)
+        for k, x in enumerate(values[:n]):
+            room[0].store(x, k)
+        found, *_ = self._solved(room[0], numbers, step)
+        results = found.pulled(cotangents[:n], slopes)
+        return [*results[:n], *[zero] * (self.n_values - n)], results[n:]
 
 
 def _solve(M: Value, sizes: Value, N: int, wide: int) -> None:
