@@ -22,7 +22,7 @@ from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gra
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, Room, step_function
+from sympflow.kernels.runs import Numbers, Room, Values, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
@@ -469,15 +469,8 @@ class SplittingCode(SplittingRollouts):
         self._adjoints  # noqa: B018
 
     def adjoint(
-        self,
-        values: list[Value],
-        cotangents: list[Value],
-        numbers: Numbers,
-        kind: Value,
-        step: Value,
-        slopes: bool,
-        *room: Room,
-    ) -> tuple[list[Value], list[Value]]:
+        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
+    ) -> tuple[Values, Values]:
         code, type = step.code, values[0].type
         zero = code.constant(0.0, type)
         found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
