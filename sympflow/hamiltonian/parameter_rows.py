@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -13,7 +13,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import sympy as sp
 
-from sympflow.arrays import differentiable, expanded, is_tensor, transformed
+from sympflow.arrays import differentiable, expanded, is_tensor, to_numpy, transformed
+from sympflow.hamiltonian.scales import size_of_terms
 from sympflow.hamiltonian.symbolic import exact, generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -29,7 +30,7 @@ class Rows(NamedTuple):
 
 
 class ParameterRows:
-    """The parameters of each trajectory of a batch; `followed` are tensors (N,) of those whose gradients are wanted."""
+    """The parameters of each trajectory of a batch; `followed` are the tensors of those whose gradients are wanted."""
 
     def __init__(
         self,
@@ -130,32 +131,43 @@ class ParameterRows:
 
     def hamiltonian(self, y: np.ndarray, t: Any) -> np.ndarray:
         """H of each trajectory at its states y (*shape, ..., 2d) at times that broadcast to these: (*shape, ...)."""
+        return self._evaluated(y, t, "_hamiltonian", lambda system, y, t: system.hamiltonian(y, t))
+
+    def sizes_of_terms(self, y: np.ndarray, t: Any) -> np.ndarray:
+        """½ Σ|y_i ∂H/∂y_i| of each trajectory, at states and times as those of `hamiltonian`."""
+        return self._evaluated(y, t, "_sizes", size_of_terms)
+
+    def _evaluated(self, y: np.ndarray, t: Any, name: str, of_system: Callable[..., Any]) -> np.ndarray:
+        """A function of symbols, or else that of the system of each value, at states."""
         symbols = self.system.symbols
         if symbols is None or symbols.samples or symbols.impulses:
-            return self._one_by_one(y, np.broadcast_to(t, y.shape[:-1]))
+            each = (y, np.broadcast_to(t, y.shape[:-1]))
+            states, at = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in each)
+            found = np.empty(states.shape[:-1])
+            for index, system, _ in self.distinct():
+                found[index] = of_system(system, states[index], at[index])
+            return found.reshape(y.shape[:-1])
         more = (1,) * (y.ndim - 1 - len(self.shape))
         columns = [value.reshape(*self.shape, *more) for value in self.values.values()]
-        d = self.system.ndof
         times = () if symbols.time is None else (t,)
-        (H,) = self._function(*(y[..., i] for i in range(2 * d)), *columns, *times)
-        return np.broadcast_to(H, y.shape[:-1])
-
-    def _one_by_one(self, y: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """`hamiltonian` by the system of each value."""
-        states, times = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in (y, t))
-        H = np.empty(states.shape[:-1])
-        for index, system, _ in self.distinct():
-            H[index] = system.hamiltonian(states[index], times[index])
-        return H.reshape(y.shape[:-1])
+        (values,) = getattr(self, name)(*(y[..., i] for i in range(2 * self.system.ndof)), *columns, *times)
+        return np.broadcast_to(values, y.shape[:-1])
 
     @cached_property
-    def _function(self) -> Any:
+    def _hamiltonian(self) -> Any:
+        return self._generated(lambda H, y: H)
+
+    @cached_property
+    def _sizes(self) -> Any:
+        return self._generated(lambda H, y: sp.Add(*[sp.Abs(s * sp.diff(H, s)) for s in y]) / 2)
+
+    def _generated(self, of: Callable[[sp.Expr, Sequence[sp.Symbol]], sp.Expr]) -> Any:
         symbols = self.system.symbols
         assert symbols is not None
         H, values = symbols.written
         H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
-        parameters = [sp.Symbol(name, real=True) for name in self.values]
-        return generate([printable(H)], [*symbols.q, *symbols.p, *parameters, *filter(None, [symbols.time])], "numpy")
+        parameters, y = [sp.Symbol(name, real=True) for name in self.values], [*symbols.q, *symbols.p]
+        return generate([printable(of(H, y))], [*y, *parameters, *filter(None, [symbols.time])], "numpy")
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""
@@ -211,7 +223,6 @@ def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...])
             f"value for each trajectory; got {shapes}."
         ) from None
     followed = {name: value for name, value in params.items() if differentiable(value)}
-    followed = {name: expanded(value.double().cpu(), shape).reshape(-1) for name, value in followed.items()}
     numbers = not followed and not any(array.ndim for array in arrays.values())
     values = {name: expanded(array, shape) for name, array in arrays.items()}
     return ParameterRows(system, values, numbers, followed)
@@ -224,7 +235,7 @@ def _checked_values(name: str, given: Any) -> np.ndarray:
                 f"`params` has {name} that torch.func, forward mode or torch.compile follows, which solve does not "
                 "take: use torch.autograd.grad, or detach it."
             )
-        given = given.detach().cpu().numpy()
+        given = to_numpy(given)
     try:
         array = np.asarray(given)
         if array.dtype.kind not in "iuf":
@@ -234,7 +245,7 @@ def _checked_values(name: str, given: Any) -> np.ndarray:
         raise TypeError(
             f"`params` has {name} = {reprlib.repr(given)}: give finite real numbers, one or an array."
         ) from None
-    if np.ma.is_masked(given):
+    if type(given) is not np.ndarray and np.ma.is_masked(given):
         raise ValueError(f"`params` has {name} with masked entries: fill them, or leave these trajectories out.")
     if not array.size:
         raise ValueError(f"`params` has no values of {name}: give one at least.")

@@ -53,11 +53,17 @@ class FixedStep(Integrator):
 
     finds_events: ClassVar[bool] = True
     on_grid: ClassVar[bool] = True
+    follows: ClassVar[bool] = False
+    """True if gradients flow to parameters through its compiled loops."""
     breakdown: ClassVar[Failure] = Failure.NON_FINITE
     """The meaning of a run that cannot go on."""
 
     def __post_init__(self) -> None:
         check_dt(self.dt)
+
+    def check_followed(self, problem: Problem) -> None:
+        if not self.follows or self.overrides("step"):
+            super().check_followed(problem)
 
     def check_store(self) -> None:
         if self.in_another_time:
@@ -77,6 +83,10 @@ class FixedStep(Integrator):
     def doubt(self, system: HamiltonianSystem) -> str:
         """Return a warning of the method with its step on a system, or nothing."""
         return ""
+
+    def multiplier(self, z: np.ndarray) -> np.ndarray:
+        """Return what stands for exp(iz), (n,), in a step of z radians of an oscillation; that where any z is borne."""
+        return np.exp(1j * z)
 
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of one run, for states such as the problem's y0."""
