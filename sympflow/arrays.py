@@ -245,8 +245,8 @@ def _is_plain(x: Any) -> bool:
     """True of a tensor that stands for itself alone, as nearly all do."""
     import torch
 
-    is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
-    return type(x) is torch.Tensor and not is_wrapped(x) and not torch.compiler.is_dynamo_compiling()
+    alone = torch._C._functorch.peek_interpreter_stack() is None  # else a function of x would be wrapped
+    return type(x) is torch.Tensor and alone and not torch.compiler.is_dynamo_compiling()
 
 
 def _behind(x: Any) -> tuple[Any, Sequence[int]]:
@@ -391,7 +391,7 @@ def beside(t: Any, x: Array) -> Any:
         return np.float64(t) if type(t) is float else np.asarray(t, dtype=float)[()]  # 1/t at 0 is infinite, no error
     import torch
 
-    return torch.as_tensor(t, dtype=torch.float64, device=x.device)
+    return as_tensor(t).to(dtype=torch.float64, device=x.device)
 
 
 def detached(x: Any) -> Any:

@@ -54,9 +54,9 @@ NEW = {"kind": "sympflow", "pairs": 1, "hidden": (5,)}
             W,
             {"optimizer": "sgd"},
             V,
-            f"^`optimizer` 'sgd' is unknown: choose one of {', '.join(SOLVERS)}",
+            f"^`optimizer` must be one of {', '.join(map(repr, SOLVERS))}; got 'sgd'",
         ),
-        (W, {"kind": "gan"}, V, "^`kind` 'gan' is unknown"),
+        (W, {"kind": "gan"}, V, "^`kind` must be one of 'primed', 'sympflow', 'mlp'; got 'gan'"),
         (W, {"schedule": "hope"}, V, "^`schedule`"),
         (W, {"dt": 0.0}, V, "^`dt`"),
         (W, {"dt": math.nan}, V, "^`dt`"),
@@ -283,6 +283,7 @@ class Started(Exception):
 def test_a_run_of_trials_is_resumed_whatever_else_is_said_now(monkeypatch, tmp_path):
     """A short budget, and the default of its fit, say nothing of its flow."""
     path, start = tmp_path / "run.ckpt", trials.tried_starts(HH, HH.domain)[-1]
+    assert start.curvature
 
     def kill(*_):
         raise Started
