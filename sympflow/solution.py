@@ -72,7 +72,7 @@ class Solution(Answering):
         is then the one that was given, unless they were given as numbers.
     """
 
-    OTHER_NAMES: ClassVar[Mapping[str, str]] = {
+    _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(("times", "time", "ts"), "`t`, the times of outputs"),
         **dict.fromkeys(("x", "ys", "u", "trajectory"), "`y`, of shape (..., 2d, n), or `q` and `p`"),
         **dict.fromkeys(("positions", "momenta", "v", "velocities"), "`q` and `p`, of shape (..., d, n)"),

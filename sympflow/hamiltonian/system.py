@@ -141,7 +141,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     array([-0.])
     """
 
-    OTHER_NAMES: ClassVar[Mapping[str, str]] = {
+    _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(("solve", "integrate", "run"), "sympflow.solve(system, method, t_span, y0)"),
         **dict.fromkeys(("H", "energy"), "`hamiltonian(y)` for its values, `expression` for the formula"),
         **dict.fromkeys(("V", "U"), "`potential(q)`"),

@@ -84,16 +84,16 @@ class Shown(ABC):
 class Answering(Shown):
     """An object that says where it has what users look for under other names."""
 
-    OTHER_NAMES: ClassVar[Mapping[str, str]] = {}
+    _OTHER_NAMES: ClassVar[Mapping[str, str]] = {}
     """These names, and what to take."""
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name not in self.OTHER_NAMES:
+            if name not in self._OTHER_NAMES:
                 return object.__getattribute__(self, name)  # which says what is wrong
             raise AttributeError(
-                f"{type(self).__name__} has no attribute {name!r}: take {self.OTHER_NAMES[name]}.", name="", obj=None
+                f"{type(self).__name__} has no attribute {name!r}: take {self._OTHER_NAMES[name]}.", name="", obj=None
             )
 
 
