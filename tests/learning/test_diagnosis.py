@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import sympflow
-from sympflow.learning.diagnosis import hint
+from sympflow.learning.diagnosis import Cause, best_by_increments, hint
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
 from sympflow.learning.learner import _constraints
@@ -15,7 +15,6 @@ from sympflow.learning.library import library_for
 from sympflow.learning.models import drags, frictions
 from sympflow.learning.parts import Drive, Polynomial
 from sympflow.learning.search import Search
-from sympflow.learning.symplecticity import Cause, best_by_increments
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training.session import Session
 
