@@ -136,6 +136,16 @@ def test_hints_name_the_reason_and_its_size(field, d, known, said):
     assert "driven" not in str(hint(library_for(None, d, 4, one.smooth.points)[0], one.smooth, data, **known))
 
 
+def test_reasons_are_looked_for_by_some_of_the_points():
+    """So that the time does not grow with the data: points, slopes and times stay together."""
+    smooth = Trajectories.read(runs(driven, 1, n=12, noise=0.0)).smooth
+    some = smooth.some(100)
+    assert len(some.points) == 100
+    right = np.stack([some.points[:, 1], -np.sin(some.points[:, 0]) + 0.3 * np.cos(1.7 * some.times)], axis=1)
+    assert np.abs(some.slopes - right).max() < 0.02
+    assert smooth.some(10_000) is smooth
+
+
 def test_friction_of_one_percent_is_named():
     """It leaves more than half of the squares of a model without it, for most of them are noise."""
     data = Trajectories.read(
