@@ -344,18 +344,8 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
     for observed, letters, columns in (("qv", "q,v", 4), ("q", "q", 3)):
         table = [f"orbit,t,{letters}", *(",".join(row.split(",")[:columns]) for row in rows[1:])]
         (tmp_path / "seen.csv").write_text("\n".join(table))
-        seen = [
-            "learn",
-            str(tmp_path / "seen.csv"),
-            "--observed",
-            observed,
-            "--out",
-            str(to),
-            "--drive",
-            "1.5",
-            "--drag",
-        ]
-        found = CliRunner().invoke(app, seen)
+        seen = ["learn", str(tmp_path / "seen.csv"), "--out", str(to), "--drive", "1.5", "--drag", "--observed"]
+        found = CliRunner().invoke(app, [*seen, observed])
         assert found.exit_code == 0, found.output
         assert asked["velocities"]
         assert asked["missing"] == (observed == "q")
