@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.hamiltonian.definition import Found, bare_copy
+from sympflow.hamiltonian.definition import bare_copy
+from sympflow.lazy import kept, lately_kept
 
 STATES = 64
 """States of a domain at which Hessians are taken, where there is no y0."""
@@ -20,29 +21,24 @@ STEP = 0.05
 """Radians of the fastest motion in a default step."""
 MOST_RATES = 16  # states of a batch at which rates are taken
 
-SMALLEST_SCALE = 1e-12
-"""|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
-
-
-_KNOWN = Found()
-_STARTED = Found(most=64)
-"""What was found at states: by these default steps, and by one of these and a step the system that starts there."""
+SMALLEST_SCALE = 1e-3
+"""The scale of energy errors, at least, in units of the size of the terms of H along an orbit."""
 
 
 def natural_scale(scene: Any) -> np.ndarray:
     """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω)."""
-    system = scene.between_impulses
+    return _natural_scale(scene.between_impulses).copy()
 
-    def found() -> np.ndarray:
-        with np.errstate(all="ignore"):
-            try:
-                large = system.local is not None and system.ndof > MOST_DENSE
-                s = _of_large(system) if large else _of_hessians(system)
-            except (ArithmeticError, ValueError, TypeError):  # singular at the origin, or no second derivatives
-                s = np.ones(system.ndof)
-            return np.where(np.isfinite(s) & (s > 0), s, 1.0)
 
-    return _KNOWN.of(system, "", found).copy()
+@kept
+def _natural_scale(system: Any) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        try:
+            large = system.local is not None and system.ndof > MOST_DENSE
+            s = _of_large(system) if large else _of_hessians(system)
+        except (ArithmeticError, ValueError, TypeError):  # singular at the origin, or no second derivatives
+            s = np.ones(system.ndof)
+        return np.where(np.isfinite(s) & (s > 0), s, 1.0)
 
 
 def weights(system: Any) -> np.ndarray:
@@ -109,10 +105,7 @@ def fastest_rate(system: Any) -> float | None:
 
 def default_step(scene: Any, y: np.ndarray | None = None) -> float:
     """`STEP` over the largest rate at states y (..., 2d), by default y0 or those of the domain, to two digits."""
-    if y is not None:
-        y = _few(y)
-        return _STARTED.of(scene, y.tobytes(), lambda: _step_at(scene.between_impulses, y))
-    return _step_at(scene.between_impulses, None)
+    return _step_at(scene.between_impulses, None if y is None else _few(y).tobytes())
 
 
 def _few(y: np.ndarray) -> np.ndarray:
@@ -121,12 +114,18 @@ def _few(y: np.ndarray) -> np.ndarray:
     return rows[:: max(1, len(rows) // MOST_RATES)].astype(float)
 
 
-def _step_at(system: Any, y: np.ndarray | None) -> float:
-    rate = 0.0
-    if system.ndof <= MOST_DENSE:
-        with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
-            rate = max(float(_rates(system, t, y).max(initial=0.0)) for t in system.probe_times())
+@lately_kept
+def _step_at(system: Any, states: bytes | None) -> float:
+    y = None if states is None else np.frombuffer(states).reshape(-1, 2 * system.ndof)
+    rate = max(fastest_at(system, t, y) for t in system.probe_times())
     return float(f"{STEP / rate:.2g}") if 0 < STEP / max(rate, 1e-300) < 1e100 and np.isfinite(rate) else STEP
+
+
+def fastest_at(system: Any, t: float, y: np.ndarray | None) -> float:
+    """The largest rate at states y (..., 2d) at t; 0 where it is not known."""
+    with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
+        return float(_rates(system, t, y).max(initial=0.0)) if system.ndof <= MOST_DENSE else 0.0
+    return 0.0
 
 
 def _rates(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
@@ -160,20 +159,31 @@ def started(system: Any, y0: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
             H = system.between_impulses.hamiltonian(rows, system.t_span[0])
             highest = int(np.argmax(np.nan_to_num(H, nan=-np.inf, posinf=-np.inf)))
-
-    def other() -> Any:
-        made = bare_copy(system)
-        made.dt, made.y0 = dt, rows[highest]
-        return made
-
-    return _STARTED.of(system, (dt, rows[highest].tobytes()), other)
+    return _started(system, dt, rows[highest].tobytes())
 
 
-def known_scale(system: Any, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:
-    """The system's `energy_scale`, else |H0| of the states y0 (..., 2d); NaN where H0 is 0 but for rounding: (...)."""
-    if system.energy_scale is not None:
-        return np.full_like(H0, system.energy_scale)
+@lately_kept
+def _started(system: Any, dt: float, y0: bytes) -> Any:
+    other = bare_copy(system)
+    other.dt, other.y0 = dt, np.frombuffer(y0).copy()
+    return other
+
+
+def size_of_terms(system: Any, y: np.ndarray, t: Any) -> np.ndarray:
+    """½ Σ|y_i ∂H/∂y_i| of states y (..., 2d) at times t: the energy of an oscillator, whatever constant H has."""
     with np.errstate(all="ignore"):
-        y = y0.astype(float)
-        terms = np.abs(y * np.asarray(system.gradient(y, t0))).sum(-1)
-        return np.where(np.isfinite(H0) & (np.abs(H0) <= SMALLEST_SCALE * terms), np.nan, np.abs(H0))
+        return 0.5 * np.abs(y * np.asarray(system.gradient(y, t))).sum(-1)
+
+
+def known_scale(system: Any, H: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The scale of energy errors, (...), of H and the sizes of its terms at the start and along an orbit, (n, ...).
+
+    It is the system's `energy_scale`, else |H| at the start or, where that is about 0, `SMALLEST_SCALE` of the largest
+    size of states that kept H. It is NaN where all are 0.
+    """
+    if system.energy_scale is not None:
+        return np.full_like(H[0], system.energy_scale)
+    with np.errstate(all="ignore"):
+        kept = np.isfinite(sizes) & (np.abs(H - H[0]) <= SMALLEST_SCALE * sizes)
+        scale = np.fmax(np.abs(H[0]), SMALLEST_SCALE * np.max(np.where(kept, sizes, 0.0), axis=0))
+    return np.where(scale == 0, np.nan, scale)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import check_one_of, plain, real_number
 from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
@@ -22,7 +22,7 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Domain, domain_of, remedy_for
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.clock_fit import train_clock
@@ -42,7 +42,6 @@ from sympflow.training.fits import (
     PrimedFit,
     Solver,
     SplitFit,
-    check_of,
     from_keywords,
     keywords,
     said,
@@ -65,7 +64,7 @@ BOUGHT = 1000  # starts that a budget buys at most
 
 
 def train(
-    system: HamiltonianSystem | None = None,
+    system: GivenSystem | None = None,
     fit: Fit | float | None = None,
     *,
     flow: FlowMap | None = None,
@@ -349,7 +348,7 @@ def _described(
     else:
         named = ["kind"] * (kind is not None) + [n for n in options if n in (*OF_PRIMED, *OF_SEARCHES)]
         kind = _meant(system, options, searches) if kind is None else kind
-        check_of("kind", kind, KINDS)
+        check_one_of("kind", kind, KINDS)
         for name in (n for n in options if n in (OF_NETWORKS if kind == "primed" else OF_PRIMED)):
             raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
         if kind == "primed":
