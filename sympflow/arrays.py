@@ -244,8 +244,8 @@ def _is_plain(x: Any) -> bool:
     """True of a tensor that stands for itself alone, as nearly all do."""
     import torch
 
-    is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
-    return type(x) is torch.Tensor and not is_wrapped(x) and not torch.compiler.is_dynamo_compiling()
+    alone = torch._C._functorch.peek_interpreter_stack() is None  # else a function of x would be wrapped
+    return type(x) is torch.Tensor and alone and not torch.compiler.is_dynamo_compiling()
 
 
 def _behind(x: Any) -> tuple[Any, Sequence[int]]:
