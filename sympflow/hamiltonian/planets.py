@@ -24,6 +24,7 @@ from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
 from sympflow.hamiltonian.local import checked_params, numbered, parsed
 from sympflow.hamiltonian.recorded import NotRecorded
+from sympflow.schemes import Substeps
 
 COORDINATES = ("jacobi", "democratic")
 ELEMENTS = ("a", "e", "inc", "node", "peri", "M")
@@ -202,6 +203,29 @@ class Frame:
         if near is not None:
             x = masked(x, near.any(-1)[..., None, None], math.nan)
         return x, v
+
+    def moved(self, y: Array, passed: Any, *pieces: tuple[Substeps, Any]) -> Array:
+        """States after substeps of so long a step (...) each; the centre moves for the time that has `passed`."""
+        x, v, Q, U = self.into(y)
+        for substeps, h in pieces:
+            for kick, drift, third in substeps:
+                if kick or third:
+                    x, v = self.kick(x, v, kick * h, third * h**3 if third else None)
+                if drift:
+                    x, v = self.drift(x, v, drift * h)
+        return self.out(x, v, Q + passed[..., None] * U, U)
+
+    def kepler_energy(self, y: Array) -> Array:
+        """The part (...) of H that drifts conserve, in Jacobi's coordinates."""
+        x, v, _, U = self.into(y)
+        n, sums = len(self.order), self.sums
+        x, v, mu = x[..., :n, :], v[..., :n, :], like(self.mu[:n], y)
+        each = (v * v).sum(-1) / 2 - mu / (x * x).sum(-1) ** 0.5
+        return (like(self.masses[self.order] * sums[:-1] / sums[1:], y) * each).sum(-1) + sums[-1] * (U * U).sum(-1) / 2
+
+    def interaction(self, x: Array, along: Array | None = None) -> Array:
+        """Accelerations of planets at x by the interaction; along vectors of theirs, the derivative."""
+        return self._accelerations(self._placed(x), x, along)
 
     def _placed(self, x: Array) -> Array:
         """Places of the bodies, but for that of the centre, or vectors of these, of those of the planets."""

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,8 +33,9 @@ from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_state
 from sympflow.kernels.rollouts import Columns, Rollouts, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.tangents import EVERY, TangentKernel, exponent_of
+from sympflow.schemes import Substeps
 
-__all__ = ["KeplerKernel", "KeplerLoops", "KeplerTangents", "Substeps"]
+__all__ = ["KeplerFlowKernel", "KeplerKernel", "KeplerLoops", "KeplerTangents", "kepler_loops"]
 
 LANES, LANES_SHIFT = 8, 3
 AXES = 3
@@ -49,8 +51,6 @@ ROWS = ("Gm", "mu", "weight", "ratio", "over", "mass", "star", "share")
 """Constants of each planet: Gm, μ, its share in the mass up to it, that mass over the one before, 1 over that, m, the
 G m of the star, its mass as a part of the star's."""
 
-Substeps = Sequence[tuple[float, float, float]]
-"""Kicks, the drifts after them, and the force gradients of the kicks, one after the other, of a step of length 1."""
 Vectors = list[Any]
 
 
@@ -144,16 +144,20 @@ class KeplerCode(Rollouts):
         inverses = [1.0 / r for r in roots]
         watch = partial(self._watch, room, kick) if self.watches and vector is None else None
         a, kick = self._accelerations(room, x, c, inverses, kick, watch)
-        turned = None
+        changes = [kick * y for group in a for y in group]
         if third:
-            again = [[Dual(y, b) for y, b in zip(*z, strict=True)] for z in zip(x, a, strict=True)]
-            turned, _ = self._accelerations(room, again, c, [1.0 / sqrt(dot(y, y)) for y in again], kick)
-        for g in groups:
-            for i in range(AXES):
-                change = kick * a[g][i]
-                if turned is not None:
-                    change = change + third[0] * turned[g][i].rate
-                state[g][AXES + i].add(change)
+
+            def bent() -> Vectors:
+                again = [[Dual(y, b) for y, b in zip(*z, strict=True)] for z in zip(x, a, strict=True)]
+                rates, _ = self._accelerations(room, again, c, [1.0 / sqrt(dot(y, y)) for y in again], kick)
+                found = [y.rate for group in rates for y in group]
+                return [y + third[0] * z for y, z in zip(changes, found, strict=True)]
+
+            # the kicks of a processor may have force gradients where those of a step have none
+            bends = code.any(third[0] < 0.0) | code.any(third[0] > 0.0)
+            changes = code.when(bends, bent, lambda: changes) if vector is None else bent()
+        for k, change in enumerate(changes):
+            state[k // AXES][AXES + k % AXES].add(change)
         if not self.jacobi:
             self._jump(state, c, 0.5 * kick)
             x = [values(group[:AXES]) for group in state]
@@ -558,6 +562,16 @@ class KeplerLoops:
         return self.frame.out(planets[..., :AXES], planets[..., AXES:], centre, size * U + 0 * centre)
 
 
+_LOOPS: WeakKeyDictionary[Frame, KeplerLoops] = WeakKeyDictionary()
+
+
+def kepler_loops(frame: Frame) -> KeplerLoops:
+    """Return the loops of a frame, made once."""
+    if frame not in _LOOPS:
+        _LOOPS[frame] = KeplerLoops(frame)
+    return _LOOPS[frame]
+
+
 class KeplerKernel(Kernel):
     """The compiled loops of a scheme of kicks by the interaction and Kepler's drifts, with or without a processor.
 
@@ -578,8 +592,9 @@ class KeplerKernel(Kernel):
         after: Substeps = (),
         compensated: bool = False,
     ) -> None:
-        self.loops, self.before, self.after, self.step_itself = loops, before, after, [*before, *substeps, *after]
-        self.form = Form(gradients=any(third for *_, third in self.step_itself), compensated=compensated)
+        self.loops, self.before, self.substeps, self.after = loops, before, substeps, after
+        thirds = [third for *_, third in (*before, *substeps, *after)]
+        self.form = Form(gradients=any(thirds), compensated=compensated)
         self.code = loops.code(self.form)
         *rest, last = np.array(substeps)
         first = rest[0] if rest else last
@@ -587,17 +602,22 @@ class KeplerKernel(Kernel):
         inner, end = (rest[1:], last) if ends else ([*rest[1:], last], 0 * last)
         self.columns = np.array([first, *inner, end + first, end])
 
-    def _table(self, h: Any, columns: Any) -> Columns:
-        entries = np.asarray(h, dtype=float)[..., None, None] ** POWERS * np.asarray(columns)
-        return np.ascontiguousarray(entries[..., : self.code.size]), np.zeros(len(columns), dtype=np.int64)
+    def _table(self, h: Any, *pieces: Any) -> Columns:
+        """The columns of pieces in turn, those of the processor, every other, for a step forwards."""
+        h = np.asarray(h, dtype=float)[..., None, None]
+        made = [
+            (abs(h) if k % 2 else h) ** POWERS * np.reshape(piece, (-1, len(POWERS))) for k, piece in enumerate(pieces)
+        ]
+        entries = np.concatenate(made, axis=-2)
+        return np.ascontiguousarray(entries[..., : self.code.size]), np.zeros(entries.shape[-2], dtype=np.int64)
 
     def rollout(self, code: KeplerCode, h: float) -> Callable[[Batch], None]:
         """The runs of batches, with steps of a length."""
         columns = self._table(h, self.columns)
         if not self.before:
             return partial(code.run, columns)
-        after = self._table(h, [self.columns[-1], *self.after])
-        return partial(code.run_processed, self._table(h, self.before), columns, after)
+        after = self._table(h, self.columns[-1:], self.after)
+        return partial(code.run_processed, self._table(h, (), self.before), columns, after)
 
     def runs(self, task: Task) -> Run:
         loops, start = self.loops, self.loops.rows(task.y0)
@@ -639,14 +659,44 @@ class KeplerKernel(Kernel):
         N, k, _ = vectors.shape
         code = self.loops.code(self.form._replace(vectors=k, compensated=False))
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), (N,))
-        nothing = (0.0, 0.0, 0.0)
+        nothing = np.zeros((2, len(POWERS)))
         rows = np.concatenate([self.loops.rows(y), self.loops.rows(vectors, 0.0).reshape(N, k * code.whole)], axis=1)
         start = np.concatenate([rows, np.arange(N, dtype=float)[:, None]], axis=1)
         batch = Batch.whole(start, 1, ONE, code.n_out)
-        code.run(self._table(lengths, [*self.step_itself, nothing, nothing]), batch, False)
+        columns = self._table(lengths, (), self.before, self.substeps, self.after, nothing)
+        code.run(columns, batch, False)
         rows = batch.out[:, 0].reshape(N, 1 + k, code.whole)
         moved = self.loops.moved(rows[:, 1:], vectors, lengths[:, None])
         return self.loops.moved(rows[:, 0], y, lengths), moved.swapaxes(-1, -2)
+
+
+class KeplerFlowKernel(Kernel):
+    """The compiled loops of a flow that is trained at Δt, where `at_dt` of a step is True, and a scheme before it."""
+
+    def __init__(self, at_dt: Callable[[Any], Any], trained: KeplerKernel, between: KeplerKernel) -> None:
+        self.at_dt, self.trained, self.between = at_dt, trained, between
+
+    def runs(self, task: Task) -> Run:
+        kernel = self.trained if self.at_dt(task.h) else self.between
+        found = kernel.runs(task)
+        self.remark = kernel.remark
+        return found
+
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
+        return Steps(self._moved(h, y, False)[0])
+
+    def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._moved(h, y, True)
+
+    def _moved(self, h: ArrayLike, y: np.ndarray, tangents: bool) -> tuple[np.ndarray, np.ndarray]:
+        lengths, n = np.broadcast_to(np.asarray(h, dtype=float), (len(y),)), y.shape[-1]
+        whole = self.at_dt(lengths)
+        ends, jacobians = np.empty_like(y), np.empty((*y.shape, n if tangents else 0))
+        for kernel, rows in ((self.trained, whole), (self.between, ~whole)):
+            if rows.any():
+                given = lengths[rows], y[rows]
+                ends[rows], jacobians[rows] = kernel.tangents(*given) if tangents else kernel.jvp(*given)
+        return ends, jacobians
 
 
 class KeplerTangents(TangentKernel):
