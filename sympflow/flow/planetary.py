@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from sympflow.arguments import real_number
-from sympflow.arrays import detached, differentiable, jvp, to_numpy
+from sympflow.arrays import differentiable, jvp, to_numpy
+from sympflow.flow.flow_map import to_values
 from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time
 from sympflow.flow.records import Refused, checked_integer
@@ -190,7 +191,7 @@ class KeplerFlow(SystemFlow):
         if differentiable(y) or differentiable(t) or self.dtype != torch.float64 or self.device.type != "cpu":
             return self._moved(t, y.T, slice(None)).T
         rows = np.ascontiguousarray(to_numpy(y).T)
-        lengths = np.broadcast_to(to_numpy(torch.as_tensor(t)).astype(float), len(rows))
+        lengths = np.broadcast_to(to_numpy(t) if isinstance(t, Tensor) else t, len(rows))
         return torch.from_numpy(self.kernel_for(self._binding.system).step(lengths, rows).states).T
 
     def _map_inverse(self, t: float | Tensor, y: Tensor) -> Tensor:
@@ -205,8 +206,8 @@ class KeplerFlow(SystemFlow):
     def _moved(self, t: float | Tensor, x: Tensor, parts: slice) -> Tensor:
         """States after some of χ⁻¹, K and χ, or of the scheme before Δt, for t < 0 of its inverse."""
         time = torch.as_tensor(t, dtype=x.dtype, device=x.device).expand(x.shape[:-1])
-        kept, whole = self._kept.current(self._frozen), at_dt(self.dt, to_numpy(detached(time)))
-        passed = time if parts != BEFORE and parts != AFTER else 0 * time
+        kept, whole = self._kept.current(self._frozen), at_dt(self.dt, to_values(time))
+        passed = time if parts not in (BEFORE, AFTER) else 0 * time
         ends: list[Tensor] = []
         for is_trained, pieces in ((True, (kept.inverse, STEP, kept.processor)), (False, ([], BETWEEN, []))):
             if (whole == is_trained).any():
