@@ -91,7 +91,7 @@ class PlanetLayer(OwnLayer):
         q, p = self.inverse(t, q, p)
         y, (kick, drift, _) = torch.cat([q, p]).T, self.substep
         kepler = self.flow.frame.kepler_energy(y)
-        return q, p, drift * kepler + (kick * (self.flow.system.hamiltonian(y) - kepler) if kick else 0.0)
+        return q, p, kick * (self.flow.system.hamiltonian(y) - kepler) if kick else drift * kepler
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": "kepler"}
@@ -146,7 +146,7 @@ class KeplerFlow(SystemFlow):
         self.periods = None if periods is None else tuple(periods)
         self._kept: Kept[_Kept] = Kept([self._buffers])
         # A tuple, not a ModuleList: the layers own no numbers.
-        self.layers = tuple(PlanetLayer(self, kick, drift) for kick, drift, _ in BETWEEN)
+        self.layers = tuple(PlanetLayer(self, *m) for b, a, _ in BETWEEN for m in ((b, 0.0), (0.0, a)) if any(m))
         if system is not None:
             self._take(system)
             self.identify(system)
