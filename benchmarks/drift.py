@@ -30,7 +30,6 @@ from measuring import fragments
 import sympflow
 from sympflow import HamiltonianSystem, energy_drift, solve, systems
 from sympflow.flow.shipped import ShippedFlow
-from sympflow.training.shipped.rows import double_wells_in_a_plane
 
 STEPS, OUTPUTS, BLOCKS = 1_000_000, 1000, 20
 QUICK_STEPS = 20_000
@@ -62,7 +61,7 @@ def scenes() -> list[HamiltonianSystem]:
         systems.fput_beta(),
         systems.sine_gordon(n=16, length=16.0, accuracy=2),
         systems.phi4(n=16, length=16.0, accuracy=2),
-        double_wells_in_a_plane(64),
+        HamiltonianSystem.lattice(onsite="(q**2 - 1)**2/4", bond="r**2/2", shape=(8, 8), name="phi4_sheet"),
     ]
 
 

@@ -7,7 +7,7 @@
     python benchmarks/large_flows.py --sites 10000 --states 4   another size of chains and, squared, of sheets
 
 Lattices of 1024 sites at energy densities of 0.02 to 0.2 above rest. The flows are those that ship, fitted on 6 or
-4 × 4 sites by the recipes of `sympflow/training/shipped/rows.py`, whose Δt were chosen on other states. The error is
+4 × 4 sites by the recipes in the files that ship, whose Δt were chosen on other states. The error is
 the largest of the energy up to T = 100, relative to the energy above rest, the median over twenty held-out states of
 the lattice. For each target every scheme, and every flow with steps of a quarter of its Δt and longer, gets the fewest
 steps that meet it. Then they run in turn over T = 5000, one thread, one state of which the end is kept: the least

@@ -32,8 +32,7 @@ import torch
 from measuring import fragments
 
 from sympflow import train
-from sympflow.training.fits import NetworkFit
-from sympflow.training.shipped import rows
+from sympflow.training.pretrained import package_folder
 from sympflow.training.shipped.judges import AsPublished, one_step_errors
 from sympflow.training.shipped.recipe import Recipe
 
@@ -64,19 +63,18 @@ class Result:
 
 def recipe_of(scene: str, kind: str) -> Recipe:
     """The recipe of a network that ships."""
-    return next(recipe for recipe in rows.networks() if (recipe.scene, recipe.kind) == (scene, kind))
+    return Recipe.of(package_folder() / f"{scene}-{kind}.safetensors")
 
 
 def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
     """A flow that was trained for so many seconds of processor time, and what it achieves."""
-    system, start, judge = recipe.system(), recipe.fit, recipe.judge
-    assert isinstance(start, NetworkFit)
+    system, judge = recipe.system, recipe.judge
     assert isinstance(judge, AsPublished)
-    points = [start.points, *(fit.points for fit, _ in recipe.further)]
-    options: dict[str, Any] = {"optimizer": optimizer, "domain": recipe.domain_of(system), "matching_weight": 0.0}
+    points = [fit.points for fit, _ in recipe.stages]
+    options: dict[str, Any] = {"optimizer": optimizer, "domain": recipe.domain, "matching_weight": 0.0}
     options["steps"] = MANY
     options |= {"progress": False, "validate_every": 1}
-    new: dict[str, Any] = {"dt": start.dt, "kind": recipe.kind}
+    new: dict[str, Any] = {"dt": recipe.flow.dt, "kind": recipe.kind}
     if optimizer == "adam":
         for _ in range(2):  # the first sets up what later steps find
             begin = time.process_time()
@@ -106,7 +104,9 @@ def trained(recipe: Recipe, optimizer: str, seconds: float) -> Result:
     spent = time.process_time() - begin
     at_dt, fractional = one_step_errors(flow, system, judge.initial())
     steps = sum(stage["steps_taken"] for stage in flow.recipe["stages"])
-    return Result(recipe.scene, recipe.kind, optimizer, flow.n_parameters, spent, steps, at_dt, fractional)
+    return Result(
+        recipe.name.partition("-")[0], recipe.kind, optimizer, flow.n_parameters, spent, steps, at_dt, fractional
+    )
 
 
 def row(result: Result) -> str:

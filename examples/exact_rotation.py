@@ -20,11 +20,8 @@ from sympflow import SympFlow, solve, systems
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import Potential, Time, register_potential
 
-FUNCTIONS: dict[str, tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]] = {
-    "sin t": (torch.sin, torch.cos),
-    "tan t/2": (lambda t: torch.tan(t / 2), lambda t: 0.5 / torch.cos(t / 2) ** 2),
-}
-"""w and its derivative, of tensors."""
+FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {"sin t": torch.sin, "tan t/2": lambda t: torch.tan(t / 2)}
+"""w, of tensors."""
 
 
 class Shear(Potential):
@@ -40,19 +37,14 @@ class Shear(Potential):
     def __init__(self, function: str, ndof: int = 1) -> None:
         super().__init__()
         self.function, self.ndof = function, ndof
-        self.w, self.dw = FUNCTIONS[function]
+        self.w = FUNCTIONS[function]
         self.c = nn.Parameter(torch.ones((), dtype=torch.float64))
+
+    def value(self, t: Time, x: Tensor) -> Tensor:
+        return self.c * self.w(torch.as_tensor(t, dtype=x.dtype)) * (x * x).sum(0) / 2
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         return self.c * self.w(torch.as_tensor(t, dtype=x.dtype)) * x
-
-    def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
-        rate = self.c * self.dw(torch.as_tensor(t, dtype=x.dtype)) * (x * x).sum(0) / 2
-        return self.impulse(t, x), rate
-
-    def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
-        time = torch.as_tensor(t, dtype=x.dtype)
-        return self.impulse(t, x), self.c * (self.dw(time) * x + self.w(time) * dx)
 
     def to_dict(self) -> dict[str, Any]:
         return {"type": "shear", "function": self.function}

@@ -158,6 +158,10 @@ if TYPE_CHECKING:
     from sympflow.training.fits import SplitFit as SplitFit
     from sympflow.training.trainer import train as train
 
+_OF_INTEROP = {"as_scipy": "scipy", "from_hamiltonian": "systems", "from_module": "systems"} | dict.fromkeys(
+    ("odeint", "odeint_adjoint", "odeint_dense", "odeint_event"), "torchdiffeq"
+)
+
 
 def __getattr__(name: str) -> Any:
     if name in (*_MODULES, *_ROOMS):
@@ -169,6 +173,8 @@ def __getattr__(name: str) -> Any:
         hint = f". Did you mean {close[0]!r}?" if close else ""
         if not name.startswith("_") and name in whole_import("sympflow.systems").__all__:
             hint = f". It is `sympflow.systems.{name}`"
+        if name in _OF_INTEROP:
+            hint = f". It is `sympflow.interop.{_OF_INTEROP[name]}.{name}`"
         raise AttributeError(f"module 'sympflow' has no attribute {name!r}{hint}")
     value = getattr(whole_import(f"sympflow.{_HOME[name]}"), name)
     globals()[name] = value

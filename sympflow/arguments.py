@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arrays import differentiable, is_tensor, to_numpy
+from sympflow.arrays import differentiable, is_tensor, to_numpy, without_torch
 
 MAX_SAVED_VALUES = 10_000_000
 MAX_ASKED_VALUES = 1_000_000_000
@@ -66,7 +66,7 @@ def check_not_followed(name: str, times: Any) -> None:
     """Raise a TypeError if times carry derivatives: where times are numbers they would be dropped in silence."""
     parts = times if type(times) in (tuple, list) else (times,)
     for t in parts:
-        if type(t) is float or not is_tensor(t) or not differentiable(t):
+        if type(t) is float or not differentiable(t):
             continue
         raise TypeError(
             f"`{name}` is a tensor that torch differentiates or transforms, but the times of a solution are numbers: "
@@ -76,7 +76,7 @@ def check_not_followed(name: str, times: Any) -> None:
 
 def check_kept(name: str, value: Any) -> None:
     """Raise a TypeError if a number that a system keeps carries derivatives, which would be dropped in silence."""
-    if is_tensor(value) and differentiable(value):
+    if differentiable(value):
         raise TypeError(
             f"`{name}` is a tensor that torch differentiates or transforms, but it is kept as numbers: pass "
             "`.detach()`, and the tensor itself to each run, as in solve(..., params={name: tensor}); or write H with "
@@ -84,11 +84,16 @@ def check_kept(name: str, value: Any) -> None:
         )
 
 
+def check_array(y0: Any, but: str, remedy: str = "y0.numpy()") -> None:
+    """Raise a TypeError if `y0` is a tensor; `but` is a clause on what takes none."""
+    if is_tensor(y0):
+        raise TypeError(f"`y0` is a tensor, but {but}: pass {remedy}.")
+
+
 def check_not_traced(function: str) -> None:
     """Raise a TypeError in a graph that `torch.compile` traces, into which a whole run does not go."""
-    import torch
-
-    if torch.compiler.is_dynamo_compiling():
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.compiler.is_dynamo_compiling():
         raise TypeError(
             f"`{function}` looks at values, which torch.compile hides: compile the steps, "
             'sympflow.get("verlet")().step(system, t, y, h), or a flow, flow(t, y) with a number t.'
@@ -175,7 +180,7 @@ def positive_numbers(name: str, values: Any) -> list[float]:
 
 def check_dt(dt: Any) -> None:
     """Raise unless `dt` is None or a step length."""
-    if dt is not None and not (real_number(dt) and 0 < dt <= LONGEST_STEP):
+    if dt is not None and not 0 < as_float(dt) <= LONGEST_STEP:
         raise ValueError(f"`dt` must be a positive and finite number, at most {LONGEST_STEP:g}; got {dt!r}.")
 
 
@@ -191,7 +196,7 @@ def as_float(value: Any) -> float:
 
 def check_positive(name: str, value: Any, most: float = sys.float_info.max) -> Any:
     """Return the argument `name`; raise unless it is a positive and finite real number."""
-    if not (real_number(value) and 0 < value <= most):
+    if not 0 < as_float(value) <= most:
         raise ValueError(f"`{name}` must be positive and finite; got {value!r}: give a number above 0.")
     return value
 
@@ -319,8 +324,8 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
 
 def plain(value: Any) -> Any:
     """A number of NumPy's or torch's as one of Python's, which JSON takes as well; anything else as it is."""
-    array = isinstance(value, np.generic | np.ndarray) or is_tensor(value)
-    return value.item() if array and value.ndim == 0 else value
+    array = without_torch(value)
+    return array.item() if isinstance(array, np.generic | np.ndarray) and array.ndim == 0 else value
 
 
 def writable(path: Any) -> Path:

@@ -27,10 +27,25 @@ def is_tensor(x: object) -> bool:
 
 
 def as_tensor(x: Array) -> Array:
-    """Return a tensor of the same numbers."""
+    """Return a tensor of the same numbers: itself, or of a copy of an array."""
     import torch
 
-    return torch.as_tensor(x)
+    return x if is_tensor(x) else torch.as_tensor(np.array(x))
+
+
+def as_array(x: Any) -> Array:
+    """Return a tensor as it is, and all else as an array."""
+    return x if is_tensor(x) else np.asarray(x)
+
+
+def without_torch(x: Any) -> Any:
+    """Return the values of a tensor as an array, and all else as it is."""
+    return to_numpy(x) if is_tensor(x) else x
+
+
+def copied(x: Array) -> Array:
+    """Return a copy, in the graph of a tensor."""
+    return x.clone() if is_tensor(x) else x.copy()
 
 
 def library(x: Array) -> Any:
@@ -44,7 +59,7 @@ def library(x: Array) -> Any:
 
 def library_name(x: Array) -> str:
     """Return "torch" for a tensor and "numpy" for an array."""
-    return "torch" if is_tensor(x) else "numpy"
+    return library(x).__name__
 
 
 def concatenate(parts: Sequence[Array], axis: int = -1) -> Array:
@@ -76,16 +91,14 @@ def expanded(y: Array, shape: tuple[int, ...]) -> Array:
     """Return y broadcast to a shape: itself where it has that."""
     if tuple(y.shape) == shape:
         return y
-    return y.expand(shape) if is_tensor(y) else np.broadcast_to(y, shape)
+    return library(y).broadcast_to(y, shape)
 
 
-def masked(y: Array, mask: Any, value: float) -> Array:
-    """Return y with a value where the mask, an array that broadcasts against it, is True."""
+def masked(y: Array, mask: Any, value: Any) -> Array:
+    """Return y with a value, a number or an array like it, where the mask, which broadcasts against it, is True."""
     if is_tensor(y):
-        import torch
-
-        return y.masked_fill(torch.as_tensor(mask, device=y.device), value)
-    return np.where(mask, value, y).astype(y.dtype)
+        mask = as_tensor(mask).to(y.device)
+    return library(y).where(mask, value, y)
 
 
 def of_library(value: Any, like: Array) -> Array:
@@ -127,7 +140,7 @@ def to_numpy(x: Array) -> np.ndarray:
         `torch.compile` traces for none.
     """
     found = values(x)
-    if found is None or (is_tensor(x) and found.ndim != x.ndim):
+    if found is None or found.ndim != np.ndim(x):
         where = "in a graph that torch.compile traces" if found is None else "inside torch.func.vmap"
         raise TypeError(
             f"The values of a tensor of shape {tuple(x.shape)} are needed as numbers, which it has not {where}: make "
@@ -142,7 +155,7 @@ def differentiable(*arrays: Any) -> bool:
     That is a graph (reverse mode), a tangent (forward mode), a transform of `torch.func`, or a graph that
     `torch.compile` traces.
     """
-    return any(is_tensor(x) and _is_followed(x) for x in arrays)
+    return any(_is_followed(x) for x in arrays if is_tensor(x))
 
 
 def values(x: Any) -> np.ndarray | None:
@@ -150,11 +163,9 @@ def values(x: Any) -> np.ndarray | None:
 
     None where there are none to be read, in a graph that `torch.compile` traces.
     """
-    if not is_tensor(x):
-        return np.asarray(x)
     plain, order = _behind(x)
-    if plain is None:
-        return None
+    if plain is None or isinstance(plain, np.ndarray):
+        return plain
     import torch
 
     with torch._C._DisableFuncTorch():
@@ -179,7 +190,7 @@ def values_of_times(t: Any, remedy: str) -> np.ndarray:
 
 def has_values(x: Array) -> bool:
     """Return True unless `x` is a tensor without values, in a graph that `torch.compile` traces."""
-    return not is_tensor(x) or _behind(x)[0] is not None
+    return _behind(x)[0] is not None
 
 
 def one_lane(x: Array) -> np.ndarray:
@@ -199,26 +210,22 @@ def unfollowed(x: Array) -> Array:
 
     `x.detach()` inside a transform of `torch.func` is a tensor of that transform still.
     """
-    if not is_tensor(x):
-        return x
+    plain, order = _behind(x)
+    if plain is None or isinstance(plain, np.ndarray):
+        return detached(x)
     import torch
 
-    plain, order = _behind(x)
-    if plain is None:
-        return x.detach()
     with torch._C._DisableFuncTorch():
         return plain.permute(order)[(0,) * (plain.ndim - x.ndim)]
 
 
 def lanes(x: Array) -> int:
     """Return the number of axes, hidden in the shape of `x`, over which `torch.func.vmap` maps it."""
-    return len(_behind(x)[1]) - x.ndim if is_tensor(x) else 0
+    return len(_behind(x)[1]) - x.ndim
 
 
 def readable(x: Array) -> bool:
     """Return True if the values of `x` are there, one for each entry: not under vmap, nor where a graph is traced."""
-    if not is_tensor(x):
-        return True
     plain, order = _behind(x)
     return plain is not None and len(order) == x.ndim
 
@@ -230,8 +237,10 @@ def untransformed() -> AbstractContextManager[Any]:
     return temporarily_clear_interpreter_stack()
 
 
-def _behind(x: Any) -> tuple[Any, list[int]]:
+def _behind(x: Any) -> tuple[Any, Sequence[int]]:
     """The tensor with the values of x, in no graph, and the order of its axes: lanes first; None without values."""
+    if not is_tensor(x):
+        return (x := np.asarray(x)), range(x.ndim)
     import torch
 
     if torch.compiler.is_dynamo_compiling():
@@ -297,20 +306,12 @@ def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
 
 def all_finite(y: Array) -> Array:
     """Return True for each of the states y (..., k) that is finite: (...) booleans of the library of y."""
-    if is_tensor(y):
-        import torch
-
-        return torch.isfinite(y).all(-1)
-    return np.isfinite(y).all(-1)
+    return library(y).isfinite(y).all(-1)
 
 
 def full_of_nan(y: Array) -> Array:
     """NaN in the shape, dtype and library of `y`, and in no graph."""
-    if is_tensor(y):
-        import torch
-
-        return torch.full_like(y, np.nan, requires_grad=False)
-    return np.full_like(y, np.nan)
+    return library(y).full_like(y, np.nan)
 
 
 def rows_of_nan(n: int, y: Array) -> Array:
@@ -332,7 +333,7 @@ def with_rows(y: Array, rows: Any, values: Array) -> Array:
 
 def known_finite(y: Array) -> bool:
     """Return True if an array is finite all over; of tensors that is not looked for."""
-    return not is_tensor(y) and bool(np.isfinite(y).all())
+    return isinstance(y, np.ndarray) and bool(np.isfinite(y).all())
 
 
 def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
@@ -367,16 +368,14 @@ def _set_up() -> None:
 def like(values: Any, x: Array) -> Array:
     """Return values in the library, dtype and device of `x`."""
     if is_tensor(x):
-        import torch
-
-        return torch.as_tensor(values if is_tensor(values) else np.array(values), dtype=x.dtype, device=x.device)
+        return as_tensor(values).to(dtype=x.dtype, device=x.device)
     return np.asarray(values, dtype=x.dtype)
 
 
 def beside(t: Any, x: Array) -> Any:
-    """Return a time, a number or (...), as it stands beside x: of a tensor as doubles on its device."""
+    """Return a time, a number or (...), as it stands beside x: as doubles, of a tensor on its device."""
     if not is_tensor(x):
-        return np.float64(t) if type(t) is float else t  # whose 1/t at 0 is infinite, and no error
+        return np.float64(t) if type(t) is float else np.asarray(t, dtype=float)[()]  # 1/t at 0 is infinite, no error
     import torch
 
     return torch.as_tensor(t, dtype=torch.float64, device=x.device)
@@ -388,7 +387,7 @@ def detached(x: Any) -> Any:
 
 
 def opaque(function: Any, *x: Array) -> Array:
-    """Return a function of NumPy arrays of the tensors x, which torch differentiates by the function's own rules.
+    """Return a function of NumPy arrays of arrays x, or of tensors, which torch differentiates by its own rules.
 
     Parameters
     ----------
@@ -396,7 +395,7 @@ def opaque(function: Any, *x: Array) -> Array:
         `value(*arrays)`; `jvp(x, v)`, its derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
         the derivatives of Σ w·value by those of x that are wanted.
     """
-    return _opaque_function().apply(function, *x)
+    return _opaque_function().apply(function, *x) if is_tensor(x[0]) else function.value(*x)
 
 
 @cache

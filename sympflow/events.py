@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, differentiable, is_tensor, stack, to_numpy
+from sympflow.arrays import Array, copied, detached, differentiable, stack, to_numpy
 
 EventFunction = Callable[[float, Array], Any]
 Dense = Callable[[float], Array]
@@ -42,7 +42,7 @@ class Event:
     label: str = "`events`"
 
     def value(self, t: float, y: Array) -> float:
-        value = self.g(t, y.clone() if is_tensor(y) else y.copy())  # a g that writes into its y changes no result
+        value = self.g(t, copied(y))  # a g that writes into its y changes no result
         try:
             number = float(to_numpy(value))
         except (TypeError, ValueError) as error:
@@ -177,7 +177,7 @@ class EventSearch:
         for t, i in sorted(zeros, key=lambda zero: zero[0] if b >= a else -zero[0]):
             y = inside(t)
             followed = differentiable(y)
-            y = y.detach() if is_tensor(y) else y  # the time depends on y0 as well: a gradient through y alone is wrong
+            y = detached(y)  # the time depends on y0 as well: a gradient through y alone is wrong
             self.found[i].append((t, y))
             if len(self.found[i]) >= self.events[i].limit:
                 if followed:

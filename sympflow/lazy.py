@@ -1,15 +1,38 @@
-"""Imports: whole although interrupted, of plug-ins when used, and of libraries that may be missing."""
+"""What is made when it is used: values kept with an object, and imports, of plug-ins and of what may be missing."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Container, Iterable
+from collections.abc import Callable, Container, Iterable
+from functools import wraps
 from importlib import import_module
 from types import FrameType, ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
+from weakref import WeakKeyDictionary
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
+
+K = TypeVar("K")
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def kept(make: Callable[Concatenate[K, P], T]) -> Callable[Concatenate[K, P], T]:
+    """Make a function of an object, and of what is hashable, keep its values as long as that object lives."""
+    known: WeakKeyDictionary[K, dict[Any, T]] = WeakKeyDictionary()
+
+    @wraps(make)
+    def found(owner: K, *args: P.args, **options: P.kwargs) -> T:
+        values = known.get(owner)
+        if values is None:
+            values = known[owner] = {}
+        if args not in values:
+            values[args] = make(owner, *args, **options)
+        return values[args]
+
+    return found
 
 
 def needed(library: str, extra: str) -> str:

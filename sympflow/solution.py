@@ -168,7 +168,7 @@ class Solution(Shown):
     def energy(self) -> Array:
         """H along the solution, of a driven system at the times of its states: (..., n)."""
         with np.errstate(all="ignore"):
-            if self.varied and not is_tensor(self.y) and self.system.autonomous:
+            if self.varied and not is_tensor(self.y):
                 return _energy(self, self.states, self.t)
             if self.varied:
                 return gathered(self, lambda part: part.energy())
@@ -183,8 +183,6 @@ class Solution(Shown):
 
     def energy_scale(self) -> np.ndarray:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
-        if self.varied and not self.system.autonomous:
-            return gathered(self, lambda part: part.energy_scale())
         return known_scale(self.system, to_numpy(self.y0), self.t_span[0], _energy(self, self.y0, self.t_span[0]))
 
     def card(self) -> Card:
@@ -451,8 +449,8 @@ def _energy(sol: Solution, y: Array, t: Any) -> np.ndarray:
     """H in float64, whatever the precision of the run, of each trajectory at its states (..., k, 2d) or (..., 2d)."""
     states = to_numpy(y).astype(float)
     with np.errstate(all="ignore"):
-        if sol.rows is not None and not sol.rows.uniform and sol.system.autonomous:
-            return sol.rows.hamiltonian(states)
+        if sol.rows is not None and not sol.rows.uniform:
+            return sol.rows.hamiltonian(states, t)
         return np.asarray(sol.system.hamiltonian(states, np.broadcast_to(t, states.shape[:-1])))
 
 

@@ -29,7 +29,6 @@ from sympflow.arrays import (
     concatenate,
     finite_states,
     full_of_nan,
-    is_tensor,
     known_finite,
     lanes,
     last,
@@ -198,8 +197,7 @@ def solve(
     >>> sol.y.shape
     (4, 101)
     """
-    if is_tensor(y0):
-        check_not_traced("solve")
+    check_not_traced("solve")
     system = given_system(system, params)
     given, chosen = options, None
     if tol is not None and isinstance(method, str) and "tol" in get(method).options():
@@ -289,7 +287,8 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
         error = float(np.max(np.abs(energy_change(sol)), initial=0.0))
     sol.stats["energy_error"] = error
     if error > tol:
-        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
+        remedy = "pass a smaller one" if sol.y.dtype.itemsize >= 8 else "float32 rounds off, compute in float64"
+        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: {remedy}."
         sol.message += f" {note}"
         warn(note, RuntimeWarning)
 

@@ -23,14 +23,29 @@ def pytest_collection_finish():
     gc.freeze()
 
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+TESTS = Path(__file__).parent
+EXAMPLES = TESTS.parent / "examples"
+LOW_ORDER = {"adaptive_heun", "bosh3", "fehlberg2"}
+"""Methods that choose thousands of steps where `dopri5`, of the same kind, needs ten."""
+
+
+def pytest_collection_modifyitems(config, items):
+    """Mark as slow LOW_ORDER, and what long.txt lists: rows of some seconds whose kind a shorter row shows."""
+    listed = set((TESTS / "long.txt").read_text("utf-8").splitlines())
+    if config.args == config.getini("testpaths") and (gone := listed - {item.nodeid for item in items}):
+        raise pytest.UsageError(f"tests/long.txt lists tests that are gone: {sorted(gone)}")
+    for item in items:
+        row = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        if item.nodeid in listed or any(isinstance(value, str) and value in LOW_ORDER for value in row):
+            item.add_marker(pytest.mark.slow)
+
 
 KINDS = (
     *("verlet", "leapfrog", "srkn6b", "chin4a"),  # begins with a kick, a drift; for quadratic T; with force gradients
     *("gauss_legendre4", "log_leapfrog"),
     *("impulse", "mollified_impulse", "implicit_explicit", "linear_omelyan4", "strang_parts", "kahan_li6_parts"),
     *("euler", "rk4", "explicit_adams", "implicit_adams"),
-    *("rk45", "dop853", "dopri5", "adaptive_heun"),
+    *("rk45", "dop853", "dopri5"),
     *("sympflow", "mlp"),
 )
 """A method of each kind: for tests of what methods of one kind share. That each alone is sound, `test_checks` shows."""

@@ -49,7 +49,7 @@ from measuring import race as at_equal_error
 from sympflow import SympFlow, shipped_flows, systems
 from sympflow.schemes import SCHEMES
 from sympflow.systems import henon_heiles, kepler, pendulum
-from sympflow.training.shipped.rows import weak_duffing
+from sympflow.training.shipped.recipe import SCENES
 
 pytestmark = pytest.mark.slow
 
@@ -397,7 +397,7 @@ def test_a_tiny_search_for_drift():
 
 def test_scenes_of_the_drift_are_those_of_all_flows():
     """But of driven systems, whose energy is not kept and has no drift."""
-    scenes = [*drift.scenes(), systems.driven_pendulum(), weak_duffing()]
+    scenes = [*drift.scenes(), systems.driven_pendulum(), SCENES["duffing"]()]
     for entry in shipped_flows(kind="sympflow"):
         assert any(entry.is_of(system) for system in scenes), entry.name
 

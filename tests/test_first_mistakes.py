@@ -1,5 +1,6 @@
 """Natural first calls: what is meant is done, or the error names the remedy."""
 
+import importlib
 import warnings
 
 import numpy as np
@@ -209,3 +210,17 @@ def test_scales_of_orbits_are_those_of_their_states(function):
     states = np.array([[2.0, 0.0], [1.0, 0.0]])
     found, expected = (OF_ORBITS[function](H(BENT, y0=y0, dt=0.1), states) for y0 in (None, states[0]))
     np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "home"), [("as_scipy", "scipy"), ("odeint", "torchdiffeq"), ("from_module", "systems")]
+)
+def test_names_of_other_rooms_are_told(name, home):
+    with pytest.raises(AttributeError, match=f"It is `sympflow.interop.{home}.{name}`"):
+        getattr(sympflow, name)
+    assert callable(getattr(importlib.import_module(f"sympflow.interop.{home}"), name))
+
+
+def test_a_tolerance_below_single_precision_has_another_remedy():
+    with pytest.warns(RuntimeWarning, match="float32 rounds off, compute in float64"):
+        sympflow.solve(sympflow.systems.henon_heiles(), "kahan_li8", (0, 10), tol=1e-9, dtype="float32")

@@ -75,9 +75,7 @@ def applies(method, form):
     return True
 
 
-@pytest.mark.parametrize(
-    "method", [pytest.param(m, marks=pytest.mark.slow) if m in ("fehlberg2", "bosh3") else m for m in METHODS]
-)
+@pytest.mark.parametrize("method", METHODS)
 def test_methods(method):
     adaptive = "rtol" in sympflow.get(method)().options()
     forms = [form for form in FORMS if applies(method, form)]

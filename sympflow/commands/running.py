@@ -164,7 +164,7 @@ def train(
     restarts: Annotated[int | None, typer.Option(help="Starts of the search for a primed flow.")] = None,
     time_budget: Annotated[
         float | None,
-        typer.Option(help="Stop after so many seconds. Default: 60 for a primed flow without --restarts and --steps."),
+        typer.Option(help="Stop after so many seconds. Default: as long as it takes."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes that share the starts of a search; -1 for all cores.")

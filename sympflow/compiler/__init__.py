@@ -4,3 +4,9 @@ Read in this order: `numbers` (what arithmetic is done with), `functions` (one t
 (operations recorded, differentiated, evaluated with arrays), `arrange` (the order of operations), `control` (loops,
 conditions, memory), `elementary` (exp, log, sin and their kin by arithmetic alone) and `machine` (from text to code).
 """
+
+__all__ = ["NotCompiled"]
+
+
+class NotCompiled(ValueError):
+    """The reason why there is no compiled code, for which array operations may do."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.numbers import Number
 
 __all__ = ["FUNCTIONS", "Function", "added", "apply", "dot", "fma", "is_zero", "summed", "times", "where"]
@@ -80,7 +81,7 @@ def _polygamma(n: int) -> Function:
 
     def partials(y: Any, x: Any) -> tuple[Any]:
         if n == MOST_DERIVATIVES:
-            raise ValueError(
+            raise NotCompiled(
                 f"`polygamma` of the order {n} has no derivative here: use a method with fewer derivatives of H, such "
                 "as 'kahan_li8'."
             )
@@ -128,7 +129,7 @@ def _by_last(name: str, slope: Callable[..., Any]) -> Callable[..., tuple[Any, A
 
     def partials(y: Any, order: Any, x: Any) -> tuple[Any, Any]:
         if not isinstance(order, float | int):
-            raise ValueError(f"`{name}` has no derivative by its order, its first argument: make that a number.")
+            raise NotCompiled(f"`{name}` has no derivative by its order, its first argument: make that a number.")
         return 0.0, slope(y, order, x)
 
     return partials

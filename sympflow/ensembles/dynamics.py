@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_counts
+from sympflow.compiler import NotCompiled
 from sympflow.ensembles.chunks import BLOCK, MOST_VALUES, Chunk
 from sympflow.ensembles.reductions import Fields, Reduction
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -69,7 +70,7 @@ class _Indicator(Reduction):
         try:
             chunk.integrator.tangent_kernel(chunk.system, self.vectors())
             together = chunk.backend != "array"
-        except ValueError:
+        except NotCompiled:
             together = False
         for rows in _blocks(chunk, together):
             found = self.follow(chunk, rows)

@@ -7,8 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_counts
-from sympflow.arrays import is_tensor
+from sympflow.arguments import check_array, check_counts
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.problems import check_y0
@@ -133,8 +132,7 @@ def initial_states(system: HamiltonianSystem, y0: Any, n: Any, seed: Any) -> Giv
         return drawn
     if n is not None:
         raise ValueError("`n` is for drawing states: pass a domain or a sampler as `y0`, or leave it out.")
-    if is_tensor(y0):
-        raise TypeError("`y0` is a tensor, which an ensemble does not take: pass y0.numpy().")
+    check_array(y0, "an ensemble takes NumPy arrays")
     given = check_y0(system, system.y0 if y0 is None else y0, None)
     if given.ndim > 2:
         raise ValueError(f"`y0` must have shape (N, {given.shape[-1]}); got {given.shape}: reshape it.")

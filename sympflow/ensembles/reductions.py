@@ -199,6 +199,8 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
     named = value if isinstance(value, Mapping) else {"reduced": value}
     arrays = {}
     for name, v in named.items():
+        if np.ma.is_masked(v):
+            v = v.astype(np.result_type(v.dtype, float)).filled(np.nan)  # noqa: PLW2901
         try:
             array = np.asarray(v)
         except ValueError:  # rows of different lengths

@@ -123,7 +123,8 @@ class Layout:
     state: str
 
     def __post_init__(self) -> None:
-        taken = [name for name in self.fields if name in {*RESERVED, *self.axes}]
+        own = {*RESERVED, *self.axes, *dir(Ensemble), *Ensemble.__dataclass_fields__}
+        taken = [name for name in self.fields if name in own]
         if taken:
             raise ValueError(f"`reduce` returns {taken[0]!r}, a name that the result has already: take another one.")
 

@@ -30,7 +30,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
-    from sympflow.kernels.flow_loops import ClockedFlowKernel
+    from sympflow.flow.loops import ClockedFlowKernel
 
 
 class ClockPotential(Potential):
@@ -43,32 +43,14 @@ class ClockPotential(Potential):
         self.ndof = ndof
         self.numbers = nn.Parameter(torch.zeros(terms, dtype=dtype, device=device))
 
-    def advance(self, t: Time, B: Tensor, rate: bool = False) -> Tensor:
-        """Σ_k c_k t^(3+2k) B^k, by which the time is put forward, or its derivative by t."""
-        total = torch.zeros_like(B)
-        for k, c in enumerate(self.numbers):
-            power = 3 + 2 * k
-            total = total + c * (power * t ** (power - 1) if rate else t**power) * B**k
-        return total
+    def value(self, t: Time, x: Tensor) -> Tensor:
+        B, k = x[-1], range(len(self.numbers))
+        return sum((self.numbers[k] * t ** (3 + 2 * k) * B ** (k + 1) / (k + 1) for k in k), 0 * B)
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
-        advance = self.advance(t, x[-1])
+        B, k = x[-1], range(len(self.numbers))
+        advance = sum((self.numbers[k] * t ** (3 + 2 * k) * B**k for k in k), 0 * B)
         return torch.cat([torch.zeros_like(x[:-1]), advance[None]])
-
-    def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
-        B = x[-1]
-        rate = torch.zeros_like(B)
-        for k, c in enumerate(self.numbers):
-            rate = rate + c * (3 + 2 * k) * t ** (2 + 2 * k) * B ** (k + 1) / (k + 1)
-        return self.impulse(t, x), rate
-
-    def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
-        B = x[-1]
-        along = self.advance(t, B, rate=True)
-        for k, c in enumerate(self.numbers):
-            if k:
-                along = along + c * t ** (3 + 2 * k) * k * B ** (k - 1) * dx[-1]
-        return self.impulse(t, x), torch.cat([torch.zeros_like(x[:-1]), along[None]])
 
     def to_dict(self) -> dict[str, Any]:
         return {"type": "clock"}
@@ -170,9 +152,9 @@ class ClockedFlow(SystemFlow):
         return self._numbers.current(lambda: tuple(to_numpy(self.clock.numbers).astype(float)[::-1].tolist()))
 
     def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
-        from sympflow.kernels.flow_loops import ClockedFlowKernel
+        from sympflow.flow.loops import ClockedFlowKernel
 
-        return ClockedFlowKernel(self.scheme, system, self.advance, self.clock_numbers)
+        return ClockedFlowKernel(self.scheme, system, self.advance)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)

@@ -15,7 +15,7 @@ from sympflow.flow.tables import free_numbers
 
 
 class FreeTable(nn.Module):
-    """Numbers c_ik, i = 1 … n, k = 0 … K−1, of which only the free ones are a parameter."""
+    """c_i(τ) = Σ_k c_ik f_k(τ), i = 1 … n, which enter as t^power c_i(t/Δt); the free c_ik are a parameter."""
 
     basis: Tensor
     offset: Tensor
@@ -24,6 +24,8 @@ class FreeTable(nn.Module):
         self,
         n: int,
         terms: int,
+        dt: float,
+        power: int,
         palindromic: bool,
         bound: int,
         total: float | None,
@@ -32,6 +34,7 @@ class FreeTable(nn.Module):
         present: Sequence[int] | None = None,
     ) -> None:
         super().__init__()
+        self.dt, self.power = dt, power
         self._free, basis, offset = free_numbers(n, terms, palindromic, bound, total, present)
         like: dict[str, Any] = {"dtype": dtype, "device": device}
         self.register_buffer("basis", torch.as_tensor(basis, **like), persistent=False)
@@ -48,6 +51,20 @@ class FreeTable(nn.Module):
         """All c_ik as an array of float64, the same bits wherever the parameter is."""
         basis, offset, free = (to_numpy(x).astype(float) for x in (self.basis, self.offset, self.free))
         return offset + basis @ free
+
+    def _functions(self, tau: Any) -> list[Any]:
+        """The f_k(τ), K of them."""
+        raise NotImplementedError
+
+    def functions(self, t: np.ndarray) -> np.ndarray:
+        """The f_k at times t: (…, K)."""
+        return np.stack(self._functions(np.asarray(t, dtype=float) / self.dt), axis=-1)
+
+    def affine(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """t^power c(t/Δt) as a function of the parameters: offset (J, n) and design (J, n, f)."""
+        basis, offset = (a.cpu().double().numpy() for a in (self.basis, self.offset))
+        weights = np.asarray(t)[:, None] ** self.power * self.functions(t)
+        return weights @ offset.T, np.einsum("nkf,jk->jnf", basis, weights, optimize=True)
 
     @torch.no_grad()
     def set(self, table: np.ndarray) -> None:
@@ -76,8 +93,8 @@ class Coefficients(FreeTable):
         present: Sequence[int] | None = None,
     ) -> None:
         bound = len(exponents) if always else int(total is not None)
-        super().__init__(n, len(exponents), palindromic, bound, total, dtype, device, present)
-        self.exponents, self.dt, self.power, self.always, self.present = exponents, dt, power, always, present
+        super().__init__(n, len(exponents), dt, power, palindromic, bound, total, dtype, device, present)
+        self.exponents, self.always, self.present = exponents, always, present
 
     def set_constant(self, c: Sequence[Any]) -> None:
         """Let c_i(τ) be c_i at every τ."""
@@ -85,10 +102,8 @@ class Coefficients(FreeTable):
         table[:, 0] = [float(c_i) for c_i in c]
         self.set(table)
 
-    def at(self, tau: float | np.ndarray) -> np.ndarray:
-        """c_i(τ): (n,), or (n, N) for N values of τ."""
-        exponents = np.array(self.exponents, dtype=float).reshape(-1, *[1] * np.ndim(tau))
-        return to_numpy(self.table).astype(float) @ np.asarray(tau) ** exponents
+    def _functions(self, tau: Any) -> list[Any]:
+        return [tau**e for e in self.exponents]
 
     def value(self, i: int, t: Time) -> Time:
         """t^m c_i(t/Δt)."""
@@ -121,8 +136,8 @@ class Column(FreeTable):
         device: torch.device | str | None = None,
     ) -> None:
         bound = terms if total == "always" else int(total == "start")
-        super().__init__(n, terms, True, bound, None if total is None else 1.0, dtype, device)
-        self.n, self.terms, self.dt, self.power, self.total = n, terms, dt, power, total
+        super().__init__(n, terms, dt, power, True, bound, None if total is None else 1.0, dtype, device)
+        self.n, self.terms, self.total = n, terms, total
 
     def values(self, t: Time) -> Tensor:
         """t^m c_i(t/Δt): (n, …), the shape of t behind."""
@@ -134,16 +149,6 @@ class Column(FreeTable):
         """`values` of an array of times: (…, n)."""
         c = to_numpy(self.table).astype(float)
         return np.asarray(t)[..., None] ** self.power * (self.functions(t) @ c.T)
-
-    def functions(self, t: np.ndarray) -> np.ndarray:
-        """The basis functions at times t: (…, K)."""
-        return np.stack(self._functions(np.asarray(t, dtype=float) / self.dt), axis=-1)
-
-    def affine(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`at` as a function of the parameters: offset (J, n) and design (J, n, f)."""
-        basis, offset = (a.cpu().double().numpy() for a in (self.basis, self.offset))
-        weights = np.asarray(t)[:, None] ** self.power * self.functions(t)
-        return weights @ offset.T, np.einsum("nkf,jk->jnf", basis, weights)
 
     def _functions(self, tau: Any) -> list[Any]:
         functions = [1 + 0 * tau]

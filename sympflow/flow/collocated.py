@@ -33,7 +33,7 @@ from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
-    from sympflow.kernels.flow_loops import CollocatedFlowKernel
+    from sympflow.flow.loops import CollocatedFlowKernel
 
 MOST_STAGES, MOST_STEPS = 8, 200
 SAMPLED = 100
@@ -180,7 +180,7 @@ class CollocatedFlow(SystemFlow):
         return collocation.advanced(self.bound_system, self.tableau, y, K, per_state(h, y))
 
     def _compiled_for(self, system: HamiltonianSystem) -> CollocatedFlowKernel:
-        from sympflow.kernels.flow_loops import CollocatedFlowKernel
+        from sympflow.flow.loops import CollocatedFlowKernel
 
         return CollocatedFlowKernel(system, self.tableau, self.steps)
 

@@ -564,14 +564,13 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         if domain is None and (system is None or system.y0 is None):
             raise ValueError("`system` is needed, for the flow has no domain to start in: pass one with a `y0`.")
         y0 = np.atleast_2d(system.y0) if domain is None else domain.sample(DRAWN, 0)  # type: ignore[union-attr, arg-type]
-        driven = system is not None and not system.autonomous
         states = [torch.as_tensor(y0, dtype=self.dtype, device=self.device)]
         with torch.no_grad():
             for k in range(DRAWN_STEPS):
-                states.append(self(self.dt, states[-1], **({"t0": k * self.dt} if driven else {})))
+                states.append(self(self.dt, states[-1], **({"t0": k * self.dt} if self.driven else {})))
         y = to_numpy(torch.stack(states, dim=-1)).astype(float)
         error = None
-        if system is not None and system.autonomous and system.conservative:
+        if system is not None and system.keeps_energy:
             H = np.asarray(system.hamiltonian(np.moveaxis(y, -1, 0))).T
             error = (H - H[:, :1]) / (system.energy_scale or np.abs(H[:, :1]))
         heading = f"{repr(self).split(':')[0].strip('<>')}, Δt = {self.dt:g}"

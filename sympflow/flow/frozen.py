@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from sympflow.arrays import untransformed
+from sympflow.compiler import NotCompiled
 from sympflow.flow.known import UNCOMPENSATED, KnownFlow
 from sympflow.flow.records import Provenance, numbers_checksum, read
 from sympflow.flow.tables import PrimedShape, Tables, free_numbers
@@ -20,7 +21,6 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.local import LocalHamiltonian
-    from sympflow.kernels.flow_loops import PrimedFlowKernel
     from sympflow.kernels.networks import NetworkLayer
     from sympflow.kernels.protocol import Kernel
 
@@ -46,11 +46,11 @@ class PrimedKnown(KnownFlow):
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return self.tables.evaluations(n_steps, n_saved, n_extra, backend)
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> PrimedFlowKernel:
+    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         tables = self.tables
         if tables.kernel is not None and tables.kernel.system is system and not compensated:
             return tables.kernel
-        from sympflow.kernels.flow_loops import PrimedFlowKernel
+        from sympflow.flow.loops import PrimedFlowKernel
 
         self.check_compilable()
         if compensated:
@@ -205,7 +205,7 @@ class FrozenNetwork(KnownFlow):
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         if compensated:
-            raise ValueError(UNCOMPENSATED)
+            raise NotCompiled(UNCOMPENSATED)
         return self._kernel
 
     @cached_property

@@ -9,7 +9,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from sympflow.arrays import is_tensor, values
+from sympflow.arrays import values
+from sympflow.compiler import NotCompiled
 from sympflow.flow.records import Provenance
 from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import PROBES, Identity, check_for_flows, recognised, without_friction
@@ -91,7 +92,8 @@ class KnownFlow:
         self.lattice_terms = {} if system.local is None else dict(system.local.terms)
         small = self.known_by(system)
         self.fingerprint, self.system_name = small.fingerprint, system.name
-        self.identity = Identity.of(small, domain)
+        in_common_units = domain is not None or np.isfinite(small.fingerprint).all()
+        self.identity = Identity.of(small, domain if in_common_units else small.domain)
 
     def known_by(self, system: HamiltonianSystem) -> HamiltonianSystem:
         """The system whose H the flow keeps to know another: a few sites of a lattice, else that system itself."""
@@ -154,14 +156,13 @@ class KnownFlow:
             raise ValueError(
                 f"`system` {system.name!r} has {system.ndof} degrees of freedom but the flow {self.ndof}: {remedy}"
             )
-        if not (system.autonomous or self.matches(system)):
-            raise ValueError(
-                f"`system` {system.name!r} is driven, H depends on t, and the flow was trained with another drive or "
-                f"none, for {self.system_name!r}: its amplitude, its frequency or another parameter differs. Pass the "
-                "flow of this system, or train one with sympflow.train(system), from these numbers by "
-                "sympflow.train(system, flow=flow.transferred(system))."
-            )
         if not self.matches(system):
+            system.check_autonomous(
+                f"and the flow was trained with another drive or none, for {self.system_name!r}: its amplitude, its "
+                "frequency or another parameter differs",
+                "pass the flow of this system, or train one with sympflow.train(system), from these numbers by "
+                "sympflow.train(system, flow=flow.transferred(system))",
+            )
             raise ValueError(
                 f"`system` {system.name!r} is not the one that this flow was trained for ({self.system_name!r}, or its "
                 f"parameters differ): {remedy}"
@@ -201,7 +202,7 @@ class KnownFlow:
         """Warn where a time, or one of several, is k·Δt + r with an r at which the flow was fitted to nothing."""
         if not self.unfitted:
             return
-        seen = values(t) if is_tensor(t) else np.asarray(t)
+        seen = values(t)
         if seen is None:  # in a graph that torch.compile traces
             return
         times = np.abs(seen.astype(float)).reshape(-1)
@@ -223,7 +224,7 @@ class KnownFlow:
         """Warn where a run over `passed` from t0 leaves the times for which a drive without a period was fitted."""
         if self.drive_times is None or t0 is None:
             return
-        start, length = (values(each) if is_tensor(each) else np.asarray(each) for each in (t0, passed))
+        start, length = map(values, (t0, passed))
         if start is None or length is None:  # in a graph that torch.compile traces
             return
         if not (start.size and length.size and start.dtype.kind in "fiu"):
@@ -249,7 +250,7 @@ class KnownFlow:
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         """Return the compiled loops of the flow with its present weights, the same while these do not change."""
-        raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
+        raise NotCompiled(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count the evaluations of the system's own functions in a run; a network has none."""

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from sympflow.arrays import jvp
-from sympflow.flow.potentials import NO_NETWORK, Potential, Time
+from sympflow.compiler import NotCompiled
+from sympflow.flow.potentials import NO_NETWORK, Potential, Time, by_time
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -44,12 +44,8 @@ class Layer(nn.Module):
 
     def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """φ_t(x) and d/dt φ_t(x(t)) along a curve with velocity (dq, dp), here by forward-mode differentiation."""
-
-        def along(s: Tensor) -> Tensor:
-            return torch.cat(self(t + s, q + s * dq, p + s * dp))
-
-        x, dx = jvp(along, q.new_zeros(()), q.new_ones(()))
-        return (*x.chunk(2), *dx.chunk(2))
+        x, dx = by_time(lambda s: torch.cat(self(t + s, q + s * dq, p + s * dp)), q)
+        return (*x.split([len(q), len(p)]), *dx.split([len(q), len(p)]))
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         raise NotImplementedError
@@ -59,7 +55,7 @@ class Layer(nn.Module):
 
     def network(self) -> NetworkLayer:
         """Return its weights for compiled loops; a ValueError if it is not a kick or a drift with an MLP potential."""
-        raise ValueError(NO_NETWORK)
+        raise NotCompiled(NO_NETWORK)
 
     def trained(self) -> TrainedNetwork | None:
         """Return its network for compiled derivatives by the parameters; None if there are none."""

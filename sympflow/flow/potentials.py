@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from sympflow.arguments import plain
 from sympflow.arrays import jvp
+from sympflow.compiler import NotCompiled
 from sympflow.flow.weights import check_memory, checked_device, checked_dtype
 from sympflow.lazy import announced, distribution, load_announced
 
@@ -266,30 +267,42 @@ def _short(name: Any) -> str:
     return text if len(text) < 60 else f"{text[:50]} …"
 
 
+def by_time(f: Callable[[Tensor], Tensor], like: Tensor) -> tuple[Tensor, Tensor]:
+    """f(0) and f'(0) of a function of a time ()."""
+    return jvp(f, like.new_zeros(()), like.new_ones(()))
+
+
 class Potential(nn.Module):
     """V(t, x), of which layers need three combinations; a new kind of potential provides these.
 
     Duties
     ------
-    1. `impulse(t, x)`: ∇V(t, x) − ∇V(0, x), shape (d, N).
-    2. `impulse_and_rate(t, x)`: the impulse, and ∂_tV(t, x) of shape (N,).
-    3. `impulse_and_tangent(t, x, dx)`: the impulse, and its derivative along a curve x(t) with velocity dx.
-    4. `to_dict()`: its architecture, JSON-able. For files it has a "type", the name by which the class is registered
+    1. `value(t, x)`: V(t, x), up to a constant, shape (N,).
+    2. `impulse(t, x)`: ∇V(t, x) − ∇V(0, x), shape (d, N).
+    3. `to_dict()`: its architecture, JSON-able. For files it has a "type", the name by which the class is registered
        with `register_potential`, and
-    5. `from_dict(ndof, plan, dtype)`, a class method, builds it again from that, untrained. The file is not to be
+    4. `from_dict(ndof, plan, dtype)`, a class method, builds it again from that, untrained. The file is not to be
        trusted: it checks the plan before it allocates anything.
+
+    `impulse_and_rate` and `impulse_and_tangent` differentiate the first two by forward mode; a class that knows a
+    faster way replaces them.
     """
 
     ndof: int
+
+    def value(self, t: Time, x: Tensor) -> Tensor:
+        raise NotImplementedError
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
         raise NotImplementedError
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
-        raise NotImplementedError
+        """The impulse, and ∂_tV(t, x), shape (N,)."""
+        return self.impulse(t, x), by_time(lambda s: self.value(t + s, x), x)[1]
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
-        raise NotImplementedError
+        """The impulse, and its derivative along a curve x(t) with velocity dx."""
+        return by_time(lambda s: self.impulse(t + s, x + s * dx), x)
 
     def to_dict(self) -> dict[str, Any]:
         raise NotImplementedError
@@ -301,7 +314,7 @@ class Potential(nn.Module):
 
     def network(self, is_kick: bool) -> NetworkLayer:
         """Return the weights of a kick or drift of it for compiled loops; ValueError if there are none."""
-        raise ValueError(NO_NETWORK)
+        raise NotCompiled(NO_NETWORK)
 
     def trained(self) -> TrainedNetwork | None:
         """Return the network for compiled derivatives by its parameters; None if there are none."""
@@ -312,8 +325,8 @@ class MLPPotential(Potential):
     """V(t, x) = c · N(t/τ, x/s), N a multilayer perceptron of any depth whose input is x with t appended.
 
     N(t, x) = w · σ(W_n σ(… σ(K x + k t + b_1) …) + b_n). It has no output bias: a constant in V moves nothing.
-    Its x- and t-derivatives come from one forward and one reverse sweep through the layers, ∂_t∇V from carrying a
-    tangent along both, and the evaluations at t and at 0 share K x.
+    Its derivatives come from one forward and one reverse sweep through the layers, ∂_t∇V from carrying a tangent along
+    both, and the evaluations at t and at 0 share K x.
 
     Parameters
     ----------
@@ -492,7 +505,7 @@ class MLPPotential(Potential):
         from sympflow.kernels.networks import NetworkLayer
 
         if self.features:
-            raise ValueError(
+            raise NotCompiled(
                 "`flow` has networks that take the time of the state, and these have no compiled form: use "
                 "backend='array'."
             )
@@ -517,7 +530,7 @@ class MLPPotential(Potential):
         flat = torch.cat([u.detach().reshape(-1) for u in units]).numpy()
         return TrainedNetwork(self.ndof + self.features, self.hidden, self.activation, flat)
 
-    # V and its derivatives at one time ---------------------------------------------------------------
+    # V, and the combinations that the layers use: t and 0 in one sweep --------------------------------------
 
     def value(self, t: Time, x: Tensor) -> Tensor:
         """V(t, x): (N,)."""
@@ -526,30 +539,6 @@ class MLPPotential(Potential):
         for W_l, b_l in zip(W, b[1:], strict=True):
             h = self._sigma.value(W_l @ h + b_l[:, None])
         return w @ h
-
-    def gradient(self, t: Time, x: Tensor) -> Tensor:
-        """∇V(t, x): (d, N)."""
-        K, r = self._sensitivity(t, x)[:2]
-        return K.T @ r
-
-    def rate(self, t: Time, x: Tensor) -> Tensor:
-        """∂_tV(t, x): (N,)."""
-        _, r, k = self._sensitivity(t, x)
-        return k @ r
-
-    def gradient_tangent(self, t: Time, x: Tensor, dt: float, dx: Tensor) -> Tensor:
-        """The derivative of ∇V along the direction (dt, dx): (d, N). With dx = 0, dt = 1 it is ∂_t∇V."""
-        K, k, b, W, w = self.folded()
-        a = K @ x + outer(k, t) + b[0][:, None]
-        _, dr = self._sweeps_tangent(a, K @ dx + dt * k[:, None], b, W, w)
-        return K.T @ dr
-
-    def hessian(self, t: Time, x: Tensor) -> Tensor:
-        """∇²V(t, x): (d, d, N)."""
-        basis = torch.eye(self.ndof, dtype=x.dtype, device=x.device)
-        return torch.stack([self.gradient_tangent(t, x, 0.0, e[:, None].expand_as(x)) for e in basis], 1)
-
-    # the combinations that the layers use: t and 0 in one sweep -------------------------------------------
 
     def _by_x(self, gradient: Tensor) -> Tensor:
         """The gradient with 0 in the rows of the features."""
@@ -577,11 +566,6 @@ class MLPPotential(Potential):
         return self._by_x(K.T @ (r_t - r_0)), self._by_x(K.T @ (dr_t - dr_0))
 
     # sweeps ---------------------------------------------------------------------------------------------
-
-    def _sensitivity(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """K, r = ∂V/∂a (h_1, N) for the first pre-activation a, and k."""
-        K, k, b, W, w = self.folded()
-        return K, self._sweeps(K @ x + outer(k, t) + b[0][:, None], b, W, w), k
 
     @staticmethod
     def _both_times(t: Time, a: Tensor, k: Tensor) -> Tensor:

@@ -358,7 +358,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
 def _is_timed(system: HamiltonianSystem) -> bool:
     """Return True if the drifts of a kernel must add up to t."""
-    return not (system.autonomous and not system.friction)
+    return not system.keeps_energy
 
 
 def _check_counts(stages: Any, processor: Any) -> None:

@@ -163,8 +163,7 @@ class PrimedDrift(Drift):
     @property
     def _plain(self) -> bool:
         """True without friction and driving."""
-        system = self._binding.system
-        return not system.friction and system.autonomous
+        return self._binding.system.keeps_energy
 
     def _moved(self, s: Time, q: Tensor, p: Tensor, passed: Time = 0.0) -> tuple[Tensor, Tensor]:
         """The linear map of a drift over s, and by how much the time moves with it."""
@@ -174,10 +173,8 @@ class PrimedDrift(Drift):
         else:
             mean, end = system.friction.drift(p.T, _each(s))
             end = end.T
-        change = system.velocity(mean).T
-        if not system.autonomous:
-            change = torch.cat([change, torch.zeros_like(change[:1]) + passed])
-        return q + change, end
+        d = system.ndof
+        return torch.cat([q[:d] + system.velocity(mean).T, q[d:] + passed]), end
 
     def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         if self._plain:
@@ -198,20 +195,16 @@ class PrimedDrift(Drift):
         s, rate = self._time.value(t), self._time.rate(t)
         q, p = self._moved(s, q, p, s)
         dq, dp = self._moved(s, dq, dp, rate)
-        change = rate * system.velocity(p.T).T
-        if not system.autonomous:
-            change = torch.cat([change, torch.zeros_like(change[:1])])
+        d = system.ndof
         if system.friction:
             dp = dp + rate * system.friction.force(p.T).T
-        return q, p, dq + change, dp
+        return q, p, torch.cat([dq[:d] + rate * system.velocity(p.T).T, dq[d:]]), dp
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         system = self._binding.system
         system.check_conservative(
             "and a damped flow is not Hamiltonian", "ask for flow.velocity, or for system.hamiltonian"
         )
-        if system.autonomous:
-            return super().pull_back(t, q, p)
         return *self.inverse(t, q, p), self._time.rate(t) * system.kinetic(p.T)
 
 

@@ -19,12 +19,13 @@ import torch
 from torch import Tensor
 
 from sympflow.arguments import check_flag, plain
-from sympflow.arrays import jvp, to_numpy
+from sympflow.arrays import to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.flow.coefficients import Column
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.known import UNCOMPENSATED
 from sympflow.flow.layers import OwnLayer
-from sympflow.flow.potentials import Time
+from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Memory
@@ -35,7 +36,7 @@ from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts,
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 if TYPE_CHECKING:  # a flow needs it only to be compiled
-    from sympflow.kernels.flow_loops import SplitFlowKernel
+    from sympflow.flow.loops import SplitFlowKernel
 
 MOST_KEPT = 64  # steps whose maps are kept
 KINDS_OF_MODES = ("oscillator", "hyperbolic", "free", "idle")
@@ -96,7 +97,7 @@ class SplitLayer(OwnLayer):
                 V = V - m.gradient * (slope * parts.inverse_masses(X) * slope).sum(-1) / 2
             return V
 
-        return q, p, jvp(generator, q.new_zeros(()), q.new_ones(()))[1]
+        return q, p, by_time(generator, q)[1]
 
     def _apply_map(self, m: SubFlow, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         parts = self.flow.parts
@@ -284,7 +285,7 @@ class SplitFlow(SystemFlow):
         return self._run([m.inverse() for m in reversed(self.maps(t))], y)
 
     def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        return jvp(lambda s: self._map(t + s, y), y.new_zeros(()), y.new_ones(()))
+        return by_time(lambda s: self._map(t + s, y), y)
 
     def _run(self, maps: Sequence[SubFlow], y: Tensor) -> Tensor:
         parts = self.parts
@@ -292,11 +293,11 @@ class SplitFlow(SystemFlow):
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> SplitFlowKernel:
         if compensated:
-            raise ValueError(UNCOMPENSATED)
+            raise NotCompiled(UNCOMPENSATED)
         flow = self.bound(system)
         frozen = flow.frozen()
         if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
-            from sympflow.kernels.flow_loops import SplitFlowKernel
+            from sympflow.flow.loops import SplitFlowKernel
 
             check_compilable(*frozen.placement)
             frozen.kernel = SplitFlowKernel(frozen, flow.parts, flow.dt)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain, real_number
+from sympflow.compiler import NotCompiled
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.known import UNCOMPENSATED
@@ -80,8 +81,10 @@ class Drive:
             )
 
     @classmethod
-    def of(cls, system: HamiltonianSystem, harmonics: int = 2) -> Drive:
-        """The drive of a system: its period, or its `t_span`."""
+    def of(cls, system: HamiltonianSystem, harmonics: int = 2) -> Drive | None:
+        """The drive of a system: its period, or its `t_span`; None where H does not depend on t."""
+        if system.autonomous:
+            return None
         span = (float(min(system.t_span)), float(max(system.t_span))) if system.period is None else None
         return cls(system.period, span, harmonics)
 
@@ -466,11 +469,11 @@ class SympFlow(FlowMap):
         ValueError
             If H does not depend on t, or an argument is not admissible.
         """
-        if system.autonomous:
+        drive = Drive.of(system, plain(harmonics))
+        if drive is None:
             raise ValueError(
                 f"`system` {system.name!r} is not driven, its H does not depend on t: use SympFlow, without t0."
             )
-        drive = Drive.of(system, plain(harmonics))
         return SympFlow(system.ndof, pairs, hidden, activation, dt, dtype, device, seed, scale, drive)
 
     @property
@@ -491,7 +494,7 @@ class SympFlow(FlowMap):
             one of them has a period.
         """
         mine = self.drive
-        drive = None if mine is None or system.autonomous else Drive.of(system, mine.harmonics)
+        drive = None if mine is None else Drive.of(system, mine.harmonics)
         if mine is None or drive is None or (system.ndof, drive.size) != (self.ndof, mine.size):
             raise ValueError(
                 f"`system` {system.name!r} must be driven, with {self.ndof} degrees of freedom and "
@@ -501,10 +504,11 @@ class SympFlow(FlowMap):
 
     def check_system(self, system: HamiltonianSystem) -> None:
         super().check_system(system)
-        own = not system.autonomous and system.period == self.period
+        theirs = Drive.of(system)
+        own = theirs is not None and theirs.period == self.period
         if self.drive is not None and self.fingerprint is None and not own:
             raise ValueError(
-                f"`system` {system.name!r} has {'no drive' if system.autonomous else f'the period {system.period}'}, "
+                f"`system` {system.name!r} has {'no drive' if theirs is None else f'the period {theirs.period}'}, "
                 f"and the flow was made for one of period {self.period}: make one by SympFlow.timed(system)."
             )
 
@@ -538,7 +542,7 @@ class SympFlow(FlowMap):
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         if compensated:
-            raise ValueError(UNCOMPENSATED)
+            raise NotCompiled(UNCOMPENSATED)
         if self._network is None:
             self._network = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
         return self._network.current(self._compiled)
@@ -648,7 +652,7 @@ class SystemFlow(SympFlow):
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         if compensated:
-            raise ValueError(UNCOMPENSATED)
+            raise NotCompiled(UNCOMPENSATED)
         check_compilable(self.dtype, self.device)
         if self._loops is None or self._loops[0] is not system:
             self._loops = system, self._compiled_for(system)
@@ -656,7 +660,7 @@ class SystemFlow(SympFlow):
 
     def _compiled_for(self, system: HamiltonianSystem) -> Kernel:
         """The compiled loops of the flow on a system."""
-        raise ValueError(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
+        raise NotCompiled(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
 
 
 def _pairs_of_layers(

@@ -15,7 +15,6 @@ from sympflow.schemes import POLYNOMIAL as POLYNOMIAL_LEVEL
 from sympflow.schemes import Scheme, scheme_evaluations
 
 if TYPE_CHECKING:
-    from sympflow.kernels.flow_loops import PrimedFlowKernel
     from sympflow.kernels.stages import StageTable
 
 Kind = Literal["kick", "drift"]
@@ -227,7 +226,7 @@ class Tables(Memory):
         last = len(substeps) - outer
         self._parts = {"primed": substeps, "primed kernel": substeps[outer:last], "primed processor": substeps[last:]}
         self.substeps, self.dt, self.processed = substeps, dt, outer > 0
-        self.kernel: PrimedFlowKernel | None = None  # the compiled loops that were made of these last
+        self.kernel: Any = None  # the compiled loops that were made of these last
         self.carried: Any = None  # the flow of another size of a lattice that was made of these last
         self.monomials = monomials
         self.level = POLYNOMIAL_LEVEL if monomials else max(len(s.more) for s in substeps)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.flow.records import numbers_checksum
 
 T = TypeVar("T")
@@ -67,7 +68,12 @@ def _machine_memory() -> float:
 def check_compilable(dtype: torch.dtype, device: torch.device) -> None:
     """Raise a ValueError unless the numbers of a flow are float64 on the CPU, which compiled loops need."""
     if dtype != torch.float64 or device.type != "cpu":
-        raise ValueError(f"`flow` is {dtype} on {device}: compiled flows are float64 on the CPU.")
+        raise NotCompiled(f"`flow` is {dtype} on {device}: compiled flows are float64 on the CPU.")
+
+
+def doubles(values: Tensor) -> np.ndarray:
+    """The values as an array of float64."""
+    return values.detach().cpu().double().numpy()
 
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:

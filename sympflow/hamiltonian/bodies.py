@@ -34,8 +34,12 @@ MOST_WRITTEN = 45
 """Differences of coordinates of two bodies up to which pairs are written out: six bodies in space."""
 MOST_SPELLED_PAIRS = 400
 """Pairs up to which H is written in symbols, term by term, for methods that need it so."""
+ASLANT = np.array([1.0, 0.6180339887498949, 0.3247179572447460])
+"""A direction at which no places differ by accident."""
+STRAIGHT, TINY = 1e-9, float(np.finfo(float).tiny)
+"""Share of a velocity that is across the line between two bodies, below which they move along it."""
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
-"""Pairs up to which the energy at the end of a run is always looked at, and steps beside which it costs nothing."""
+"""Pairs up to which the ends of a run are always looked at, and steps beside which it costs nothing."""
 
 
 class PairsHamiltonian(LocalHamiltonian):
@@ -296,19 +300,38 @@ class PairsHamiltonian(LocalHamiltonian):
         return density[..., 0]
 
     @property
-    def on_a_line(self) -> bool:
-        """True of bodies that would pass through each other to change places, so that differences have signs."""
-        return self.dim == 1 and self.box is None and not self.softening
+    def signed(self) -> bool:
+        """True of bodies that pass at r = 0 if they change places on a line."""
+        return self.box is None and not self.softening
 
     @cached_property
     def poles(self) -> Poles | None:  # type: ignore[override]
         return PairsPoles(self) or None
 
-    def met(self, q: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, list[Any]]]:
-        """The ends i, j (P,) of pairs, their distances, or differences on a line, (..., P), and values of symbols."""
-        for pairs in self._pairs(q):
-            x = pairs.x[0][..., 0] if self.on_a_line else np.sqrt(pairs.s)
-            yield pairs.i, pairs.j, x, pairs.symbol_values
+    def met(self, y: np.ndarray, together: bool = False) -> Iterator[tuple[Any, Any, np.ndarray, list[Any]]]:
+        """The ends i, j (P,) of pairs, their distances (..., P), and values of symbols.
+
+        A distance has a sign on a line, and in space where a pair moves along the line between both, at all of the
+        states if they are taken `together`: it changes as they pass each other.
+        """
+        q, p = y[..., : self.ndof], y[..., self.ndof :]
+        if self.dim == 1 or not self.signed:
+            for pairs in self._pairs(q):
+                yield pairs.i, pairs.j, pairs.x[0][..., 0] if self.signed else np.sqrt(pairs.s), pairs.symbol_values
+            return
+        for pairs in self._pairs(q, p / np.repeat(self.inertia, self.dim)):
+            x, w = pairs.x
+            r, side = np.sqrt(pairs.s), np.sign(x @ ASLANT[: self.dim])
+            straight = _is_straight(x, w)
+            along = straight.all(0, keepdims=True) if together else straight
+            yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values
+
+    def may_pass(self, y: np.ndarray) -> bool:
+        """Return True if two of not too many bodies move along their line, in one of the states (..., 2d)."""
+        if self.n_bodies * (self.n_bodies - 1) // 2 > CHEAP_PAIRS:
+            return False
+        q, v = y[..., : self.ndof], y[..., self.ndof :] / np.repeat(self.inertia, self.dim)
+        return any(_is_straight(*pairs.x).any() for pairs in self._pairs(q, v))
 
     def values_of(
         self, key: str, expressions: list[sp.Expr], x: sp.Symbol, distances: np.ndarray, symbol_values: list[Any]
@@ -463,6 +486,12 @@ def _incidence(n: int) -> np.ndarray:
     """1 at the first and −1 at the second end of each pair of n bodies: (P, n)."""
     i, j = np.triu_indices(n, 1)
     return np.eye(n)[i] - np.eye(n)[j]
+
+
+def _is_straight(x: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """True where velocities w (..., dim) are along differences x of places."""
+    speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
+    return (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
 
 
 def _dot(x: Array, y: Array) -> Array:

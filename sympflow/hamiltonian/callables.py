@@ -20,6 +20,7 @@ from sympflow.arrays import (
     differentiable,
     is_tensor,
     library,
+    library_name,
     like,
     of_library,
     opaque,
@@ -57,6 +58,8 @@ class CallableHamiltonian(Definition):
 
     library: str = ""
     untraced: str = ""
+    guard: Callable[[], None] | None = None
+    """Raises a ValueError if something else has changed that the system is made of."""
     _scene: tuple[Any, ...] = (None, None, None, (0.0, 1.0))
     _functions: tuple[Any, Any, Any, Any]
     _potential: Any
@@ -78,8 +81,8 @@ class CallableHamiltonian(Definition):
         functions = potential, hamiltonian, gradient, hessian_vector
         for (name, arguments), function in zip(_ARGUMENTS.items(), functions, strict=True):
             _check_callable(name, function, gradient)
-            if timed and function is not None and not _is_numba(function):
-                _check_arguments(name, function, f"t, {arguments}")
+            if function is not None and not _is_numba(function):
+                _check_arguments(name, function, arguments, timed)
         if potential is None and (gradient is not None or hessian_vector is not None):
             raise TypeError("`gradient` and `hessian_vector` only go with `potential`: leave them out.")
         self.ndof, self.given, self.timed = ndof, bool(check), timed
@@ -206,7 +209,7 @@ class CallableHamiltonian(Definition):
                         failure or f"{type(error).__name__}: {str(error).splitlines()[0][:160] if str(error) else ''}"
                     )
                     value = np.nan
-                if is_tensor(value) != (name == "torch"):
+                if library_name(value) != name:
                     failure, value = failure or "its result is not a NumPy array", np.nan
                 try:
                     found.append(float(value))
@@ -250,6 +253,8 @@ class CallableHamiltonian(Definition):
 
     def check_unchanged(self) -> None:
         """Raise a ValueError if the function has another value than when it was traced."""
+        if self.guard is not None:
+            self.guard()
         if self.layered is not None:
             state, t, _ = self._known
             expected = float(self.layered.value(state[None, : self.ndof])[0])
@@ -271,6 +276,10 @@ class CallableHamiltonian(Definition):
         if form is None or (is_tensor(x) and self._follows_tensors):
             return None
         return form if self.library == "numpy" or form.size <= MOST_BY_ARRAYS else None
+
+    def _in_place_of(self, function: Any, x: Array) -> TracedHamiltonian | None:
+        """The program in place of a user's function: where that was not given, or takes no tensors such as x."""
+        return self._exact(x) if function is None or is_tensor(x) else None
 
     @cached_property
     def _follows_tensors(self) -> bool:
@@ -311,8 +320,8 @@ class CallableHamiltonian(Definition):
             self.form.check_continuous(self._name)
         if self.form is not None and self.library == "numpy":
             like = np.empty(0) if is_tensor(like) or self._gradient is None else like
-        elif self.differentiates_itself and not is_tensor(like):
-            like = as_tensor(np.empty(0, like.dtype))
+        elif self.differentiates_itself:
+            like = as_tensor(like)
         if self.separable:
             states = states[:, : self.ndof]
         for t in [(s,) for s in times] if self.timed else [()]:
@@ -369,14 +378,14 @@ class CallableHamiltonian(Definition):
 
     def hamiltonian(self, x: Array, *t: Any) -> Array:
         """V of q or H of y, by the function itself, but for tensors that it does not take."""
-        if is_tensor(x) and (form := self._exact(x)) is not None:
+        if (form := self._in_place_of(self._own, x)) is not None:
             return form.value(x, *t)
-        if self._gradient is not None or (self.library == "numpy" and not is_tensor(x)):
+        if self._gradient is not None or self.library == library_name(x) == "numpy":
             return _checked(self._protected(self._own, self._name, t, x), x, self._name, ())
         return _with_torch(partial(self._own, *t), x, self._name, (), self.untraced)
 
     def gradient(self, x: Array, *t: Any) -> Array:
-        if self._gradient is None or (is_tensor(x) and self._exact(x) is not None):
+        if self._gradient is None or self._in_place_of(self._gradient, x) is not None:
             return self._derived("gradient", _gradient_of, x, x.shape[-1:], t)
         return _checked(self._protected(self._gradient, "gradient", t, x), x, "gradient", x.shape[-1:])
 
@@ -428,8 +437,7 @@ class CallableHamiltonian(Definition):
             raise ValueError(f"{refused}, q.copy() ({error}).") from error
 
     def hessian_vector(self, q: Array, v: Array, *t: Any) -> Array:
-        form = self._exact(q)
-        if form is not None and (self._hessian_vector is None or is_tensor(q)):
+        if (form := self._in_place_of(self._hessian_vector, q)) is not None:
             return form.hessian_vector(q, v, *t)
         if self._hessian_vector is None:
             return super().hessian_vector(q, v, *t)
@@ -557,16 +565,17 @@ def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[in
 
 def _checked(value: Any, x: Array, name: str, tail: tuple[int, ...]) -> Array:
     """Return the user's result for x, checked: real numbers of the right shape, in the library and dtype of x."""
-    expected, tensor = (*x.shape[:-1], *tail), is_tensor(x)
+    expected, tensor = (*x.shape[:-1], *tail), library_name(x) == "torch"
     if isinstance(value, int | float) and not tensor:
         value = np.asarray(value)
     shape = getattr(value, "shape", None)
     if shape is None or tuple(shape) != expected:
         raise ValueError(
             f"`{name}` must return shape {expected} for a state part of shape {tuple(x.shape)}; got "
-            f"{type(value).__name__ if shape is None else tuple(shape)}. Reduce over the last axis only."
+            f"{type(value).__name__ if shape is None else tuple(shape)}. Reduce over the last axis only: write "
+            "q[..., 0] in place of q[0], and NumPy's functions in place of those of `math`."
         )
-    if is_tensor(value) != tensor:
+    if library(value) is not library(x):
         given, got = ("a torch tensor", "NumPy's") if tensor else ("a NumPy array", "torch's")
         raise TypeError(
             f"`{name}` must return an array of the library that it is given, {given}; got one of {got}. Write it for "
@@ -608,16 +617,18 @@ class _OverTimes:
         return self.function(beside(t, states[0]) if is_tensor(states[0]) else float(t), *states)
 
 
-def _check_arguments(name: str, function: Callable[..., Any], arguments: str) -> None:
+def _check_arguments(name: str, function: Callable[..., Any], arguments: str, timed: bool) -> None:
     """Raise a TypeError if it is known that a function does not take these arguments."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
         return
+    arguments = f"t, {arguments}" if timed else arguments
     try:
         signature.bind(*arguments.split(","))
     except TypeError as error:
-        raise TypeError(f"`{name}` of a driven system is called with ({arguments}), the time first: {error}.") from None
+        time = "the time first" if timed else "without the time, which a driven system gives where time=True is passed"
+        raise TypeError(f"`{name}` is called with ({arguments}), {time}: {error}.") from None
 
 
 def _time_difference(value: Callable[[Any], Array], t: Any) -> Array:
@@ -649,7 +660,7 @@ class NumbaFunction:
         n = 2 if self.order == 2 else 1
         times, x = tuple(map(float, arguments[:-n])), arguments[-n:]
         at = NumbaFunction(self.functions, self.order, times)
-        return opaque(at, *x) if is_tensor(x[0]) else at.value(*x)
+        return opaque(at, *x)
 
     def value(self, *x: np.ndarray) -> np.ndarray:
         """The values for arrays."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from sympflow.arrays import (
     Array,
+    as_array,
     beside,
     concatenate,
     detached,
@@ -36,14 +37,12 @@ TRACED_ITERATIONS = 8
 def counted_step(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, h: float | Array) -> tuple[Array, int]:
     """One step of length h, a number or (...), from states y (..., 2d) at the time t; Newton's iterations in sum."""
     length = per_state(h, y)
-    K, iterations = stages(system, tableau, y, length, stage_times(system, tableau, t, y, h))
+    K, iterations = stages(system, tableau, y, length, stage_times(tableau, t, y, h))
     return advanced(system, tableau, y, K, length), iterations
 
 
-def stage_times(system: HamiltonianSystem, tableau: Tableau, t: Any, y: Array, h: Any) -> Any:
-    """The times t + c_i h of the stages, (..., s), of a driven system; None of another, whose stages are all alike."""
-    if system.autonomous:
-        return None
+def stage_times(tableau: Tableau, t: Any, y: Array, h: Any) -> Any:
+    """The times t + c_i h of the stages, (..., s)."""
     nodes, batch = stage_nodes(tableau), y.shape[:-1]
     times = [stage_time(t, c, h) for c in nodes]
     return stack([library(y).broadcast_to(beside(s, y), batch) for s in times], axis=-1)
@@ -129,7 +128,7 @@ def _field(system: HamiltonianSystem, Y: Array, h: Any, times: Any, A: Array, sc
 
 def decays(system: HamiltonianSystem, s: Any) -> Array:
     """e^{−Γs} for times s, a number or (...): (..., d, d)."""
-    s = s if is_tensor(s) else np.asarray(s)
+    s = as_array(s)
     return system.friction.drift(like(np.eye(system.ndof), s), s[..., None, None])[1]
 
 

@@ -157,8 +157,7 @@ def doubled(
     made: DoubledSystem
     sympy = sys.modules.get("sympy")
     given = callable(force) and not (sympy is not None and isinstance(force, sympy.Basic))  # a Symbol is callable
-    samples = system.symbols is not None and system.symbols.samples
-    if samples or (not system.autonomous and (given or system.symbols is None)):
+    if given or system.symbols is None or system.symbols.samples:
         system.check_autonomous(
             "by functions of t, or samples, or with a force by a function, which are not doubled",
             "give H and the force by symbols, with the time named, or solve system.vector_field by 'dop853'",
@@ -201,8 +200,8 @@ class GivenForce:
         import torch
 
         value = self.force(torch.as_tensor(q), torch.as_tensor(p))
-        if not is_tensor(value) or tuple(value.shape) != tuple(p.shape):
-            got = tuple(value.shape) if is_tensor(value) else type(value).__name__
+        got = tuple(value.shape) if is_tensor(value) else type(value).__name__
+        if got != tuple(p.shape):
             raise ValueError(
                 f"`force` must return a tensor of the shape of p, {tuple(p.shape)}; got {got}: write it with torch "
                 "functions, for states on the last axis."

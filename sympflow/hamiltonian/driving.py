@@ -16,13 +16,13 @@ import numpy as np
 import sympy as sp
 from sympy.core.symbol import Str
 
-from sympflow.arrays import Array, is_tensor, opaque
+from sympflow.arrays import Array, opaque
 from sympflow.hamiltonian.expression import ELEMENTARY
 
 JUMP = 1e-9
 """Share of the largest value by which both sides of an end of an interval differ where samples jump."""
 
-MOST_TURNS = 1000
+MOST_TURNS = 10_000
 """Periods of samples, and zeros of a function, beyond which jumps are not listed."""
 
 # samples -------------------------------------------------------------------------------------------
@@ -113,11 +113,11 @@ class Samples:
 
     def __call__(self, t: Array, order: int = 0) -> Array:
         """The derivative of an order, −1 for the antiderivative, at times: numbers or arrays; tensors by NumPy."""
-        if is_tensor(t):
-            return opaque(_Derivative(self, order), t)
-        return self._values(np.asarray(t, dtype=float), order)
+        return opaque(_Derivative(self, order), t)
 
-    def _values(self, t: np.ndarray, order: int) -> np.ndarray:
+    def values(self, t: np.ndarray, order: int) -> np.ndarray:
+        """The same at numbers or arrays."""
+        t = np.asarray(t, dtype=float)
         function, (low, high) = self._function(order), self.span
         if not self.periodic:
             return function(t)
@@ -168,7 +168,7 @@ class _Derivative(NamedTuple):
     order: int
 
     def value(self, t: np.ndarray) -> np.ndarray:
-        return self.samples(np.asarray(t), self.order)
+        return self.samples.values(t, self.order)
 
     def vjp(self, x: Sequence[Array], w: Array, wanted: Sequence[bool]) -> tuple[Array]:
         return (w * self.samples(x[0], self.order + 1),)

@@ -17,7 +17,7 @@ from typing import Any
 
 import sympy as sp
 
-from sympflow.hamiltonian.removable import with_sinc
+from sympflow.hamiltonian.removable import Max, Min, with_own_functions
 
 MAX_TEXT = 100_000  # characters
 MAX_NESTING = 100  # brackets and powers in each other
@@ -25,9 +25,7 @@ MAX_EXPONENT = 1000.0  # of a power, where it is a number
 MAX_BITS = 4096  # of an exact fraction; a longer one is rounded
 MAX_TERMS = 50_000  # that the expression may have when it is multiplied out
 MAX_ARGUMENT = 1e4  # of a special function of numbers
-MAX_ARGUMENTS = 64
-MAX_COMPARED = 16
-"""Arguments of Max and Min, each of which is compared with all others in every derivative: 20 s for 16, 150 for 24."""
+MAX_ARGUMENTS = 128
 TERMS_IN_A_ROW = 200
 
 # fmt: off
@@ -42,7 +40,8 @@ SPECIAL = (
 )
 # fmt: on
 FUNCTIONS: dict[str, Callable[..., Any]] = {
-    **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Max", "Min", "Rational", "DiracDelta")},
+    **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Rational", "DiracDelta")},
+    **{"Max": Max, "Min": Min, "max": Max, "min": Min},
     "ln": sp.log,
     "log10": lambda x: sp.log(x) / sp.log(10),
     "log2": lambda x: sp.log(x) / sp.log(2),
@@ -50,11 +49,8 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "expm1": lambda x: sp.exp(x) - 1,
     "hypot": lambda x, y: sp.sqrt(x**2 + y**2),
     "abs": sp.Abs,
-    "max": sp.Max,
-    "min": sp.Min,
 }
 CONSTANTS = {"pi": sp.pi, "E": sp.E, "I": sp.I}
-EXTREMA = ("Max", "Min", "max", "min")
 RELATIONS = {ast.Lt: sp.Lt, ast.LtE: sp.Le, ast.Gt: sp.Gt, ast.GtE: sp.Ge}
 
 
@@ -121,10 +117,7 @@ def of_sympy(expression: sp.Basic, names: Collection[str] = ()) -> sp.Expr:
     f = expression.xreplace(
         {s: sp.Symbol(spelled.get(_normal(s.name), s.name), real=True) for s in expression.free_symbols}
     )
-    f = with_sinc(f)
-    for extremum in f.atoms(sp.Max, sp.Min):
-        _check_compared(type(extremum).__name__, len(extremum.args))
-    return f
+    return with_own_functions(f)
 
 
 def complex_part(f: sp.Expr) -> sp.Expr | None:
@@ -142,14 +135,6 @@ def _normal(name: str) -> str:
 
 def _spelled(names: Collection[str]) -> dict[str, str]:
     return {_normal(name): name for name in names}
-
-
-def _check_compared(name: str, count: int) -> None:
-    if count > MAX_COMPARED:
-        raise Unreadable(
-            f"its {name} has {count} arguments, more than {MAX_COMPARED}: each is compared with every other in all "
-            "derivatives, which takes minutes. Give H by functions, HamiltonianSystem(V, ndof=…)"
-        )
 
 
 def _check_characters(text: str) -> None:
@@ -292,14 +277,14 @@ class _Reader:
 
     def _call(self, node: ast.Call, depth: int) -> tuple[sp.Expr, int]:
         name = node.func.id if isinstance(node.func, ast.Name) else None
-        if node.keywords or len(node.args) > MAX_ARGUMENTS or name is None or name in self.names:
+        if node.keywords or name is None or name in self.names:
             raise Unreadable(f"{_excerpt(node)} is not understood: a function is called by its name, as in sin(q)")
+        if len(node.args) > MAX_ARGUMENTS:
+            raise Unreadable(f"{name} has {len(node.args)} arguments, more than {MAX_ARGUMENTS}: give H by functions")
         if name == "Piecewise":
             return _checked(self._piecewise(node, depth)), 1
         if name not in FUNCTIONS:
             raise Unreadable(f"the function {name} is unknown: {', '.join(sorted(FUNCTIONS))} are known")
-        if name in EXTREMA:
-            _check_compared(name, len(node.args))
         values, counts = zip(*(self.visit(a, depth) for a in node.args), strict=True) if node.args else ((), ())
         numbers = all(v.is_number for v in values)
         if name == "Rational" and not (values and all(v.is_Rational for v in values) and not values[-1].is_zero):

@@ -32,12 +32,14 @@ PROBES = 8
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
-    """H at 8 fixed states less H at a ninth; the entries of Γ follow, of a system with friction."""
+    """H at 8 fixed states less H at a ninth, NaN where it is not finite; then the entries of Γ of a damped system."""
     states = _fixed_states(system.ndof)
     if system.local is not None:
         states[:, : system.ndof] *= system.local.apart
     ninth = np.broadcast_to(states[0], states[1:].shape)
-    H = _energies(system, states[1:]) - _energies(system, ninth)
+    with np.errstate(invalid="ignore"):
+        H = _energies(system, states[1:]) - _energies(system, ninth)
+    H[~np.isfinite(H)] = np.nan  # a file keeps no infinities
     friction = () if system.damping is None else system.damping.ravel().tolist()
     return (*H.tolist(), *friction)
 
@@ -77,16 +79,20 @@ def check_for_flows(system: Hamiltonian, takes_friction: bool = False, takes_dri
         )
 
 
-def recognised(mine: Sequence[float], identity: Identity | None, system: Any) -> bool:
-    """Return True if a fingerprint, and an identity where there is one, are those of a system."""
-    return same_system(mine, system.fingerprint) and (identity is None or identity.agrees(system))
+def recognised(mine: Sequence[float], identity: Identity | None, system: Any, friction: bool = True) -> bool:
+    """Return True if a fingerprint, and an identity where there is one, are those of a system, or but for friction."""
+    if not same_system(mine, system.fingerprint if friction else fingerprint(system)[:PROBES]):
+        return False
+    if np.isfinite(mine[:PROBES]).any():
+        return identity is None or identity.agrees(system)
+    if identity is None:  # in units in which H is finite at none of the common states
+        return False
+    return identity.agrees(system) if len(identity.states) else identity.is_proved(system)
 
 
 def without_friction(mine: Sequence[float], identity: Identity | None, system: Hamiltonian) -> bool:
     """Return True if a fingerprint and an identity are those of a damped system without its friction."""
-    if not system.friction or not same_system(mine, fingerprint(system)[:PROBES]):
-        return False
-    return identity is None or identity.agrees(system)
+    return system.friction is not None and recognised(mine, identity, system, friction=False)
 
 
 Known = WeakKeyDictionary["Hamiltonian", bool]

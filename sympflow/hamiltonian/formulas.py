@@ -7,6 +7,7 @@ functions is `TracedHamiltonian`, whose expressions are programs. Kernels take e
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -172,7 +173,7 @@ class TracedHamiltonian:
             symbols = SymbolicHamiltonian(in_symbols(self.H.program), time="t" if self.time else None)
         except (NotRecorded, ValueError, TypeError):
             return None
-        return symbols if (symbols.ndof, symbols.separable) == (self.ndof, self.separable) else None
+        return symbols if symbols.ndof == self.ndof and symbols.separable >= self.separable else None
 
     @cached_property
     def size(self) -> int:
@@ -282,7 +283,7 @@ class TracedPoles:
                 inputs[form.separable * form.ndof :], gradient(H, inputs)[form.separable * form.ndof :], strict=True
             ):
                 T = T + abs(x * slope)
-            cells = [apply("sign", g) for g in self._vanishing.values()]
+            cells = [_cell(g) for g in self._vanishing.values()]
             self._program = Program(program.inputs, [*cells, H, T])
 
     def __bool__(self) -> bool:
@@ -294,8 +295,19 @@ class TracedPoles:
             if g.name in _AS_THEIR_ARGUMENTS:
                 for x in g.args:
                     self._add(x)
+            elif (
+                g.name == "sub"
+                and isinstance(g.args[1], float)
+                and g.args[1] > 0
+                and (x := _squared(g.args[0])) is not None
+            ):
+                for root in (-math.sqrt(g.args[1]), math.sqrt(g.args[1])):
+                    self._add(x - root)
             elif _least(g) < POSITIVE:
                 self._vanishing[g.order] = g
+                used = [x for x in self._form.H.program.inputs if x.order in _reached(g)]
+                if len(used) == 1 and g is not used[0] and _at_zero(g, used[0]) == 0.0:
+                    self._add(used[0])  # which it may touch
 
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         times = () if self._form.time is None else (np.broadcast_to(t, y.shape[:-1]),)
@@ -307,6 +319,48 @@ class TracedPoles:
     def exact(self) -> Any:
         """The places in symbols, None if they cannot be written."""
         return self._form.written and self._form.written.poles
+
+
+def _squared(x: Any) -> Traced | None:
+    """The x of x²."""
+    if not isinstance(x, Traced):
+        return None
+    if x.name not in ("pow", "mul"):
+        return None
+    base, other = x.args
+    square = other is base if x.name == "mul" else isinstance(other, float) and other == 2
+    return base if square else None
+
+
+def _reached(g: Traced) -> set[int]:
+    """The numbers of the operations and inputs on which a traced number depends."""
+    found, left = set[int](), [g]
+    while left:
+        x = left.pop()
+        if x.order not in found:
+            found.add(x.order)
+            left += [a for a in x.args if isinstance(a, Traced)]
+    return found
+
+
+def _at_zero(g: Traced, x: Traced) -> float:
+    with np.errstate(all="ignore"):
+        return float(Program([x], [g])(np.float64(0.0))[0])
+
+
+_TOUCHING = {"cos": (math.pi, 0.0), "sin": (math.pi / 2, -math.pi / 2), "cosh": (0.0, 0.0)}
+"""Shifts of the arguments at which 1 + f and 1 − f of waves vanish."""
+
+
+def _cell(g: Traced) -> Any:
+    """What is another number beyond a place where g vanishes, of 1 ± cos a too, which touches 0."""
+    parts = [x for x in g.args if isinstance(x, Traced)] if g.name in ("add", "sub") else []
+    number = [x for x in g.args if isinstance(x, float)]
+    if len(parts) != 1 or parts[0].name not in _TOUCHING or [abs(x) for x in number] != [1.0]:
+        return apply("sign", g)
+    wave, (a,) = parts[0].name, parts[0].args
+    opposite = (number[0] < 0) == (g.name == "add")
+    return apply("sign", a) if wave == "cosh" else apply("floor", (a + _TOUCHING[wave][opposite]) / (2 * math.pi))
 
 
 def _is_whole(x: Any) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, library, like
+from sympflow.arrays import Array, as_array, library, like
 
 
 class Friction:
@@ -79,7 +79,7 @@ def _factors(rates: Array, s: Any) -> tuple[Array, Array]:
     """(1 − e^{−γs})/γ and e^{−γs}, the first s where γs is 0."""
     x = rates * s
     xp = library(x)
-    x = x if is_tensor(x) else np.asarray(x)
+    x = as_array(x)
     still = x == 0
     safe = xp.where(still, 1.0 + 0.0 * x, x)
     return s * xp.where(still, 1.0 + 0.0 * x, -xp.expm1(-safe) / safe), xp.exp(-x)

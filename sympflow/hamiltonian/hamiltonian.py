@@ -150,7 +150,8 @@ class Hamiltonian:
     def time_derivative(self, y: Array, t: Any = None) -> Array:
         """∂H/∂t of a driven system, 0 of another: (..., 2d) to (...)."""
         self._check_width(y)
-        return 0 * y[..., 0] if self.autonomous else self.definition.time_derivative(y, *self._time(t, y))
+        times = self._time(t, y)
+        return self.definition.time_derivative(y, *times) if times else 0 * y[..., 0]
 
     def energy_density(self, y: Array, t: Any = None) -> Array:
         """H at each site of a lattice (..., *shape), or each body of pairs (..., n), which add up to H.

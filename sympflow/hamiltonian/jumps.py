@@ -31,6 +31,8 @@ MOST_IMPULSES = 1_000_000
 POINTS_A_PERIOD = 4096
 LONGEST_MULTIPLE = 64
 """Periods of a term that the common period of all may have."""
+NEAR = 1e-3
+"""Share of two places by which they differ, so that what jumps at one is constant at the other."""
 MOST_ROOTS = 64
 """Zeros in a state at which an expression is tried."""
 EPS = float(np.finfo(float).eps)
@@ -67,12 +69,43 @@ def borders(f: sp.Expr, symbols: Iterable[sp.Symbol]) -> list[Border]:
         if g.free_symbols & wanted:
             flipped = g.could_extract_minus_sign()
             sides.setdefault(-g if flipped else g, {})[a] = (below, above) if flipped else (above, below)
-    found = []
+    found, holding = [], dict[sp.Basic, list[sp.Expr]]()
+    known = {a for values in sides.values() for a in values}
+    for term in sp.Add.make_args(f):
+        for a in known.intersection(sp.preorder_traversal(term)):
+            holding.setdefault(a, []).append(term)
+    lines = {g: line for g in sides if (line := _line(g)) is not None}
     for g, values in sorted(sides.items(), key=lambda item: str(item[0])):
-        terms = [term for term in sp.Add.make_args(f) if term.has(*values)]
-        above, below = (tuple(term.xreplace({a: v[i] for a, v in values.items()}) for term in terms) for i in (0, 1))
+        terms = list(dict.fromkeys(term for a in values for term in holding[a]))
+        decided = _decided(g, lines, sides)
+        above, below = (
+            tuple(term.xreplace(decided | {a: v[i] for a, v in values.items()}) for term in terms) for i in (0, 1)
+        )
         if sp.Add(*above) != sp.Add(*below):
             found.append(Border(g, above, below))
+    return found
+
+
+def _line(g: sp.Expr) -> tuple[sp.Symbol, float, float] | None:
+    """The symbol, the slope and the zero of a linear function of one symbol."""
+    if len(g.free_symbols) != 1:
+        return None
+    (s,) = g.free_symbols
+    slope = sp.diff(g, s)
+    return (s, float(slope), float(-g.subs(s, 0) / slope)) if slope.is_number and slope != 0 else None
+
+
+def _decided(
+    g: sp.Expr, lines: Mapping[sp.Expr, tuple[sp.Symbol, float, float]], sides: Mapping[sp.Expr, Mapping[Any, Any]]
+) -> dict[sp.Basic, Any]:
+    """The values of steps at other places of the symbol of a linear g, where that vanishes."""
+    if g not in lines:
+        return {}
+    s, _, at = lines[g]
+    found: dict[sp.Basic, Any] = {}
+    for other, (symbol, slope, zero) in lines.items():
+        if symbol == s and abs(at - zero) > NEAR * max(abs(at), abs(zero)):
+            found |= {a: v[slope * (at - zero) < 0] for a, v in sides[other].items()}
     return found
 
 
@@ -246,6 +279,8 @@ def _roots(
 def _real_roots(coefficients: np.ndarray) -> list[float]:
     if not np.isfinite(coefficients).all():
         return []
+    if len(coefficients) == 2 and coefficients[0]:
+        return [float(-coefficients[1] / coefficients[0])]
     roots = np.roots(coefficients)
     return [float(z.real) for z in roots if abs(z.imag) <= 1e-7 * abs(z)]
 

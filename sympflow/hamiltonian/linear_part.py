@@ -233,13 +233,12 @@ def linear_part(system: Any) -> LinearPart:
             f"`system` {system.name!r} has no linear part: no coordinate that quadratic terms bind has a momentum that "
             "enters H by quadratic terms alone. Use 'implicit_midpoint', 'strang_parts' or a Runge–Kutta method."
         )
-    if part is None and not system.autonomous:
-        raise ValueError(
-            f"`system` {system.name!r} has no linear part: no coordinate has quadratic terms, in q and in p, that do "
-            "not depend on t, and terms that do have no known flow. Use a scheme on the splitting 'kinetic', "
-            "such as 'srkn11b' or 'kahan_li8', or an implicit method."
-        )
     if part is None:
+        system.check_autonomous(
+            "and has no linear part: no coordinate has quadratic terms, in q and in p, that do not depend on t, and "
+            "terms that do have no known flow",
+            "use a scheme on the splitting 'kinetic', such as 'srkn11b' or 'kahan_li8', or an implicit method",
+        )
         raise ValueError(
             f"`system` {system.name!r} has no linear part: its potential has no quadratic terms. Use another splitting "
             "method, such as 'srkn11b', or pass a system with `stiffness_matrix`."

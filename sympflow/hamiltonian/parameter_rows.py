@@ -128,22 +128,24 @@ class ParameterRows:
                 values[index] = math.nan
         return values
 
-    def hamiltonian(self, y: np.ndarray) -> np.ndarray:
-        """H of each trajectory at its states y (*shape, ..., 2d): (*shape, ...)."""
-        if self.system.symbols is None:
-            return self._one_by_one(y)
+    def hamiltonian(self, y: np.ndarray, t: Any) -> np.ndarray:
+        """H of each trajectory at its states y (*shape, ..., 2d) at times that broadcast to these: (*shape, ...)."""
+        symbols = self.system.symbols
+        if symbols is None or symbols.samples or symbols.impulses:
+            return self._one_by_one(y, np.broadcast_to(t, y.shape[:-1]))
         more = (1,) * (y.ndim - 1 - len(self.shape))
         columns = [value.reshape(*self.shape, *more) for value in self.values.values()]
         d = self.system.ndof
-        (H,) = self._function(*(y[..., i] for i in range(2 * d)), *columns)
+        times = () if symbols.time is None else (t,)
+        (H,) = self._function(*(y[..., i] for i in range(2 * d)), *columns, *times)
         return np.broadcast_to(H, y.shape[:-1])
 
-    def _one_by_one(self, y: np.ndarray) -> np.ndarray:
+    def _one_by_one(self, y: np.ndarray, t: np.ndarray) -> np.ndarray:
         """`hamiltonian` by the system of each value."""
-        states = y.reshape(math.prod(self.shape), *y.shape[len(self.shape) :])
+        states, times = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in (y, t))
         H = np.empty(states.shape[:-1])
         for index, system, _ in self.distinct():
-            H[index] = system.hamiltonian(states[index])
+            H[index] = system.hamiltonian(states[index], times[index])
         return H.reshape(y.shape[:-1])
 
     @cached_property
@@ -153,7 +155,7 @@ class ParameterRows:
         H, values = symbols.written
         H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
         parameters = [sp.Symbol(name, real=True) for name in self.values]
-        return generate([printable(H)], [*symbols.q, *symbols.p, *parameters], "numpy")
+        return generate([printable(H)], [*symbols.q, *symbols.p, *parameters, *filter(None, [symbols.time])], "numpy")
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""

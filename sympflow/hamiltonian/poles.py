@@ -11,6 +11,8 @@ import mpmath
 import numpy as np
 import sympy as sp
 
+from sympflow.hamiltonian.removable import Min
+
 __all__ = ["LatticePoles", "PairsPoles", "Place", "Poles", "SymbolicPoles", "places"]
 
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
@@ -245,9 +247,9 @@ class PairsPoles(Poles):
     def __init__(self, pairs: Any) -> None:
         self._pairs, self._x = pairs, sp.Symbol("r", real=True)
         own = [s for s in pairs.of_distance.free_symbols if s.name == "r"]
-        self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if pairs.on_a_line else self._x for s in own})
-        found = places(self._f, (self._x,))
-        self._places = [place for place in found if pairs.on_a_line or place.cell != sp.sign(self._x)]
+        self._f = pairs.of_distance.xreplace({s: sp.Abs(self._x) if self._on_a_line else self._x for s in own})
+        found, self._meeting = places(self._f, (self._x,)), sp.sign(self._x)
+        self._places = [place for place in found if pairs.signed or place.cell != self._meeting]
         self.watched = bool(self._places)
         self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
 
@@ -257,7 +259,10 @@ class PairsPoles(Poles):
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         q, end = y[..., : self._pairs.ndof], self._pairs.cutoff
         sums = np.zeros((*y.shape[:-1], len(self._places)))
-        for i, j, x, letters in self._pairs.met(q):
+        in_space = not self._on_a_line and [place.cell for place in self._places] == [self._meeting]
+        if in_space and not self._pairs.may_pass(y[[0, -1]]):
+            return sums, sums[..., 0], None
+        for i, j, x, letters in self._pairs.met(y):
             cells = self._cells(x, letters)
             beyond = self._cells(np.full_like(x, end), letters) if end else [0.0] * len(cells)
             number = 1 + i * self._pairs.n_bodies + j
@@ -265,12 +270,14 @@ class PairsPoles(Poles):
         return sums, np.where(np.isnan(self._pairs.potential(q)), np.nan, 0.0), None
 
     def passed(self, column: int, t: Sequence[float], y: np.ndarray) -> bool:
-        names = (self._x, *self._pairs.first, *self._pairs.second, *self._pairs.c)
-        for _, _, x, letters in self._pairs.met(y[..., : self._pairs.ndof]):
+        names, cell = (self._x, *self._pairs.first, *self._pairs.second, *self._pairs.c), self._places[column].cell
+        f = self._f.xreplace({self._x: sp.Abs(self._x)}) if cell == self._meeting else self._f
+        for _, _, x, letters in self._pairs.met(y, together=True):
             cells = self._cells(x, letters)[column]
+            x = x if self._on_a_line or cell == self._meeting else np.abs(x)  # noqa: PLW2901
             for k in np.flatnonzero(cells[0] != cells[1])[:MOST_MET]:
                 own = [float(np.broadcast_to(v, x.shape)[0, k]) for v in letters]
-                if infinite_between(self._f, self._places[column].cell, names, *([float(v), *own] for v in x[:, k])):
+                if infinite_between(f, cell, names, *([float(v), *own] for v in x[:, k])):
                     return True
         return False
 
@@ -279,10 +286,17 @@ class PairsPoles(Poles):
         return f"{_written(self._places[column].g.xreplace(names))} = 0 of two bodies"
 
     def visited(self, terms: Cancelling, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([x for _, _, x, _ in self._pairs.met(y[..., : self._pairs.ndof])], axis=-1)
+        found = np.concatenate([x for _, _, x, _ in self._pairs.met(y)], axis=-1)
+        return found if self._on_a_line else np.abs(found)
+
+    @property
+    def _on_a_line(self) -> bool:
+        return self._pairs.dim == 1 and self._pairs.signed
 
     def _cells(self, x: np.ndarray, letters: Sequence[Any]) -> list[np.ndarray]:
-        return self._pairs.values_of("cells", [place.cell for place in self._places], self._x, x, letters)
+        cells, r = [place.cell for place in self._places], x if self._on_a_line else np.abs(x)
+        found = self._pairs.values_of("cells", cells, self._x, r, letters)
+        return [np.sign(x) if cell == self._meeting else value for cell, value in zip(cells, found, strict=True)]
 
 
 def _with_numbers(f: sp.Expr, letters: Sequence[sp.Symbol], params: Any) -> sp.Expr:
@@ -375,7 +389,7 @@ def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
     elif isinstance(g, (sp.Abs, *_ODD)) or (g.is_Pow and g.exp.is_positive):
         yield from _split(g.args[0], x)
     elif g.is_Pow and g.base.func is sp.gamma:
-        yield Place(g, sp.Min(sp.floor(g.base.args[0]), 0))
+        yield Place(g, Min(sp.floor(g.base.args[0]), 0))
     elif g.is_Pow:  # what it divides by is looked for itself
         return
     elif isinstance(g, sp.sin | sp.tan):

@@ -11,14 +11,15 @@ from typing import Any
 import sympy as sp
 from sympy.core.relational import Relational
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
 from sympflow.compiler.program import Program, Traced
-from sympflow.hamiltonian.removable import sinc
+from sympflow.hamiltonian.removable import Max, Min, sinc
 
 __all__ = ["NotRecorded", "calculated", "can_be_recorded", "check_recorded", "in_symbols"]
 
 
-class NotRecorded(ValueError):
+class NotRecorded(NotCompiled):
     """A function in an expression is in no table of the compiler."""
 
 
@@ -66,7 +67,7 @@ _RULES: dict[type, Callable[..., Any]] = {
     sp.elliptic_k: lambda m: apply("ellipk", m), sp.Ei: lambda x: apply("expi", x),
     sp.polygamma: lambda n, x: apply(f"polygamma{int(n)}" if n else "digamma", x),
     sp.sinc: _sinc, sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
-    sp.Max: _folded("max"), sp.Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
+    Max: _folded("max"), Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
     sp.Not: lambda x: apply("not", x),
     sp.StrictLessThan: lambda x, y: apply("lt", x, y), sp.LessThan: lambda x, y: apply("le", x, y),
     sp.StrictGreaterThan: lambda x, y: apply("lt", y, x), sp.GreaterThan: lambda x, y: apply("le", y, x),
@@ -81,7 +82,7 @@ _SYMBOLS: dict[str, Callable[..., sp.Expr]] = {
     "add": lambda x, y: x + y, "sub": lambda x, y: x - y, "mul": lambda x, y: x * y, "times": lambda x, y: x * y,
     "div": lambda x, y: x / y, "neg": lambda x: -x, "fma": lambda x, y, z: x * y + z,
     "pow": lambda x, n: x ** (sp.nsimplify(n) if n.is_Float and 2 * n % 1 == 0 else n), "sqrt": sp.sqrt,
-    "abs": sp.Abs, "sign": sp.sign, "floor": sp.floor, "mod": sp.Mod, "min": sp.Min, "max": sp.Max, "lt": sp.Lt,
+    "abs": sp.Abs, "sign": sp.sign, "floor": sp.floor, "mod": sp.Mod, "min": Min, "max": Max, "lt": sp.Lt,
     "le": sp.Le, "eq": sp.Eq, "and": sp.And, "or": sp.Or, "not": sp.Not,
     "where": lambda c, x, y: sp.Piecewise((x, c), (y, True)), "exp": sp.exp, "expm1": lambda x: sp.exp(x) - 1,
     "log": sp.log, "log1p": lambda x: sp.log(1 + x), "sin": sp.sin, "cos": sp.cos, "tan": sp.tan, "asin": sp.asin,
@@ -115,7 +116,7 @@ def check_recorded(f: sp.Expr) -> None:
     """Raise a ValueError with the term of an expression of which `calculated` has no rule for a function."""
     for term in sp.Add.make_args(f):
         if not can_be_recorded(term):
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` has the term {term}, for which there is no compiled function: use backend='array'."
             )
 

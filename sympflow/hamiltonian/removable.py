@@ -1,4 +1,4 @@
-"""sin(x)/x, as a function with accurate values and derivatives where x is small, and the formulas that mean it."""
+"""Functions that SymPy has otherwise: sin(x)/x, accurate where x is small, Max and Min, compared with numbers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from functools import lru_cache, reduce
 from typing import Any
 
 import sympy as sp
+from sympy.core.sorting import ordered
 
-__all__ = ["sinc", "with_sinc"]
+__all__ = ["Max", "Min", "sinc", "with_own_functions"]
 
 TERMS = 14  # of the series of sin(x)/x, enough for its first derivatives too
 SERIES_UP_TO = 2.0
@@ -41,9 +42,9 @@ class sinc(sp.Function):
         """The same in functions that code has, each branch finite wherever it is evaluated."""
         x, n = self.args[0], self.order
         series, beyond = _branches(n)
-        far = {_X: sp.Max(abs(x), SERIES_UP_TO / 2)}
+        far = {_X: Max(abs(x), SERIES_UP_TO / 2)}
         return sp.Piecewise(
-            (series.xreplace({_X: sp.Max(sp.Min(x, 2 * SERIES_UP_TO), -2 * SERIES_UP_TO)}), abs(x) < SERIES_UP_TO),
+            (series.xreplace({_X: Max(Min(x, 2 * SERIES_UP_TO), -2 * SERIES_UP_TO)}), abs(x) < SERIES_UP_TO),
             (beyond.xreplace(far) * (sp.sign(x) if n % 2 else 1), True),
         )
 
@@ -70,7 +71,65 @@ def _branches(n: int) -> tuple[sp.Expr, sp.Expr]:
     return series * _X ** (n % 2), beyond
 
 
-def with_sinc(f: sp.Expr) -> sp.Expr:
+class _Extremum:
+    """The largest or smallest argument, each compared with numbers alone: SymPy compares all, which takes minutes."""
+
+    above: bool
+    identity: Any
+    args: tuple[Any, ...]
+
+    def __new__(cls, *args: Any, **_: Any) -> Any:
+        constants: dict[sp.Expr, sp.Expr] = {}
+        for each in map(sp.sympify, args):
+            for a in each.args if isinstance(each, cls) else (each,):
+                if a.is_extended_real is False:
+                    raise ValueError(f"The argument {a} is not comparable.")
+                number, rest = (a, sp.S.Zero) if a.is_number else a.as_coeff_Add()
+                if rest not in constants or bool(number > constants[rest]) is cls.above:
+                    constants[rest] = number
+        bound, kept = constants.pop(sp.S.Zero, None), [number + rest for rest, number in constants.items()]
+        if bound is not None:
+            over, under = (a for a in ("is_extended_nonnegative", "is_extended_nonpositive")[:: 1 if cls.above else -1])
+            held = any(getattr(a - bound, over) for a in kept)
+            kept = [a for a in kept if not getattr(a - bound, under)] + [bound] * (not held)
+        if len(kept) < 2:
+            return kept[0] if kept else cls.identity
+        made = sp.Expr.__new__(cls, *ordered(kept))
+        made._argset = frozenset(kept)
+        return made
+
+    def fdiff(self, argindex: int) -> sp.Expr:
+        rest = [a for i, a in enumerate(self.args) if i != argindex - 1]
+        return sp.Heaviside((self.args[argindex - 1] - type(self)(*rest)) * (1 if self.above else -1))
+
+    def _torchcode(self, printer: Any) -> str:
+        return f"{'max' if self.above else 'min'}({', '.join(map(printer._print, self.args))})"
+
+
+class Max(_Extremum, sp.Max):
+    """The largest of some expressions."""
+
+    above = True
+
+
+class Min(_Extremum, sp.Min):
+    """The smallest of some expressions."""
+
+    above = False
+
+
+def with_own_functions(f: sp.Expr) -> sp.Expr:
+    """An expression by `Max`, `Min` and `sinc`."""
+    return _with_sinc(_with_extrema(f))
+
+
+def _with_extrema(f: sp.Basic) -> Any:
+    if not f.has(sp.Max, sp.Min):
+        return f
+    return {sp.Max: Max, sp.Min: Min}.get(f.func, f.func)(*map(_with_extrema, f.args))
+
+
+def _with_sinc(f: sp.Expr) -> sp.Expr:
     """An expression whose sin(a)/b and (1 − cos a)/b² are written by `sinc`, where a vanishes as b does."""
     if f.has(sp.sinc):
         f = f.replace(sp.sinc, sinc)

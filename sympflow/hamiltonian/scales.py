@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from contextlib import suppress
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.hamiltonian.definition import bare_copy
+from sympflow.hamiltonian.definition import Found, bare_copy
 
 STATES = 64
 """States of a domain at which Hessians are taken, where there is no y0."""
@@ -25,21 +24,25 @@ SMALLEST_SCALE = 1e-12
 """|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
 
 
-_KNOWN: WeakKeyDictionary[Any, np.ndarray] = WeakKeyDictionary()
+_KNOWN = Found()
+_STARTED = Found(most=64)
+"""What was found at states: by these default steps, and by one of these and a step the system that starts there."""
 
 
 def natural_scale(scene: Any) -> np.ndarray:
     """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω)."""
     system = scene.between_impulses
-    if system not in _KNOWN:
+
+    def found() -> np.ndarray:
         with np.errstate(all="ignore"):
             try:
                 large = system.local is not None and system.ndof > MOST_DENSE
                 s = _of_large(system) if large else _of_hessians(system)
             except (ArithmeticError, ValueError, TypeError):  # singular at the origin, or no second derivatives
                 s = np.ones(system.ndof)
-        _KNOWN[system] = np.where(np.isfinite(s) & (s > 0), s, 1.0)
-    return _KNOWN[system].copy()
+            return np.where(np.isfinite(s) & (s > 0), s, 1.0)
+
+    return _KNOWN.of(system, "", found).copy()
 
 
 def weights(system: Any) -> np.ndarray:
@@ -106,7 +109,19 @@ def fastest_rate(system: Any) -> float | None:
 
 def default_step(scene: Any, y: np.ndarray | None = None) -> float:
     """`STEP` over the largest rate at states y (..., 2d), by default y0 or those of the domain, to two digits."""
-    system = scene.between_impulses
+    if y is not None:
+        y = _few(y)
+        return _STARTED.of(scene, y.tobytes(), lambda: _step_at(scene.between_impulses, y))
+    return _step_at(scene.between_impulses, None)
+
+
+def _few(y: np.ndarray) -> np.ndarray:
+    """At most `MOST_RATES` or so of the states y (..., 2d), as rows of floats."""
+    rows = y.reshape(-1, y.shape[-1])
+    return rows[:: max(1, len(rows) // MOST_RATES)].astype(float)
+
+
+def _step_at(system: Any, y: np.ndarray | None) -> float:
     rate = 0.0
     if system.ndof <= MOST_DENSE:
         with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
@@ -125,8 +140,7 @@ def _hessians(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
     if y is None:
         y = system.y0
     if y is not None:
-        y = y.reshape(-1, y.shape[-1])
-        y = y[:: max(1, len(y) // MOST_RATES)]
+        y = _few(y)
     elif system.domain is not None:
         y = system.domain.sample(STATES, 0)
     else:
@@ -140,14 +154,19 @@ def started(system: Any, y0: np.ndarray) -> Any:
     """Return the system; without a y0 of its own, a copy with dt, and the state of highest energy of y0 (..., 2d)."""
     if system.y0 is not None:
         return system
-    other = bare_copy(system)
     rows, highest = y0.reshape(-1, y0.shape[-1]).astype(float), 0
-    other.dt = default_step(system, rows) if system.step_is_open else system.dt
-    if len(rows) > 1 and system.autonomous:
+    dt = default_step(system, rows) if system.step_is_open else system.dt
+    if len(rows) > 1:
         with np.errstate(all="ignore"):
-            highest = int(np.argmax(np.nan_to_num(system.hamiltonian(rows), nan=-np.inf, posinf=-np.inf)))
-    other.y0 = rows[highest]
-    return other
+            H = system.between_impulses.hamiltonian(rows, system.t_span[0])
+            highest = int(np.argmax(np.nan_to_num(H, nan=-np.inf, posinf=-np.inf)))
+
+    def other() -> Any:
+        made = bare_copy(system)
+        made.dt, made.y0 = dt, rows[highest]
+        return made
+
+    return _STARTED.of(system, (dt, rows[highest].tobytes()), other)
 
 
 def known_scale(system: Any, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:

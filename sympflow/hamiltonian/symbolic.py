@@ -45,9 +45,9 @@ from sympflow.hamiltonian.jumps import (
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
-from sympflow.hamiltonian.removable import sinc
+from sympflow.hamiltonian.removable import Max, sinc
 
-LARGEST = sys.float_info.max
+LARGEST, TINY = sys.float_info.max, 1e-150
 MOST_LEFT_OUT = 100
 """Degrees of freedom up to the last one that a formula may do without."""
 LONGEST_NAME = 40  # in messages
@@ -257,6 +257,10 @@ class SymbolicHamiltonian(Definition):
         if self.impulses or self.shortest_piece < math.inf:
             return True
         return any(each.at_root or len(each.times(-FAR, FAR, FAR / MOST_POINTS)) for each in self._switches)
+
+    @cached_property
+    def may_jump(self) -> bool:  # type: ignore[override]
+        return bool(self.samples or self._switches)
 
     @cached_property
     def _switches(self) -> list[Switch]:
@@ -704,7 +708,20 @@ def _with_numeric_constants(H: sp.Expr) -> sp.Expr:
 
 def printable(f: sp.Expr) -> sp.Expr:
     """A derivative as code needs it: constants as numbers, sinc written out, the δ of a kink's second one left out."""
-    return _with_numeric_constants(without_deltas(f).replace(sinc, lambda *args: sinc(*args).written_out))
+    f = without_deltas(f).replace(sinc, lambda *args: sinc(*args).written_out)
+    if f.has(Max) and f.has(sp.Heaviside):
+        f = f.replace(lambda e: e.is_Mul and e.has(sp.Heaviside), _bounded_below)
+    return _with_numeric_constants(f)
+
+
+def _bounded_below(f: sp.Mul) -> sp.Expr:
+    """A product with Heaviside(x) and a negative power of Max(x, 0), which is 0/0 in arrays, as 0 for x ≤ 0."""
+    steps = {x.as_base_exp()[0].args[0] for x in f.args if isinstance(x.as_base_exp()[0], sp.Heaviside)}
+    for x in f.args:
+        base, exponent = x.as_base_exp()
+        if exponent.is_negative and isinstance(base, Max) and (held := [s for s in steps if base == Max(s, 0)]):
+            return sp.Piecewise((f.xreplace({base: Max(held[0], TINY)}), held[0] > 0), (0, True))
+    return f
 
 
 def without_deltas(f: sp.Expr) -> sp.Expr:
@@ -716,14 +733,31 @@ def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tu
     """V(q) and T(p) with H = T + V, or (None, None). Constants go to V."""
     qs, ps = set(q), set(p)
     terms = sp.Add.make_args(H)
-    if any(t.free_symbols & qs and t.free_symbols & ps for t in terms):
-        terms = sp.Add.make_args(sp.expand(H))
     mixed = [t for t in terms if t.free_symbols & qs and t.free_symbols & ps]
+    if mixed and _is_mixed(sp.Add(*mixed), q, p):
+        return None, None
     if mixed:
+        terms = sp.Add.make_args(sp.expand(H))
+    if any(t.free_symbols & qs and t.free_symbols & ps for t in terms):
         return None, None
     T = sp.Add(*[t for t in terms if t.free_symbols & ps])
     V = sp.Add(*[t for t in terms if not t.free_symbols & ps])
     return V, T
+
+
+def _is_mixed(f: sp.Expr, q: Sequence[sp.Symbol], p: Sequence[sp.Symbol]) -> bool:
+    """True if f is no sum of a function of q and one of p, by its values at four states; False where these fail."""
+    others = sorted(f.free_symbols - {*q, *p}, key=str)
+    rng = np.random.default_rng(0)
+    a, b, c, d, t = (rng.uniform(0.3, 0.9, n).tolist() for n in (*(len(q),) * 4, len(others)))
+    try:
+        value = generate([f], (*q, *p, *others), "numpy")
+        with np.errstate(all="ignore"):
+            near, far, *crossed = (float(value(*x, *y, *t)[0]) for x, y in ((a, c), (b, d), (a, d), (b, c)))
+    except (TypeError, NameError, ArithmeticError):  # of a function that NumPy has not
+        return False
+    size = abs(near) + abs(far) + sum(map(abs, crossed))
+    return math.isfinite(size) and abs(near + far - sum(crossed)) > 1e-9 * size
 
 
 LONGEST_SUM = 500

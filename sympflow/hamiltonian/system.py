@@ -614,10 +614,13 @@ class HamiltonianSystem(Hamiltonian, Shown):
     @property
     def period(self) -> float | None:  # type: ignore[override]
         """The period of H in t, where one was named, or was that of the system of other parameters and still is."""
-        if self._former_period is not None and not self.autonomous:
-            former, self._former_period = self._former_period, None
-            with suppress(ValueError):
-                self._set_period(former)
+        if self._period is None and self._former_period is not None:
+            try:
+                self._set_period(self._former_period)
+            except ValueError:
+                self._former_period = None
+            except TypeError:  # of values with which H is constant in time: others may make it periodic again
+                pass
         return self._period
 
     def _set_scene(self, params: Mapping[str, Any], scene: Scene) -> None:
@@ -729,7 +732,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         params = {**self.params, **values}
         made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
         # Values of the drive may have changed the period: it is tested where it is asked for.
-        made._former_period = self._former_period if self.autonomous else self.period
+        made._former_period = self.period or self._former_period
         return made
 
     def check_functions(self, y0: Array | None = None) -> None:
@@ -754,8 +757,8 @@ class HamiltonianSystem(Hamiltonian, Shown):
             return
         like = np.empty(0) if y0 is None else y0
         kind = type(like), like.dtype
+        self.definition.check_unchanged()
         if kind in self._tested:
-            self.definition.check_unchanged()
             return
         from sympflow.hamiltonian.function_checks import FEW, probe_states, reach
 

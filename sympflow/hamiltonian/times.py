@@ -7,55 +7,31 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arrays import Array, beside, is_tensor, of_library, to_numpy
 
 
 def stage_time(t: Any, c: float, h: Any) -> Any:
     """t + c·h in double precision, of t and h a number or (...): states may be of less, times never are."""
-    if is_tensor(h):
-        import torch
-
-        h = h.double()
-        t = torch.tensor(t, dtype=torch.float64, device=h.device) if isinstance(t, np.ndarray) else t
-    elif isinstance(h, np.ndarray):
-        h = h.astype(float, copy=False)
-    return t + c * h
+    return t + c * h if isinstance(h, float) else beside(t, h) + c * beside(h, h)
 
 
 def checked_time(t: Any, x: Array, batch: tuple[int, ...]) -> Any:
     """Return a time as a float, or as doubles of the library of x with the shape of the batch; checked."""
     if isinstance(t, float):
         return t
-    if is_tensor(t) or (is_tensor(x) and np.ndim(t)):
-        return _checked_tensor(t, x, batch)
+    tensor = is_tensor(t)
     try:
-        given = np.asarray(t)
-        if given.dtype.kind not in "iuf":
+        given: Any = t if tensor else np.asarray(t)
+        if given.is_complex() if tensor else given.dtype.kind not in "iuf":
             raise TypeError
     except (TypeError, ValueError):
         raise TypeError(f"`t` must be a real number, or an array of them; got {t!r}.") from None
-    _check_shape(given, batch)
-    return given.astype(float, copy=False) if given.ndim else float(given)
-
-
-def _checked_tensor(t: Any, x: Array, batch: tuple[int, ...]) -> Any:
-    import torch
-
-    given = torch.as_tensor(t)
-    if given.is_complex():
-        raise TypeError(f"`t` must be a real number; got {given.dtype}.")
-    _check_shape(given, batch)
-    if is_tensor(x):
-        return given.to(dtype=torch.float64, device=x.device)
-    return to_numpy(given).astype(float)[()]
-
-
-def _check_shape(t: Any, batch: tuple[int, ...]) -> None:
-    if t.ndim and tuple(t.shape) != tuple(batch):
+    if given.ndim and tuple(given.shape) != tuple(batch):
         raise ValueError(
             f"`t` must be a number, or have the shape {tuple(batch)} of the batch, one time a state; got "
-            f"{tuple(t.shape)}."
+            f"{tuple(given.shape)}."
         )
+    return beside(of_library(given, x), x) if tensor or given.ndim else float(given)
 
 
 PROBED = np.array([0.0, 0.1327, 0.3819, 0.7211])

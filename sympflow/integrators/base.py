@@ -13,6 +13,7 @@ import numpy as np
 from sympflow.arguments import check_dt
 from sympflow.arrays import (
     Array,
+    beside,
     is_tensor,
     library_name,
     stack,
@@ -27,7 +28,6 @@ from sympflow.integrators.contract import (
     Outcome,
     Problem,
     Steps,
-    start_of,
 )
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.grid_runs import grid_run
@@ -193,7 +193,7 @@ class OwnSteps(ArraySteps):
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         if self.inner is not None:
             return self.inner.shorter(y, h, t)
-        t = start_of(self.problem.system, t) if np.ndim(t) else t
+        t = beside(t, y) if np.ndim(t) else t
         return self.integrator.checked_step(self.problem.system, t, y, h)
 
     def rollout(

@@ -22,6 +22,8 @@ TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
 """Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
 AT_ROUNDING = 1e-8
 """Errors that may be rounding: below it, steps that are shorter and no better end the search."""
+KEPT = 1e-12
+"""Errors of the energy that are round-off, whatever the step."""
 TRIALS = 12
 MOST_STATES = 16  # of a batch in trials
 SAFETY = 0.5  # of the tolerance, at which a step is aimed
@@ -170,8 +172,9 @@ def choose_step(
         A method of fixed steps, such as "srkn11b"; None for the one that suits the system, as for `solve`.
     tol : float
         The largest error: |H − H₀| relative to `system.energy_scale`, else to |H₀|. Where H is not conserved, with
-        friction or a drive, the difference of H from that of a run with half of the step takes its place. The methods
-        on the logarithmic clock may keep H where the time is wrong: their error is that of the states.
+        friction or a drive, the difference of H from that of a run with half of the step takes its place. Where H is
+        kept whatever the step, as by Gauss methods on a quadratic H, and for the methods on the logarithmic clock, the
+        error is that of the states.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
@@ -233,8 +236,13 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     most = min(length, integrator.longest_step(system))
     h = min(integrator.step_length(system), most)
     good, bad, least = 0.0, math.inf, math.inf
+    kept = math.inf  # the shortest step with which H is kept to rounding
     for _ in range(TRIALS):
         e = error(h)
+        if tol_of == "energy" and e <= KEPT:
+            if h > kept and h >= min(32 * kept, most):  # as by Gauss methods where H is quadratic
+                return step_for(integrator, problem, tol, "state")
+            kept = min(kept, h)
         if e > tol and h < bad and least <= e <= AT_ROUNDING:
             break
         least = min(least, e)

@@ -12,11 +12,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arguments import check_array
+from sympflow.arrays import Array, to_numpy
+from sympflow.hamiltonian.definition import Found
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
@@ -24,36 +25,29 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.grid_runs import Run, broken_off
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper
+from sympflow.kernels.protocol import RunCheckpoint
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
 FIRST_CHUNK = 2**16  # steps, at most, before it is known how fast time goes
-LONGEST_STRIDE = 64  # steps from one state that a compiled pass keeps to the next, where few outputs are wanted
+LONGEST_STRIDE = 64  # steps from one state that a compiled run keeps to the next, where few outputs are wanted
 MOST_KEPT = 100_000_000  # numbers that a run may store where every step is an output
 FEW_EVALUATIONS = 20_000  # of forces on arrays, half a second, before a run whose time hardly advances is ended;
 EVALUATIONS_EACH = 50  # and these for each step of the physical length dt within the interval,
 STEPS_EACH = 6  # or as many as so many steps take
 COMPILED_FOR_ONE = 10  # compiled evaluations that are allowed for one on arrays, which takes a thousand times longer
-MOST_EXPECTED = 1e9  # steps, beyond which the run by chunks says whether they are too many
 
-_TRANSFORMED: WeakKeyDictionary[HamiltonianSystem, dict[float, HamiltonianSystem]] = WeakKeyDictionary()
-_SCALES: WeakKeyDictionary[HamiltonianSystem, dict[float, float]] = WeakKeyDictionary()
+_TRANSFORMED, _SCALES = Found(), Found()
 
 
 def transformed_system(system: HamiltonianSystem, shift: float | None) -> HamiltonianSystem:
     """Return the transformed system, made once for each c."""
     c = default_shift(system) if shift is None else float(shift)
-    made = _TRANSFORMED.setdefault(system, {})
-    if c not in made:
-        made[c] = time_transformed(system, c)
-    return made[c]
+    return _TRANSFORMED.of(system, c, lambda: time_transformed(system, c))
 
 
 def scale_of(system: HamiltonianSystem, c: float) -> float:
     """Return ds/dt where the kinetic energy is c − E, at the energy E of the system's y0; worked out once."""
-    known = _SCALES.setdefault(system, {})
-    if c not in known:
-        known[c] = time_scale(system, c)
-    return known[c]
+    return _SCALES.of(system, c, lambda: time_scale(system, c))
 
 
 ARRAYS_ONLY = (
@@ -65,8 +59,7 @@ ARRAYS_ONLY = (
 class LogarithmicClock(NamedTuple):
     """A method with equal steps in s, on one system.
 
-    The method has an `inner` one, which is applied to the transformed system, with `evaluations` on that; and
-    `reach_times`, a run in one compiled pass as `kernels.elapsed_times.reach_times`, None where there is none.
+    The method has an `inner` one, which is applied to the transformed system, with `evaluations` on that.
     """
 
     method: Any
@@ -74,7 +67,6 @@ class LogarithmicClock(NamedTuple):
     transformed: HamiltonianSystem
     dt: float
     new_step: float
-    numbers: tuple[float, ...] = ()
 
     @property
     def shift(self) -> float:
@@ -83,12 +75,12 @@ class LogarithmicClock(NamedTuple):
 
     # one step -------------------------------------------------------------------------------------
 
-    def step(self, y: Array, h: float | Array) -> Array:
+    def step(self, y: Array, h: float | Array, t: Any = 0.0) -> Array:
         """One step of the physical length h, with B = c − H(y)."""
         rows, lengths = _rows(y, h)
         return projected(self._reached(lifted(self.system, rows, self.shift), lengths)[0]).reshape(y.shape)
 
-    def inverse(self, y: Array, h: float | Array) -> Array:
+    def inverse(self, y: Array, h: float | Array, t: Any = 0.0) -> Array:
         """The states from which `step` leads to y."""
         rows, lengths = _rows(y, h)
         system, c = self.system, self.shift
@@ -100,7 +92,7 @@ class LogarithmicClock(NamedTuple):
                 break
         return x.reshape(y.shape)
 
-    def tangent(self, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
+    def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian in [q, p], the realised step in s and B held fixed."""
         rows, lengths = _rows(to_numpy(y), h)
         end, sigma = self._reached(start := lifted(self.system, rows, self.shift), lengths)
@@ -131,11 +123,12 @@ class LogarithmicClock(NamedTuple):
     def run(self, problem: Problem) -> Outcome:
         """Solve the problem."""
         self.method.check_library(problem.y0)
-        return timed_pass(self, problem) or PhysicalRun(self, problem).outcome()
+        return PhysicalRun(self, problem).outcome()
 
     def steps(self, t_span: tuple[float, float], y0: Array) -> Steps:
         """The steps of the run, their physical lengths; in a batch one that has ended waits with length 0."""
         run = PhysicalRun(self, Problem(self.system, *t_span, y0))
+        run.stride = 1
         sign, batch = run.sign, y0.shape[:-1]
         for states, last in run.chunks():
             t = run.sign * states[..., self.system.ndof]
@@ -150,8 +143,7 @@ class LogarithmicClock(NamedTuple):
 
 def _rows(y: Array, h: Any) -> tuple[np.ndarray, np.ndarray]:
     """States as rows, and a length for each."""
-    if is_tensor(y):
-        raise TypeError("`y` is a tensor: the logarithmic methods step NumPy arrays; pass y.numpy().")
+    check_array(y, "the logarithmic methods step NumPy arrays")
     rows = np.asarray(y).reshape(-1, y.shape[-1])
     return rows, np.broadcast_to(np.asarray(h, dtype=rows.dtype), y.shape[:-1]).reshape(-1)
 
@@ -186,7 +178,7 @@ def reach(
     """The states step(σ), σ from 0 to `longest`, whose time is `target`, and σ: the secant method within brackets."""
     d = start.shape[1] // 2 - 1
     eps = float(np.finfo(start.dtype).eps)
-    tolerance = 2 * eps * np.maximum(np.abs(target), np.abs(start[:, d]))
+    tolerance = 4 * eps * np.maximum(np.abs(target), np.abs(start[:, d]))
     low, high = np.zeros_like(longest), longest.copy()
     sign = np.sign(longest)
     sigma = np.where((guess - low) * sign < 0, low, np.where((guess - high) * sign > 0, high, guess))
@@ -195,7 +187,7 @@ def reach(
     for _ in range(80):
         x = step(sigma)
         residual = x[:, d] - target
-        better = np.abs(residual) < best_residual
+        better = (np.abs(residual) < best_residual) & (best_residual > tolerance)  # others are done
         best[better], best_sigma[better], best_residual[better] = x[better], sigma[better], np.abs(residual)[better]
         if not (best_residual > tolerance).any():
             break
@@ -254,6 +246,12 @@ class PhysicalRun(Run):
         self.out[self.wanted == 0] = projected(self.start)
         self.delivered = np.full(len(rows), int((self.wanted == 0).sum()))
         self.kept: list[tuple[np.ndarray, np.ndarray]] = []
+        if len(self.wanted) and not problem.dense_output:
+            self.length = abs(float(self.wanted[-1]))  # nothing is asked for beyond
+        self.stride = 1
+        """Steps from one state of a chunk to the next: those between are made again where an output is due."""
+        if self.stepper.compiled and times is not None and not problem.dense_output:
+            self.stride = int(min(max(1.0, self.length / self.dt / (len(times) + 1)) ** 0.5, LONGEST_STRIDE))
 
     def _stepper(self) -> Stepper:
         clock, start = self.clock, self.start[0] if len(self.start) == 1 else self.start
@@ -277,36 +275,43 @@ class PhysicalRun(Run):
         return int(allowance * (FEW_EVALUATIONS / stages + max(EVALUATIONS_EACH / stages, STEPS_EACH) * nominal))
 
     def chunks(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Chunks of states (N, n + 1, 2d + 2), and the last one (N,) of each trajectory, at or past its end."""
-        x, rows, total = self.start, np.arange(len(self.start)), 0
+        """Chunks of states (N, m + 1, 2d + 2), and the last one (N,) of each trajectory, at or past its end."""
+        x, rows, carry = self.start, np.arange(len(self.start)), RunCheckpoint()
         n = self._chunk(1.1 * self.length / self.dt + 2, FIRST_CHUNK)
         running = np.full(len(x), self.length > 0)
         while running.any():
-            n = min(n, max(1, self.most_steps - total))
-            if running.all():
-                states, good = self._steps(x, n)
-            else:
-                states, good = np.zeros((len(x), n + 1, x.shape[1]), x.dtype), np.zeros(len(x), dtype=int)
-                states[:, 0] = x
-                states[running], good[running] = self._steps(x[running], n)
+            m = -(-min(n, max(1, self.most_steps - carry.steps)) // self.stride)
+            before = carry.steps, carry.running
+            states, good = np.zeros((len(x), m + 1, x.shape[1]), x.dtype), np.zeros(len(x), dtype=int)
+            states[:, 0] = x
+            states[running, 1:], good[running] = self._steps(x, running, m, carry)
             t = self.sign * states[..., self.d]
             forward = t[:, 1:] >= t[:, :-1]
-            good = np.minimum(good, np.where(forward.all(1), n, np.argmin(forward, axis=1)))  # time must not turn
-            passed = (t >= self.length) & (np.arange(n + 1) <= good[:, None])
-            last = np.where(passed.any(1), passed.argmax(1), good)
-            last[~running] = 0
-            lost = running & ~passed.any(1) & (good < n)
-            total += n
-            if total >= self.most_steps:
-                self.stalled = running & ~passed.any(1) & ~lost
+            good = np.minimum(good, np.where(forward.all(1), m, np.argmin(forward, axis=1)))  # time must not turn
+            passed = (t >= self.length) & (np.arange(m + 1) <= good[:, None])
+            ends = running & passed.any(1)
+            last = np.where(ends, passed.argmax(1), np.where(running, good, 0))
+            lost = running & ~ends & (good < m)
+            if self.stride > 1 and lost.any():  # their ends are found step by step
+                self.stride = 1
+                carry.advance(*before)
+                n = self._chunk(n, n)
+                continue
+            if carry.steps >= self.most_steps:
+                self.stalled = running & ~ends & ~lost
                 lost |= self.stalled
-            self.n_steps += last
+            self.n_steps += last * self.stride
+            if self.stride > 1 and ends.any():
+                self.n_steps[ends] -= self.stride - self._within(states[ends, last[ends] - 1], self.length)[1] - 1
             self.elapsed = np.nan_to_num(t[rows, last], posinf=np.inf)  # 0 of a start that is not finite
             self._end(lost)
             yield states, last
-            paces = np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last, 1), np.nan)
+            paces = np.where(running, (t[rows, last] - t[:, 0]) / np.maximum(last * self.stride, 1), np.nan)
             pace = np.fmin.reduce(paces)  # of those that are numbers, if any is
-            running = running & ~passed.any(1) & ~lost
+            go_on = running & ~ends & ~lost
+            if len(rows) > 1 and carry.running is not None:
+                carry.running = carry.running[go_on[running]]
+            running = go_on
             x = states[rows, last]
             left = (self.length - self.elapsed[running]).max(initial=0.0)
             n = self._chunk(1.02 * left / pace + 2 if pace > 0 else np.inf, 4 * n)
@@ -317,13 +322,30 @@ class PhysicalRun(Run):
 
     def _chunk(self, steps: float, most: int) -> int:
         """The number of steps of a chunk that is to have so many, or the most that there may be."""
-        return int(min(max(16, steps if steps < most else most) + 1, max(16, LARGEST_CHUNK // self.start.size)))
+        largest = self.stride * LARGEST_CHUNK // self.start.size
+        return int(min(max(16, steps if steps < most else most) + 1, max(16, largest)))
 
-    def _steps(self, x: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """The states (N, 1 + n, 2d + 2) of n steps from x (N, 2d + 2), and the last finite ones."""
-        alone = len(x) == 1
-        found, finite = self.stepper.rollout(x[0] if alone else x, self.h, n, np.arange(n + 1))
-        return (found[None] if alone else np.moveaxis(found, 0, 1)), np.atleast_1d(finite)
+    def _steps(self, x: np.ndarray, rows: np.ndarray, m: int, carry: RunCheckpoint) -> tuple[np.ndarray, np.ndarray]:
+        """The next m states of some rows, which go on from the carry and are at x, and the last finite ones."""
+        begun, n = carry.steps, m * self.stride
+        start, going = (self.start, carry) if self.stepper.takes_carry else (x, RunCheckpoint())
+        save, alone = np.arange(self.stride, n + 1, self.stride) + going.steps, len(x) == 1
+        found, finite = self.stepper.rollout(start[0] if alone else start[rows], self.h, save[-1], save, carry=going)
+        carry.steps = begun + n
+        good = (np.atleast_1d(finite) - (save[-1] - n)) // self.stride
+        return (found[None] if alone else np.moveaxis(found, 0, 1)), good
+
+    def _within(self, start: np.ndarray, target: Any) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+        """The states before and after the elapsed times `target`, of steps from `start` (M, 2d + 2), and their number.
+
+        That many whole steps are before the first one.
+        """
+        save = np.arange(self.stride + 1)
+        states = np.moveaxis(self.stepper.rollout(start, self.h, self.stride, save)[0], 0, 1)
+        self.n_extra += len(start) * self.stride
+        ahead = self.sign * states[..., self.d] >= np.reshape(target, (-1, 1))
+        k, rows = np.where(ahead.any(1), ahead.argmax(1), self.stride).clip(1) - 1, np.arange(len(start))
+        return (states[rows, k], states[rows, k + 1]), k
 
     def reach(self, before: np.ndarray, after: np.ndarray, target: np.ndarray) -> np.ndarray:
         """States [q, t, p, B] at the elapsed times `target`, within the steps from `before` to `after`."""
@@ -385,7 +407,7 @@ class PhysicalRun(Run):
         failed = np.isfinite(self.failed_at)
         n_steps = int(self.n_steps.max(initial=0))
         status: Any = -int(failed[0]) if single else np.where(failed, -1, 0).reshape(y.shape[1:-1])
-        stats = self.stats(n_steps, n_steps, n_steps, self.n_extra)
+        stats = self.stats(n_steps, n_steps, n_steps // self.stride, self.n_extra)
         outcome = Outcome(times, y, status, finished(problem), stats, path if problem.dense_output else None)
         if failed.any() and not self.stopped:
             stats["failed_at"] = float(self.failed_at[0]) if single else self.failed_at.reshape(y.shape[1:-1])
@@ -414,7 +436,10 @@ class PhysicalRun(Run):
             k = np.concatenate([t[i, : last[i] + 1].searchsorted(due[row == i]) for i in np.flatnonzero(count)])
         k = k.clip(1) - 1
         if len(row):
-            self.out[output, row] = projected(self.reach(states[row, k], states[row, k + 1], wanted[output]))
+            ends = states[row, k], states[row, k + 1]
+            if self.stride > 1:
+                ends, _ = self._within(ends[0], due)
+            self.out[output, row] = projected(self.reach(*ends, wanted[output]))
         self.delivered = delivered + count
 
     def _every_step(self, path: _Path | None) -> tuple[np.ndarray, np.ndarray]:
@@ -460,53 +485,3 @@ class _Path(DenseOutput):
             found[run.sign * target > run.sign * x[-1, run.d]] = np.nan
             rows.append(found)
         return np.stack(rows, axis=1).reshape(len(times), *run.problem.y0.shape)
-
-
-def timed_pass(clock: LogarithmicClock, problem: Problem) -> Outcome | None:
-    """The outcome of a run, or None where there is no compiled pass for it or it did not reach its end."""
-    system, y0, times = problem.system, problem.y0, problem.t_eval
-    length, dt = abs(problem.t1 - problem.t0), clock.dt
-    if problem.dense_output or problem.backend == "array" or y0.dtype != np.float64 or system.written is None:
-        return None
-    far = max(abs(problem.t0), abs(problem.t1))
-    if not length or length > MOST_EXPECTED * dt or far + dt == far:
-        return None
-    if times is None:
-        if y0.ndim == 1:
-            return None
-        times = Grid(problem.t0, problem.t1, dt).outputs(None, problem.save_every)
-    sign = 1.0 if problem.t1 > problem.t0 else -1.0
-    elapsed = sign * (times - problem.t0)
-    if not len(elapsed) or not elapsed[-1]:
-        return None
-    first = 0 if elapsed[0] else int(elapsed.searchsorted(0.0, "right"))
-
-    transformed = clock.transformed
-    from sympflow.kernels.elapsed_times import lifted_rows
-
-    start = lifted_rows(system, y0.reshape(-1, y0.shape[-1]), transformed.params["shift"])
-    if start is None:
-        return None
-    expected = float(elapsed[-1]) / dt
-    stride = int(min(max(1.0, (length / dt / (len(elapsed) + 1)) ** 0.5), LONGEST_STRIDE))
-    h = sign * clock.new_step
-    found = clock.method.reach_times(clock, h, start, elapsed[first:], stride, expected, problem.backend)
-    if found is None:
-        return None
-    Y, counts = found
-    if first:
-        initial = y0.reshape(1, -1, y0.shape[-1])
-        Y = np.concatenate([np.broadcast_to(initial, (first, *initial.shape[1:])), Y])
-    if y0.ndim == 1:
-        n_steps, n_extra = counts[0].tolist()
-        status: Any = 0
-    else:
-        n_steps, n_extra = int(counts[:, 0].max()), int(counts[:, 1].sum())
-        status = np.zeros(y0.shape[:-1], dtype=int)
-    stats = {
-        "dt": dt,
-        "n_steps": n_steps,
-        **clock.method.evaluations(n_steps, n_steps, n_extra, "compiled"),
-        "backend": "compiled",
-    }
-    return Outcome(times, Y.reshape(len(times), *y0.shape), status, finished(problem), stats, finite=True)

@@ -13,11 +13,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, ClassVar
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.arrays import Array, concatenate, is_tensor, library, like, per_state, to_numpy
+from sympflow.arrays import Array, as_array, concatenate, library, like, per_state, to_numpy
+from sympflow.compiler import NotCompiled
+from sympflow.hamiltonian.definition import Found
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.splitting_loops import SplittingLoops
     from sympflow.kernels.tangents import TangentKernel
 
-_PARTS: WeakKeyDictionary[HamiltonianSystem, dict[Any, Any]] = WeakKeyDictionary()
+_PARTS = Found()
 
 
 class Composition(ABC, ArraySteps):
@@ -120,14 +121,14 @@ class Composition(ABC, ArraySteps):
 
     def tangent_kernel(self, vectors: int) -> TangentKernel:
         """The compiled loops with k deviation vectors; a ValueError says why there are none."""
-        raise ValueError(
+        raise NotCompiled(
             f"`method` {self.method!r} has compiled deviation vectors on the splittings 'kinetic' and 'kepler' only: "
             "use backend='auto'."
         )
 
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
         """The same with the parameters of these names as numbers by which runs are differentiated."""
-        raise ValueError(f"`method` {self.method!r} has no compiled derivatives by parameters.")
+        raise NotCompiled(f"`method` {self.method!r} has no compiled derivatives by parameters.")
 
 
 MOST_GROWTH = 1.0
@@ -146,9 +147,11 @@ class KineticPotential(Composition):
     def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem) -> None:
         self.method, self.scheme, self.system = method, scheme, system
         if not system.separable:
+            is_sum = system.written is not None and system.written.separable
             raise ValueError(
-                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is not: use "
-                f"{system.definition.instead}."
+                f"`method` {method!r} needs a separable system, H = T(p) + V(q), and {system.name!r} is "
+                + ("given by one function: define it with V as `potential` and M as `mass`, or " if is_sum else "not: ")
+                + f"use {system.definition.instead}."
             )
         if (scheme.nystrom or scheme.level) and not system.quadratic_kinetic:
             raise ValueError(
@@ -184,25 +187,22 @@ class KineticPotential(Composition):
         return [stage_time(t, c, h) for c in self.scheme.substep_times]
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        system = self.system
-        q, p = y[..., : system.ndof], y[..., system.ndof :]
-        times, h = self._times(t, h), per_state(h, y)
-        for substep, at in zip(self.scheme.substeps, times, strict=True):
-            if substep.kind == "drift":
-                q, p = system.drifted(q, p, at, substep.one * h)
-            else:
-                p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
-        return concatenate([q, p])
+        return self._moved(y, h, t, 1)
 
     def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        system = self.system
+        return self._moved(y, h, t, -1)
+
+    def _moved(self, y: Array, h: Any, t: Any, sign: int) -> Array:
+        """The substeps in their order, or with the sign −1 undone in the other one."""
+        system, substeps = self.system, self.scheme.substeps
         q, p = y[..., : system.ndof], y[..., system.ndof :]
         times, h = self._times(t, h), per_state(h, y)
-        for substep, at in zip(reversed(self.scheme.substeps), reversed(times), strict=True):
-            if substep.kind == "kick":
-                p = p - _kick(system, q, substep, h, self.scheme.monomials, at)
+        for substep, at in zip(substeps[::sign], times[::sign], strict=True):
+            if substep.kind == "drift":
+                q, p = system.drifted(q, p, at, substep.one * h, sign)
             else:
-                q, p = system.drifted(q, p, at, substep.one * h, -1.0)
+                change = _kick(system, q, substep, h, self.scheme.monomials, at)
+                p = p + change if sign > 0 else p - change
         return concatenate([q, p])
 
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
@@ -260,9 +260,9 @@ class KineticPotential(Composition):
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
         system = self.system
         if system.symbols is None:
-            raise ValueError(f"`system` {system.name!r} is not symbolic.")
+            raise NotCompiled(f"`system` {system.name!r} is not symbolic.")
         if system.kinetic_timed:
-            raise ValueError(f"`system` {system.name!r} has a kinetic energy that depends on t.")
+            raise NotCompiled(f"`system` {system.name!r} has a kinetic energy that depends on t.")
         kernel = _splitting_loops()(system, names).kernel(self.scheme, compensated)
         kernel.check_reverse()
         return kernel
@@ -348,8 +348,14 @@ class ExactMaps(Composition):
         """The maps of a step of length h, a number or an array (...)."""
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        return self._moved(self.maps(h), y, h, t)
+
+    def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
+        return self._moved([m.inverse() for m in reversed(self.maps(h))], y, h, t)
+
+    def _moved(self, maps: Sequence[SubFlow], y: Array, h: Any, t: Any) -> Array:
         parts = self.parts
-        return parts.from_modes(*parts.apply(self.maps(h), *parts.to_modes(y), t, h))
+        return parts.from_modes(*parts.apply(maps, *parts.to_modes(y), t, h))
 
     def jvp(self, y: Array, h: Array, W: np.ndarray, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         parts, linear, d = self.parts, self.parts.linear, self.parts.ndof
@@ -364,15 +370,22 @@ class ExactMaps(Composition):
         moved = np.concatenate([linear.positions(U), linear.momenta(P)], axis=-1)
         return parts.from_modes(*found[0]), moved.swapaxes(-1, -2)
 
-    def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        parts = self.parts
-        back = [m.inverse() for m in reversed(self.maps(h))]
-        return parts.from_modes(*parts.apply(back, *parts.to_modes(y), t, h))
-
     def rollout(
         self, y0: Array, h: float, n_steps: int, save: np.ndarray, t0: float = 0.0, carry: RunCheckpoint | None = None
     ) -> tuple[Array, np.ndarray]:
-        return rollout_in_modes(self.parts, self.maps(h), y0, n_steps, save, h, t0, carry)
+        """See `Stepper.rollout`: in the modes from beginning to end."""
+        parts, d = self.parts, self.parts.ndof
+        start = parts.to_modes(y0)
+        known = parts.prepared(self.maps(h), start[0])
+
+        def step(k: int, z: Array) -> Array:
+            return concatenate(parts.apply(known, z[..., :d], z[..., d:], t0 + k * h, h))
+
+        modes, finite = rollout(step, concatenate(start), n_steps, save, carry=carry)
+        states = parts.from_modes(modes[..., :d], modes[..., d:])
+        if not (len(save) and save[0] == 0):
+            return states, finite
+        return concatenate([y0[None], states[1:]], 0), finite
 
     def kernel(self, compensated: bool) -> Kernel:
         from sympflow.kernels.parts_loops import parts_loops
@@ -391,31 +404,6 @@ def maps_of_step(composition: ExactMaps, h: float) -> Sequence[SubFlow]:
     return composition.maps(h)
 
 
-def rollout_in_modes(
-    parts: ExactParts,
-    maps: Sequence[SubFlow],
-    y0: Array,
-    n_steps: int,
-    save: np.ndarray,
-    h: float,
-    t0: float,
-    carry: RunCheckpoint | None = None,
-) -> tuple[Array, np.ndarray]:
-    """`steppers.rollout` of exact flows, in the modes from beginning to end."""
-    d = parts.ndof
-    start = parts.to_modes(y0)
-    known = parts.prepared(maps, start[0])
-
-    def step(k: int, z: Array) -> Array:
-        return concatenate(parts.apply(known, z[..., :d], z[..., d:], t0 + k * h, h))
-
-    modes, finite = rollout(step, concatenate(start), n_steps, save, carry=carry)
-    states = parts.from_modes(modes[..., :d], modes[..., d:])
-    if not (len(save) and save[0] == 0):
-        return states, finite
-    return concatenate([y0[None], states[1:]], 0), finite
-
-
 class LinearRest(ExactMaps):
     """H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): kicks by U, and drifts replaced by the exact linear flow."""
 
@@ -425,10 +413,7 @@ class LinearRest(ExactMaps):
         super().__init__(method, scheme, system)
         from sympflow.hamiltonian.parts import linear_and_rest
 
-        known = _PARTS.setdefault(system, {})
-        if "linear" not in known:
-            known["linear"] = linear_and_rest(system)
-        self.parts = known["linear"]
+        self.parts = _PARTS.of(system, "linear", lambda: linear_and_rest(system))
         if scheme.nystrom and any(part.turns for part in self.parts.rest):
             raise ValueError(
                 f"`method` {method!r} has a Nyström scheme, which needs a rest of H that is a potential U(q), and that "
@@ -500,7 +485,7 @@ class MidpointLinearRest(LinearRest):
 
 def _each_class(s: Any, parts: ExactParts) -> Any:
     """A time (...) for all F frequencies: (..., F)."""
-    s = s if is_tensor(s) else np.asarray(s, dtype=getattr(s, "dtype", float))
+    s = as_array(s if hasattr(s, "dtype") else float(s))
     return s[..., None] * like(np.ones(parts.n_classes), s)
 
 
@@ -528,10 +513,7 @@ class SolvableParts(ExactMaps):
         """The parts of a system, found once."""
         from sympflow.hamiltonian.parts import exact_parts
 
-        known = _PARTS.setdefault(system, {})
-        if parts not in known:
-            known[parts] = exact_parts(system, parts)
-        return known[parts]
+        return _PARTS.of(system, parts, lambda: exact_parts(system, parts))
 
     def maps(self, h: Any) -> list[SubFlow]:
         *others, innermost = self.parts.sequence
@@ -565,13 +547,12 @@ class TwoCopies(SolvableParts):
         super().__init__(method, scheme, system)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
-        known = _PARTS.setdefault(system, {})
-        key = "copies", self.omega
-        if key not in known:
-            from sympflow.hamiltonian.copies import coupling_strength, two_copies
+        from sympflow.hamiltonian.copies import coupling_strength, two_copies
 
-            known[key] = two_copies(system, coupling_strength(system) if self.omega is None else float(self.omega))
-        return known[key]
+        def make() -> ExactParts:
+            return two_copies(system, coupling_strength(system) if self.omega is None else float(self.omega))
+
+        return _PARTS.of(system, ("copies", self.omega), make)
 
     def lift(self, y: Array) -> Array:
         from sympflow.hamiltonian.copies import both
@@ -610,19 +591,7 @@ class KeplerInteraction(Composition):
             )
         if system.friction:
             raise ValueError(f"`method` {method!r} does not take friction: use the splitting 'kinetic'.")
-        known = _PARTS.setdefault(system, {})
-        if "kepler" not in known:
-            from sympflow.hamiltonian.planets import frame_of
-
-            frame = frame_of(system.local, system.y0)
-            if frame is None:
-                raise ValueError(
-                    f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
-                    "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
-                )
-            frame.check(method)
-            known["kepler"] = frame
-        self.frame: Frame = known["kepler"]
+        self.frame: Frame = _PARTS.of(system, "kepler", lambda: _frame_of(system, method))
         if scheme.level and not self.frame.jacobi:
             raise ValueError(
                 f"`method` {method!r} has force gradients, which the interaction has in Jacobi's coordinates only: "
@@ -668,7 +637,7 @@ class KeplerInteraction(Composition):
             rows = y.reshape(-1, y.shape[-1])
             lengths = np.broadcast_to(h, y.shape[:-1]).astype(float).ravel()
             ends, vectors = kernel.jvp(lengths, rows, W.reshape(*rows.shape, -1))
-        except ValueError:  # no compiled code, as of bodies without mass: `step` is differentiated
+        except NotCompiled:  # no compiled code, as of bodies without mass: `step` is differentiated
             return None
         return ends.reshape(y.shape), vectors.reshape(W.shape)
 
@@ -708,6 +677,19 @@ class KeplerInteraction(Composition):
         processed = (n_saved if backend == "compiled" else 2 * n_steps) + 2 * n_extra
         counts["force_evaluations"] += sum(kick != 0 for kick, *_ in self.before) * processed
         return counts
+
+
+def _frame_of(system: HamiltonianSystem, method: str) -> Frame:
+    from sympflow.hamiltonian.planets import frame_of
+
+    frame = frame_of(system.local, system.y0)
+    if frame is None:
+        raise ValueError(
+            f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
+            "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
+        )
+    frame.check(method)
+    return frame
 
 
 SPLITTINGS: dict[str, type[Composition]] = {

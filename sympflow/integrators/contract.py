@@ -35,12 +35,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
 from sympflow.arguments import MAX_ASKED_VALUES
-from sympflow.arrays import Array, is_tensor, jvp, to_numpy
+from sympflow.arrays import Array, as_tensor, is_tensor, jvp, to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.progress import Progress
@@ -54,6 +55,7 @@ if TYPE_CHECKING:
     from sympflow.schemes import Scheme
     from sympflow.storage.runs import RunStore
 
+M = TypeVar("M", bound="Integrator")
 Steps = Iterator[tuple[np.ndarray, Array, np.ndarray]]
 """Chunks of executed steps: times (n,), states at their beginnings (n, ..., 2d), signed lengths (n,) or (n, ...)."""
 
@@ -311,11 +313,12 @@ class Integrator:
                 f"`method` {self.name!r} {self.arrays_only}; so its step cannot be differentiated: write it with the "
                 "functions of sympflow.arrays, or define tangent()."
             )
-        return forward_tangent(lambda x, lengths: self.step(system, t, x, lengths), y, h)
+        times = as_tensor(np.array(t)) if np.ndim(t) else t
+        return forward_tangent(lambda x, lengths: self.step(system, times, x, lengths), y, h)
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
         """The compiled loops of steps with so many deviation vectors; a ValueError says why there are none."""
-        raise ValueError(f"`method` {self.name!r} has no compiled deviation vectors: use backend='auto'.")
+        raise NotCompiled(f"`method` {self.name!r} has no compiled deviation vectors: use backend='auto'.")
 
     def jacobian(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> np.ndarray:
         """The Jacobian (..., n, n) of a step from y in the phase space where steps are made; n = 2d but if extended."""
@@ -337,7 +340,7 @@ class Integrator:
     ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """The steps of the run, differentiated where they were made: times and lengths (n, ...), Jacobians as above."""
         for times, states, lengths in in_blocks(self.steps(system, t_span, y0)):
-            yield differentiated(lambda t, y, h: self.tangent(system, t, y, h)[1], times, states, lengths, system)
+            yield differentiated(lambda t, y, h: self.tangent(system, t, y, h)[1], times, states, lengths)
 
     def run(self, problem: Problem) -> Outcome:
         """Solve the problem."""
@@ -394,30 +397,29 @@ def differentiated(
     times: np.ndarray,
     states: Array,
     lengths: np.ndarray,
-    system: HamiltonianSystem | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A chunk of `steps` as times and lengths (n, ...) and Jacobians (n, ..., k, k).
 
-    `jacobian` is given the times (n, ...) of a driven system, else the first; the states and the lengths. Each step is
-    differentiated in the precision in which it was executed, so its Jacobian holds the rounding of that
-    precision; it is returned as float64, in which everything that follows is computed.
+    `jacobian` is given the times (n, ...), the states and the lengths. Each step is differentiated in the precision in
+    which it was executed, so its Jacobian holds the rounding of that precision; it is returned as float64, in which
+    everything that follows is computed.
     """
     y = to_numpy(states)
     batch = y.shape[:-1]
     t, h = (np.broadcast_to(x.reshape(*x.shape, *[1] * (len(batch) - x.ndim)), batch) for x in (times, lengths))
-    start = start_of(system, t)
     with np.errstate(all="ignore"):
-        return t, h, jacobian(start, y, h.astype(y.dtype)).astype(float)
-
-
-def start_of(system: HamiltonianSystem | None, t: np.ndarray) -> Any:
-    """The times t of steps of a driven system, else the first: that is what steps of other systems are given."""
-    return float(t.flat[0]) if system is None or system.autonomous else t
+        return t, h, jacobian(t, y, h.astype(y.dtype)).astype(float)
 
 
 @cache
 def _field_names(cls: type) -> tuple[str, ...]:
     return tuple(f.name for f in fields(cls))
+
+
+def method_class(base: type[M], class_name: str, module: str, kind: type[type] = type, **own: Any) -> type[M]:
+    """Return the integrator class of a row of a table: a base with attributes of its own, by which it is documented."""
+    own = {"__doc__": f"{own['source']}\n\n{base.__doc__}", "__module__": module, **own}
+    return dataclass(frozen=True, repr="__repr__" not in vars(base))(kind(class_name, (base,), own))
 
 
 def method_text(integrator: Integrator, dt: float | None = None) -> str:

@@ -506,24 +506,7 @@ class LogSympFlow(FixedStep):
             dt, new_step = physical_length(flow.dt, scale, clock), flow.dt
         else:
             dt, new_step = float(self.dt), step_of_length(float(self.dt), scale, clock)
-        return LogarithmicClock(self, system, transformed, dt, new_step, numbers)
-
-    def reach_times(
-        self,
-        clock: LogarithmicClock,
-        h: float,
-        start: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        backend: str,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run in one compiled pass: see `LogarithmicClock`. Only a trained clock tells what times its steps reach."""
-        if not clock.numbers:
-            return None
-        bound = self.flow.bound(clock.transformed)
-        kernel = compiled_loops(lambda: bound.kernel_for(clock.transformed), start, backend)
-        return None if kernel is None else kernel.reach_times(h, start, times, stride, expected, clock.numbers)
+        return LogarithmicClock(self, system, transformed, dt, new_step)
 
     @property
     def inner(self) -> FixedStep:

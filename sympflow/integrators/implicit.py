@@ -14,7 +14,7 @@ from sympflow.hamiltonian.collocation import Tableau, gauss_legendre
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import FixedStep
-from sympflow.integrators.contract import Failure, Problem
+from sympflow.integrators.contract import Failure, Problem, method_class
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops
 
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
@@ -77,7 +77,7 @@ class Gauss(FixedStep):
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
         """The step and its Jacobian, by differentiating the equations that the K of the step solve."""
         y = to_numpy(y)
-        times = collocation.stage_times(system, self.tableau, t, y, h)
+        times = collocation.stage_times(self.tableau, t, y, h)
         h = np.asarray(h, dtype=y.dtype)[..., None]
         K, _ = collocation.stages(system, self.tableau, y, h, times)
         A, b, scale = (np.array(c, dtype=y.dtype) for c in self.tableau)
@@ -119,40 +119,18 @@ class GaussSteps(ArraySteps):
         return y_next
 
 
-@dataclass(frozen=True)
-class ImplicitMidpoint(Gauss):
-    """The implicit midpoint rule, y₁ = y + h f((y + y₁)/2): order 2, symplectic, symmetric, A-stable.
-
-    Parameters
-    ----------
-    dt, compensated
-        As for `Gauss`.
-
-    References
-    ----------
-    .. [1] E. Hairer, C. Lubich, G. Wanner, *Geometric Numerical Integration*, 2nd ed. (Springer 2006), (I.1.7), VI.4.
-    """
-
-    name: ClassVar[str] = "implicit_midpoint"
-    source: ClassVar[str] = f"The implicit midpoint rule, y₁ = y + h f((y + y₁)/2); {_SYMPLECTIC}"
-    order: ClassVar[int | None] = 2
-    tableau: ClassVar[Tableau] = gauss_legendre(1)
+def _gauss_method(name: str, class_name: str, stages: int, source: str) -> type[Gauss]:
+    """The integrator class of the Gauss method of so many stages."""
+    own: dict[str, Any] = {"order": 2 * stages, "tableau": gauss_legendre(stages), "source": f"{source}; {_SYMPLECTIC}"}
+    return method_class(Gauss, class_name, __name__, name=name, **own)
 
 
-def _gauss_legendre_method(stages: int, count: str) -> type[Gauss]:
-    """The integrator class of the Gauss–Legendre method of so many stages."""
-    summary = f"The Gauss–Legendre method of {count} stages: order {2 * stages}, symplectic, symmetric, A-stable."
-    namespace: dict[str, Any] = {
-        "name": f"gauss_legendre{2 * stages}",
-        "source": f"{_BUTCHER}, the Gauss method of {count} stages; {_SYMPLECTIC}",
-        "order": 2 * stages,
-        "tableau": gauss_legendre(stages),
-        "__doc__": f"{summary}\n\n{Gauss.__doc__}",
-        "__module__": __name__,
-    }
-    return dataclass(frozen=True)(type(f"GaussLegendre{2 * stages}", (Gauss,), namespace))
-
-
-GaussLegendre4 = _gauss_legendre_method(2, "two")
-GaussLegendre6 = _gauss_legendre_method(3, "three")
-GaussLegendre8 = _gauss_legendre_method(4, "four")
+ImplicitMidpoint = _gauss_method(
+    "implicit_midpoint", "ImplicitMidpoint", 1, "The implicit midpoint rule, y₁ = y + h f((y + y₁)/2)"
+)
+GaussLegendre4, GaussLegendre6, GaussLegendre8 = (
+    _gauss_method(
+        f"gauss_legendre{2 * s}", f"GaussLegendre{2 * s}", s, f"{_BUTCHER}, the Gauss method of {count} stages"
+    )
+    for s, count in ((2, "two"), (3, "three"), (4, "four"))
+)

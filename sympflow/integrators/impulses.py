@@ -16,7 +16,7 @@ from sympflow.integrators.contract import Integrator, Interrupted, Outcome, Prob
 from sympflow.integrators.grid import EPS, jumps_met
 
 Run = Callable[[Integrator, Problem], tuple[Outcome, Problem]]
-MOST_LANDINGS = 2000
+MOST_LANDINGS = 20_000
 """Jumps at which a run is cut; one with more is not, and warns."""
 ASIDE = 64 * EPS
 """Share of the times between which a run goes on from a jump, or ends before it, so that H is that of one side."""
@@ -26,12 +26,18 @@ def landings(
     integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True
 ) -> tuple[str, list[float]]:
     """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut."""
-    if system.autonomous or not math.isfinite(t1) or t0 == t1:
+    if not system.definition.may_jump or not math.isfinite(t1) or t0 == t1:
         return "", []
     dt, label = integrator.step_length(system), integrator.label if integrator.forces_at_ends(system) else None
     step, said = (dt or system.dt) / 4, ""
     if dt is None:  # its steps may be longer than a pulse
         times = system.jump_times(min(t0, t1), max(t0, t1), step).tolist()
+        if times:
+            said = (
+                f"`t_span` ({t0:g}, {t1:g}): H of {system.name!r} jumps in t, at t = {times[0]:.6g} and {len(times):,} "
+                f"times or more, where {integrator.name!r} ends no step: it is of first order there, or leaps over a "
+                "pulse. Solve in shorter intervals, or by a fixed `dt` that divides all pieces between jumps."
+            )
     else:
         said, times = jumps_met(system, t0, t1, dt, label)
     able = able and len(times) <= MOST_LANDINGS and not integrator.forces_beyond(system)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import check_not_followed
-from sympflow.arrays import Array, beside, is_tensor, last, like, moveaxis, stack
+from sympflow.arrays import Array, beside, detached, last, like, moveaxis, stack
 
 Time = Any
 """A number, or a tensor that carries a gradient."""
@@ -20,7 +20,7 @@ class Interpolant:
 
     def __init__(self, begin: Time, end: Time, coefficients: Sequence[Array]) -> None:
         self.begin, self.end, self.coefficients = begin, end, coefficients
-        self.t0, self.t1 = (float(t.detach()) if is_tensor(t) else t for t in (begin, end))
+        self.t0, self.t1 = (float(detached(t)) for t in (begin, end))
 
     @property
     def y0(self) -> Array:
@@ -98,16 +98,6 @@ class Piecewise(DenseOutput):
         k: Any = np.minimum(np.searchsorted(self.sign * self._ends, self.sign * times), len(self.steps) - 1)
         x = like((beside(times, begin) - begin[k]) / length[k], self.y0)
         return _horner([c[k] for c in coefficients], x.reshape(-1, *[1] * self.y0.ndim))
-
-
-class Constant(DenseOutput):
-    """The dense output of an interval of length zero."""
-
-    def __init__(self, y: Array, t: float) -> None:
-        self.y, self.t_min, self.t_max = y, t, t
-
-    def states(self, times: np.ndarray) -> Array:
-        return stack([self.y] * len(times), axis=0) if times.size else self.y[None][:0]
 
 
 class Batch(DenseOutput):

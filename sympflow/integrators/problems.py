@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_ASKED_VALUES, MAX_SAVED_VALUES, as_float
-from sympflow.arrays import Array, expanded, finite_states, is_tensor, readable
+from sympflow.arguments import MAX_ASKED_VALUES, MAX_SAVED_VALUES, as_float, check_array
+from sympflow.arrays import Array, copied, expanded, finite_states, is_tensor, readable
 from sympflow.events import EventSearch, parse
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import Integrator, Problem
@@ -101,12 +101,13 @@ def check_params(
     rows = checked_rows(system, params, tuple(y0.shape[:-1]))
     check_own_parameters(system, rows.values, integrator)
     y = expanded(y0, (*rows.shape, y0.shape[-1]))
-    return rows, y if y is y0 or is_tensor(y) else y.copy()
+    return rows, y if y is y0 else copied(y)
 
 
 def check_own_parameters(system: HamiltonianSystem, values: Mapping[str, ArrayLike], integrator: Integrator) -> None:
     """Refuse a trained flow for other parameters than its system's, and a sweep from where H is constant in time."""
-    if system.autonomous and system.symbols is not None and system.symbols.named_time is not None and values:
+    symbols = system.symbols
+    if values and symbols is not None and symbols.time is not symbols.named_time:
         raise ValueError(
             "`params` are those of a driven system, and the values that `system` has make it constant in time: pass "
             "one whose H depends on t, as by system.with_params(...)."
@@ -180,8 +181,7 @@ def check_memory(integrator: Integrator, problem: Problem) -> None:
 
 def check_stored(problem: Problem, action: str, rows: ParameterRows | None) -> None:
     """Refuse what a store does not take, with the reason."""
-    if is_tensor(problem.y0):
-        raise TypeError("`store` takes NumPy states, for it keeps no gradients: pass y0.detach().numpy().")
+    check_array(problem.y0, "a `store` takes NumPy states, for it keeps no gradients", "y0.detach().numpy()")
     if problem.events is not None and problem.events.events:
         raise ValueError(
             "`store` takes no `events`, whose zeros are kept in memory: store the outputs, and look for the zeros in "

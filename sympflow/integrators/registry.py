@@ -317,7 +317,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
             "such as 'gauss_legendre6', or a Runge–Kutta method such as 'dop853' or 'dopri5', or solve the system "
             "that sympflow.doubled makes of it",
         )
-    if not system.autonomous and not (integrator.takes_driving and _speaks_for_itself(mro, "takes_driving")):
+    if not (integrator.takes_driving and _speaks_for_itself(mro, "takes_driving")):
         what = "was trained for a system without t" if integrator.trained else "does not take the time into account"
         system.check_autonomous(
             f"and method {integrator.name!r} {what}",

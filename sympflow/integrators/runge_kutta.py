@@ -11,6 +11,7 @@ import numpy as np
 
 from sympflow.arguments import as_float
 from sympflow.arrays import Array, per_state, readable, to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
@@ -43,7 +44,7 @@ class ExplicitStep(ByVectorField):
     def compiled(system: HamiltonianSystem, name: str, *arguments: Any) -> Any:
         """Return a function of `kernels.explicit_loops` called for a symbolic system."""
         if system.spelled is None:
-            raise ValueError(
+            raise NotCompiled(
                 "`system` cannot be compiled: its vector field is not symbolic. Use HamiltonianSystem.from_sympy, or "
                 "use backend='array'."
                 if not system.untraced

@@ -18,10 +18,19 @@ from sympflow.arguments import MAX_SAVED_VALUES, as_float, check_counts
 from sympflow.arrays import Array
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import Recorder
-from sympflow.integrators.contract import ENDED, FINISHED, Interrupted, Outcome, Problem, Steps, interrupted
+from sympflow.integrators.contract import (
+    ENDED,
+    FINISHED,
+    Interrupted,
+    Outcome,
+    Problem,
+    Steps,
+    interrupted,
+    method_class,
+)
 from sympflow.integrators.grid import MOST_OPEN_STEPS, Grid
 from sympflow.integrators.impulses import pieces_of
-from sympflow.integrators.interpolants import Batch, Constant
+from sympflow.integrators.interpolants import Batch, Piecewise
 from sympflow.integrators.runge_kutta import RungeKutta, hopeless
 
 MOST_STEPS = 10_000_000
@@ -196,7 +205,7 @@ class _Scipy(RungeKutta):
         elif failure:
             stats["failed_at"] = float(reached)
         if problem.dense_output:
-            outcome.sol = OdeSolution(times, interpolants) if interpolants else Constant(y0, t0)
+            outcome.sol = OdeSolution(times, interpolants) if interpolants else Piecewise([], y0, t0, t0)
         if stopped:
             raise interrupted(outcome, float(reached))
         return outcome
@@ -263,41 +272,10 @@ class _Lazily:
         return self.output(t)
 
 
-@dataclass(frozen=True)
-class RK45(_Scipy):
-    """Dormand–Prince 5(4), SciPy's `RK45`: the paper's ODE45, at the default tolerances.
-
-    Parameters
-    ----------
-    rtol, atol, max_step, first_step
-        As in `scipy.integrate.solve_ivp`.
-    max_steps : int, optional
-        Most steps of a trajectory; 10 million by default, and one million to an infinite end.
-    """
-
-    name: ClassVar[str] = "rk45"
-    order: ClassVar[int | None] = 5
-    source: ClassVar[str] = "Dormand–Prince 5(4), SciPy's `RK45`: the paper's ODE45, at the default tolerances."
-    solver: ClassVar[Any] = ScipyRK45
-    A: ClassVar[np.ndarray] = ScipyRK45.A
-    B: ClassVar[np.ndarray] = ScipyRK45.B
+def _scipy_method(solver: Any, order: int, source: str) -> type[_Scipy]:
+    own = {"name": solver.__name__.lower(), "solver": solver, "A": solver.A, "B": solver.B}
+    return method_class(_Scipy, solver.__name__, __name__, order=order, source=source, **own)
 
 
-@dataclass(frozen=True)
-class DOP853(_Scipy):
-    """Dormand–Prince 8(5,3), SciPy's `DOP853`.
-
-    Parameters
-    ----------
-    rtol, atol, max_step, first_step
-        As in `scipy.integrate.solve_ivp`.
-    max_steps : int, optional
-        Most steps of a trajectory; 10 million by default, and one million to an infinite end.
-    """
-
-    name: ClassVar[str] = "dop853"
-    order: ClassVar[int | None] = 8
-    source: ClassVar[str] = "Dormand–Prince 8(5,3), SciPy's `DOP853`."
-    solver: ClassVar[Any] = ScipyDOP853
-    A: ClassVar[np.ndarray] = ScipyDOP853.A
-    B: ClassVar[np.ndarray] = ScipyDOP853.B
+RK45 = _scipy_method(ScipyRK45, 5, "Dormand–Prince 5(4), SciPy's `RK45`: the paper's ODE45, at the default tolerances.")
+DOP853 = _scipy_method(ScipyDOP853, 8, "Dormand–Prince 8(5,3), SciPy's `DOP853`.")

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from sympflow.arguments import check_flag, check_number, check_one_of
+from sympflow.arguments import check_flag, check_one_of, check_positive
 from sympflow.arrays import Array, to_numpy
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -25,7 +26,7 @@ from sympflow.integrators.contract import (
     differentiated,
     forward_tangent,
     in_blocks,
-    start_of,
+    method_class,
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
@@ -192,29 +193,14 @@ class Splitting(FixedStep):
             check_one_of(name, value, known)
         if self.compensated and not SPLITTINGS[self.splitting].compensates:
             raise ValueError("`compensated` sums are for the splittings 'kinetic' and 'kepler': leave it out.")
-        if self.shift is not None:
-            checked_shift(self.shift)
-            if self.clock == "physical":
-                raise ValueError("`shift` is for the clock 'logarithmic': leave it out.")
-        if self.omega is not None:
-            check_number("omega", self.omega)
-            if self.splitting != "copies":
-                raise ValueError("`omega` is for the splitting 'copies': leave it out.")
-            if not self.omega > 0:
-                raise ValueError(f"`omega` must be positive; got {self.omega!r}.")
-        if self.corrector is not None:
-            if isinstance(self.corrector, bool) or self.corrector not in CORRECTORS:
-                raise ValueError(f"`corrector` must be an order, 3, 5, … 17; got {self.corrector!r}: take 17.")
-            if self.splitting != "kepler":
-                raise ValueError("`corrector` is for the splitting 'kepler': leave it out.")
-        if self.parts is None:
-            return
-        sequence = isinstance(self.parts, list | tuple)
-        if not sequence or not all(isinstance(part, str) for part in self.parts) or not self.parts:
-            raise TypeError(f"`parts` must be a sequence of expressions; got {self.parts!r}: pass a list of strings.")
-        if self.splitting != "parts":
-            raise ValueError("`parts` are for the splitting 'parts': leave them out.")
-        object.__setattr__(self, "parts", tuple(self.parts))
+        for name, (of, its, check) in OWN_OPTIONS.items():
+            if getattr(self, name) is None:
+                continue
+            check(getattr(self, name))
+            if getattr(self, of) != its:
+                raise ValueError(f"`{name}` is for the {of} {its!r}: leave it out.")
+        if self.parts is not None:
+            object.__setattr__(self, "parts", tuple(self.parts))
 
     def __repr__(self) -> str:
         changed = (f for f in fields(self) if getattr(self, f.name) != f.default)
@@ -222,33 +208,15 @@ class Splitting(FixedStep):
 
     def composed(self, system: HamiltonianSystem) -> Composition:
         """Return the scheme × the splitting on a system."""
-        options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
+        options: dict[str, Any] = {}
+        if not self.parts is self.omega is self.corrector is None:
+            options = {n: value for n in ("parts", "omega", "corrector") if (value := getattr(self, n)) is not None}
         return SPLITTINGS[self.splitting](self.name, self.scheme, system, **options)
 
     def on_clock(self, system: HamiltonianSystem) -> LogarithmicClock | None:
         """Return the method on its clock, where that is not the physical one."""
         on = CLOCKS[self.clock].on
         return None if on is None else on(self, system)
-
-    def reach_times(
-        self,
-        clock: LogarithmicClock,
-        h: float,
-        start: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        backend: str,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Run on the logarithmic clock in one compiled pass: see `LogarithmicClock`."""
-        transformed = clock.transformed
-        if self.compensated or transformed.symbols is None:
-            return None
-        if compiled_loops(lambda: self.inner.composed(transformed).kernel(False), start, backend) is None:
-            return None
-        from sympflow.kernels.elapsed_times import reach_times
-
-        return reach_times(transformed, self.scheme, h, start, times, stride, expected)
 
     @property
     def inner(self) -> Splitting:
@@ -295,9 +263,9 @@ class Splitting(FixedStep):
             super().check_followed(problem)
         try:
             if problem.backend == "array":
-                raise ValueError("`backend` is 'array'.")
+                raise NotCompiled("`backend` is 'array'.")
             self.composed(problem.system).kernel_by(bool(self.compensated), tuple(problem.followed))
-        except ValueError as error:
+        except NotCompiled as error:
             names = ", ".join(problem.followed)
             raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
 
@@ -329,24 +297,23 @@ class Splitting(FixedStep):
         """The times of the forces in a step of length 1, of a driven system."""
         return [] if self.clock != "physical" else self.composed(system).force_times()
 
+    def _placed(self, system: HamiltonianSystem) -> LogarithmicClock | Composition:
+        """The method on its clock, or on the physical one its composition."""
+        return self.on_clock(system) or self.composed(system)
+
     def step(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
-        clock = self.on_clock(system)
-        if clock is not None:
-            return clock.step(y, h)
+        if not self.keeps:
+            return self._placed(system).step(y, h, t)
         composition = self.composed(system)
         return composition.project(composition.step(composition.lift(y), h, t))
 
     def inverse(self, system: HamiltonianSystem, t: float, y: Array, h: float | Array) -> Array:
         if self.keeps:
             raise TypeError(f"`method` {self.name!r} keeps {self.keeps}, without which a step cannot be undone.")
-        clock = self.on_clock(system)
-        return self.composed(system).inverse(y, h, t) if clock is None else clock.inverse(y, h)
+        return self._placed(system).inverse(y, h, t)
 
     def tangent(self, system: HamiltonianSystem, t: float, y: Array, h: Array) -> tuple[np.ndarray, np.ndarray]:
-        clock = self.on_clock(system)
-        if clock is not None:
-            return clock.tangent(y, h)
-        known = None if self.keeps else self.composed(system).tangent(y, h, t)
+        known = None if self.keeps else self._placed(system).tangent(y, h, t)
         return super().tangent(system, t, y, h) if known is None else known
 
     def jvp(self, system: HamiltonianSystem, t: Any, y: Array, h: Array, W: np.ndarray) -> np.ndarray:
@@ -365,8 +332,7 @@ class Splitting(FixedStep):
         for times, states, lengths in self.steps(system, t_span, y0):
             for t, y, h in zip(times, to_numpy(states), lengths, strict=True):
                 at, length = (np.broadcast_to(x, y.shape[:-1]) for x in (t, h))
-                start = start_of(system, at)
-                yield at, length, partial(self.jvp, system, start, y, length.astype(y.dtype))
+                yield at, length, partial(self.jvp, system, at, y, length.astype(y.dtype))
 
     def tangent_kernel(self, system: HamiltonianSystem, vectors: int) -> TangentKernel:
         if self.clock != "physical" or self.overrides("step") or self.compensated:
@@ -394,7 +360,7 @@ class Splitting(FixedStep):
             return forward_tangent(lambda z, lengths: composition.step(z, lengths, t), x, h)[1]
 
         for times, states, lengths in in_blocks(super().steps(system, t_span, composition.lift(y0))):
-            yield differentiated(jacobian, times, states, lengths, system)
+            yield differentiated(jacobian, times, states, lengths)
 
     def own_stepper(self, problem: Problem) -> Stepper:
         composition = self.composed(problem.system)
@@ -427,6 +393,26 @@ class Splitting(FixedStep):
         composition = self.composed(system)
         for times, states, lengths in super().steps(system, t_span, composition.lift(y0)):
             yield times, composition.project(states), lengths
+
+
+def _check_parts(parts: Any) -> None:
+    sequence = isinstance(parts, list | tuple)
+    if not sequence or not all(isinstance(part, str) for part in parts) or not parts:
+        raise TypeError(f"`parts` must be a sequence of expressions; got {parts!r}: pass a list of strings.")
+
+
+def _check_corrector(corrector: Any) -> None:
+    if isinstance(corrector, bool) or corrector not in CORRECTORS:
+        raise ValueError(f"`corrector` must be an order, 3, 5, … 17; got {corrector!r}: take 17.")
+
+
+OWN_OPTIONS: dict[str, tuple[str, str, Callable[[Any], Any]]] = {
+    "shift": ("clock", "logarithmic", checked_shift),
+    "omega": ("splitting", "copies", partial(check_positive, "omega")),
+    "corrector": ("splitting", "kepler", _check_corrector),
+    "parts": ("splitting", "parts", _check_parts),
+}
+"""The options of one splitting, or clock, and their checks."""
 
 
 # classes of triples -------------------------------------------------------------------------------
@@ -520,18 +506,12 @@ copyreg.pickle(_ByTable, _reduced)
 
 
 def _new_class(kind: type[type], name: str, scheme: Scheme, splitting: str, clock: str, source: str) -> type[Splitting]:
-    namespace: dict[str, Any] = {
-        "name": name,
-        "order": scheme.order,
-        "scheme": scheme,
-        "source": source,
-        "splitting": splitting,
-        "clock": clock,
+    own: dict[str, Any] = {
         "__annotations__": {"splitting": str, "clock": str},
         "__doc__": f"{name}: order {scheme.order}, {source}\n\n{Splitting.__doc__}",
-        "__module__": __name__,
     }
-    return dataclass(frozen=True, repr=False)(kind(name, (Splitting,), namespace))
+    own |= {"name": name, "order": scheme.order, "scheme": scheme, "source": source}
+    return method_class(Splitting, name, __name__, kind, splitting=splitting, clock=clock, **own)
 
 
 def __getattr__(name: str) -> type[Splitting]:

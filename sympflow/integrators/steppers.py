@@ -20,6 +20,7 @@ from sympflow.arrays import (
     transformed,
     with_rows,
 )
+from sympflow.compiler import NotCompiled
 from sympflow.integrators.contract import Problem
 from sympflow.integrators.grid import Grid
 from sympflow.kernels.protocol import RunCheckpoint
@@ -191,10 +192,10 @@ def compiled_loops(
     if reason is None:
         try:
             loops = make()
-            if is_tensor(y0) and differentiable(y0):
+            if differentiable(y0):
                 loops.check_reverse()
             return loops
-        except ValueError as error:
+        except NotCompiled as error:
             reason = str(error)
     if backend == "compiled":
         raise ValueError(f"`backend` {backend!r} does not apply. {reason}") from None
@@ -268,9 +269,9 @@ def rollout(
 
 def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
-    shape, tensor = getattr(y_next, "shape", None), is_tensor(y)
-    if shape == y.shape and y_next.dtype == y.dtype and is_tensor(y_next) == tensor:
-        if tensor and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
+    shape = getattr(y_next, "shape", None)
+    if shape == y.shape and y_next.dtype == y.dtype:
+        if is_tensor(y) and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
             raise TypeError(
                 "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
                 "whose step takes arrays only says so by `arrays_only`."

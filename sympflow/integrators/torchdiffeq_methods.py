@@ -28,7 +28,16 @@ from sympflow.arrays import (
 )
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
-from sympflow.integrators.contract import ENDED, ByVectorField, Integrator, Outcome, Problem, Steps, finished
+from sympflow.integrators.contract import (
+    ENDED,
+    ByVectorField,
+    Integrator,
+    Outcome,
+    Problem,
+    Steps,
+    finished,
+    method_class,
+)
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
@@ -518,28 +527,14 @@ class _Nodes(Trace):
 def torchdiffeq_method(name: str) -> type[Integrator]:
     """The integrator class of torchdiffeq's solver of that name."""
     if name in MULTISTEP:
-        doc = f"torchdiffeq's `{name}`: {Adams.__doc__}"
-        return _named(name, Adams, {"order": MULTISTEP[name], "source": doc.partition("\n")[0], "__doc__": doc})
+        first = (Adams.__doc__ or "").partition("\n")[0]
+        own: dict[str, Any] = {"order": MULTISTEP[name], "source": f"torchdiffeq's `{name}`: {first}"}
+        return method_class(Adams, _class_name(name), __name__, name=name, **own)
     tableau = (ADAPTIVE | FIXED)[name]
     base: type[Integrator] = Adaptive if name in ADAPTIVE else FixedGrid
     source = f"torchdiffeq's `{name}`, order {tableau.order}: {tableau.source}"
-    return _named(
-        name,
-        base,
-        {
-            "order": tableau.order,
-            "tableau": tableau,
-            "A": tableau.A,
-            "B": tableau.B,
-            "source": source,
-            "__doc__": f"{source}\n\n{base.__doc__}",
-        },
-    )
-
-
-def _named(name: str, base: type[Integrator], namespace: dict[str, Any]) -> type[Integrator]:
-    namespace |= {"name": name, "__module__": __name__}
-    return dataclass(frozen=True)(type(_class_name(name), (base,), namespace))
+    own = {"order": tableau.order, "tableau": tableau, "A": tableau.A, "B": tableau.B, "source": source}
+    return method_class(base, _class_name(name), __name__, name=name, **own)
 
 
 def _class_name(method: str) -> str:

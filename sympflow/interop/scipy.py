@@ -139,7 +139,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
         system = self._solved
         dt = self.integrator.step_length(system)
         jumps: list[float] = []
-        if self._driven and math.isfinite(t_bound):
+        if system is not None and math.isfinite(t_bound):
             system.check_times(t0, t_bound)
             told, jumps = landings(self.integrator, system, t0, t_bound)
             if told:
@@ -171,7 +171,6 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             raise ValueError(f"`y0` must have length {size}, [q, p]; got {self.n}.")
         if not np.isfinite(self.y).all():
             raise ValueError("`y0` must be finite; it holds NaN or infinity.")
-        self._driven = self._solved is not None and not self._solved.autonomous
         if self._solved is not None and self._solved is not self.system:
             check_applies(integrator, self._solved)
         self.y = self.y.astype(float)
@@ -237,7 +236,7 @@ class FlowSolver(OdeSolver, metaclass=_SolverType):
             whole = self._k < grid.n_steps
             self._h = grid.h if whole else grid.remainder
             self._end = grid.time(self._k + 1) if whole else grid.t1
-            if self._driven and math.isinf(self.t_bound):
+            if self._solved is not None and math.isinf(self.t_bound):
                 try:
                     self._solved.check_times(self._t_anchor, self._end)
                 except ValueError as error:

@@ -23,7 +23,8 @@ def from_hamiltonian(H: Callable[[Tensor, Tensor], Tensor], ndof: int, **scene: 
 
     Where H turns out to be ½ pᵀM⁻¹p + V(q), as far as eight random states near y0 can tell, it is made a separable
     system, to which the splitting methods apply. M is fixed then: where ∂H/∂p depends on tensors that require
-    gradients, such as a mass that is trained, the system stays H(q, p), which gives them gradients.
+    gradients, such as a mass that is trained, the system stays H(q, p), which gives them gradients. A run is refused
+    where ∂H/∂p has changed since, as by a number that H reads from elsewhere.
 
     Parameters
     ----------
@@ -65,7 +66,8 @@ def from_hamiltonian(H: Callable[[Tensor, Tensor], Tensor], ndof: int, **scene: 
     mass = _mass(hessian, gradient, probes)
     if mass is None:
         return HamiltonianSystem(hamiltonian=H, ndof=ndof, **scene)
-    return HamiltonianSystem(lambda q: H(q, torch.zeros_like(q)), ndof=ndof, mass=mass, **scene)
+    system = HamiltonianSystem(lambda q: H(q, torch.zeros_like(q)), ndof=ndof, mass=mass, **scene)
+    return _guarded(system, "H", gradient, probes)
 
 
 def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any) -> HamiltonianSystem:
@@ -140,7 +142,29 @@ def from_module(module: Callable[[Any, Tensor], Tensor], ndof: int, **scene: Any
         return minus_J_f(torch.cat([q, torch.zeros_like(q)], dim=-1))[..., :ndof]
 
     potential = _for_arrays(lambda q: H(q, torch.zeros_like(q)))
-    return HamiltonianSystem(potential, ndof=ndof, mass=mass, gradient=_for_arrays(gradient), **scene)
+    system = HamiltonianSystem(potential, ndof=ndof, mass=mass, gradient=_for_arrays(gradient), **scene)
+    return _guarded(system, "module", minus_J_f, probes)
+
+
+def _guarded(
+    system: HamiltonianSystem, argument: str, gradient: Callable[[Tensor], Tensor], probes: Tensor
+) -> HamiltonianSystem:
+    """The system, which compares M⁻¹p with ∂H/∂p at one state whenever it is used."""
+    d, state = system.ndof, probes[:1]
+    expected = system.velocity(state[:, d:])
+
+    def check() -> None:
+        velocity = gradient(state)[:, d:]
+        if not _close(velocity, expected, TOLERANCE):
+            why = "has another ∂H/∂p than when the system was made: it reads something that has changed since"
+        elif _trained(velocity):
+            why = "depends in ∂H/∂p on tensors that require gradients, which they did not when the system was made"
+        else:
+            return
+        raise ValueError(f"`{argument}` {why}. Make a new system of it, by the same function.")
+
+    system.definition.guard = check
+    return system
 
 
 def _for_arrays(function: Callable[[Tensor], Tensor]) -> Callable[[Any], Any]:

@@ -7,6 +7,7 @@ options go into `options`: `flow`, `dt` (or `step_size`), and `system` where `fu
 from __future__ import annotations
 
 import difflib
+import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -38,6 +39,7 @@ _CALLBACKS = (
     "callback_reject_step_adjoint",
 )
 """Callbacks of torchdiffeq for adaptive steps and its adjoint equation, which our methods have not."""
+_LATE = 1000.0  # time after the start in which an event is expected
 _CHECKPOINTS = 5  # outputs of a run at which another right-hand side is compared
 _REMEDY = "Pass one system: odeint(system, ...), without options['system'] and without another function."
 
@@ -85,6 +87,7 @@ def odeint(
         states and times tell, at the start and along the run.
     """
     if not _is_ours(method, func, options):
+        options = _landing(func, t, method, options, event_fn is not None)
         with _names_of_both():
             return torchdiffeq.odeint(
                 _of_pairs(func, y0), y0, t, rtol=rtol, atol=atol, method=method, options=options, event_fn=event_fn
@@ -160,6 +163,7 @@ def odeint_dense(
         with _names_of_both():
             if method not in (None, "dopri5"):
                 raise ValueError(f"`method` {method!r} has no dense output in torchdiffeq: use 'dopri5', or ours.")
+            options = _landing(func, torch.as_tensor([float(t0), float(t1)]), method, options)
             return torchdiffeq.odeint_dense(func, y0, t0, t1, rtol=rtol, atol=atol, method=method, options=options)
     if not isinstance(y0, Tensor):
         raise TypeError(f"`y0` must be a tensor [q, p], as in torchdiffeq's odeint_dense; got {type(y0).__name__}.")
@@ -199,6 +203,9 @@ def odeint_event(
     """
     if not _is_ours(kwargs.get("method"), func, kwargs.get("options")):
         theirs = torchdiffeq.odeint if odeint_interface is odeint else odeint_interface
+        begin = float(one_lane(t0).reshape(-1)[0])
+        interval = torch.tensor([begin, begin + (-1.0 if reverse_time else 1.0)], dtype=torch.float64)
+        kwargs["options"] = _landing(func, interval, kwargs.get("method"), kwargs.get("options"), True)
         arguments = {"event_fn": event_fn, "reverse_time": reverse_time, "odeint_interface": theirs, **kwargs}
         with _names_of_both():
             return torchdiffeq.odeint_event(_of_pairs(func, y0), y0, t0, **arguments)
@@ -252,6 +259,7 @@ def odeint_adjoint(
         `torch.func`: this is for reverse mode, `backward` and `torch.autograd.grad`.
     """
     if not _is_ours(method, func, options):
+        options = _landing(func, t, method, options, event_fn is not None)
         arguments: dict[str, Any] = {"rtol": rtol, "atol": atol, "method": method, "options": options}
         arguments |= {"event_fn": event_fn, "adjoint_rtol": adjoint_rtol, "adjoint_atol": adjoint_atol}
         arguments |= {"adjoint_method": adjoint_method, "adjoint_options": adjoint_options}
@@ -348,6 +356,54 @@ def _is_ours(method: Any, func: Any, options: Any) -> bool:
     ours = isinstance(func, HamiltonianSystem) or (isinstance(options, dict) and {"system", "flow"} & set(options))
     found = _their_table().get(method)
     return bool(ours) or found is None or issubclass(found, _Solver)
+
+
+def _landing(
+    func: Any, t: Any, method: Any, options: dict[str, Any] | None, endless: bool = False
+) -> dict[str, Any] | None:
+    """The options of a method of torchdiffeq by which it ends steps where a HamiltonianSystem jumps in t."""
+    known, name = dict(options or {}), method or "dopri5"
+    if not isinstance(func, HamiltonianSystem) or func.autonomous or not isinstance(t, Tensor) or not t.numel():
+        return options
+    if {"jump_t", "grid_constructor"} & known.keys():
+        return options
+    first, last = numbers(t).flat[0], numbers(t).flat[-1]
+    if endless:
+        last = first + math.copysign(max(_LATE, abs(func.t_span[1] - func.t_span[0])), last - first)
+    low, high, step = min(first, last), max(first, last), func.dt / 4
+    found = func.jump_times(low, high, step)
+    if not len(found):
+        return options
+    if name in ADAPTIVE:
+        known["jump_t"] = torch.as_tensor(found, dtype=torch.float64)
+        if func.shortest_piece < math.inf:
+            known.setdefault("max_step", func.shortest_piece)
+    elif name in FIXED and not endless:
+        length = known.pop("step_size", None)
+        known |= {"grid_constructor": lambda _, y0, s: _with_jumps(s, length, found), "perturb": True}
+    if known == (options or {}) or len(func.jump_times(found.max(), high, step)):
+        more = " after that too" if "jump_t" in known else ""
+        warn(
+            f"`func` {func.name!r} jumps in t, at t = {found.max() if more else found.min():.6g}{more}, where "
+            f"{name!r} of torchdiffeq ends no step: it is of first order there, or leaps over a pulse. Take a "
+            "Runge–Kutta method over fewer jumps, or one of ours by sympflow.solve.",
+            RuntimeWarning,
+        )
+    return known
+
+
+def _with_jumps(t: Tensor, length: float | None, jumps: np.ndarray) -> Tensor:
+    """The grid of a fixed-step method of torchdiffeq with outputs t (n,), and the times of jumps in it."""
+    grid = t
+    if length is not None:
+        n_steps = math.ceil(float(abs(t[-1] - t[0])) / length)
+        grid = torch.cat([t[0] + torch.arange(n_steps).to(t) * torch.sign(t[-1] - t[0]) * length, t[-1:]])
+    found = torch.as_tensor(jumps).to(t)
+    near = 1e-9 * (grid[1:] - grid[:-1]).abs().min()
+    apart = ((grid[1:-1, None] - found).abs() > near).all(-1)
+    return torch.cat(
+        [grid[:1], torch.cat([grid[1:-1][apart], found]).sort(descending=bool(t[-1] < t[0]))[0], grid[-1:]]
+    )
 
 
 def _name(method: Any) -> str:

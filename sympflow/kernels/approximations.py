@@ -30,9 +30,9 @@ UNTOUCHED = (sp.Piecewise, sp.Max, sp.Min, sp.Abs, sp.Heaviside, sp.sign)
 
 
 def position_ranges(symbols: SymbolicHamiltonian, domain: Domain) -> Ranges:
-    """The interval of the position in a domain of one degree of freedom; none for a V that makes no use of it."""
+    """The interval of the position in a domain of one degree of freedom; none for an H that makes no use of it."""
     assert symbols.V is not None
-    if symbols.ndof > 1 or symbols.V.is_polynomial(*symbols.q) or symbols.V.has(*UNTOUCHED):
+    if symbols.ndof > 1 or symbols.timed or symbols.V.is_polynomial(*symbols.q) or symbols.V.has(*UNTOUCHED):
         return ()
     q = domain.sample(STATES, 0)[:, : symbols.ndof]
     margin = MARGIN * (q.max(0) - q.min(0))

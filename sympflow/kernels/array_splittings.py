@@ -26,7 +26,16 @@ from sympflow.kernels.splittings import Splitting, SplittingCode
 if TYPE_CHECKING:
     from sympflow.kernels.terms import Terms
 
-__all__ = ["ArrayCode", "Functions", "TermForces", "function_code", "term_code"]
+__all__ = [
+    "ARRAYS",
+    "ArrayCode",
+    "Forces",
+    "FunctionSplitting",
+    "Functions",
+    "TermForces",
+    "function_code",
+    "term_code",
+]
 
 ARRAYS = 4  # of d numbers that a kick needs: slopes, velocities, products with the Hessian, curvatures
 
@@ -195,11 +204,9 @@ class ArrayCode(SplittingCode):
 
     def __init__(self, splitting: Splitting, forces: Forces) -> None:
         super().__init__(splitting, chunked=False)
+        self._given = splitting, forces
         self._forces, self.data, self.lanes = forces, forces.data, forces.lanes
         self.room = ARRAYS * splitting.ndof
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return ArrayCode, (self._splitting, self._forces)
 
     @cached_property
     def _kinds(self) -> list[Arranged]:
@@ -214,10 +221,11 @@ class ArrayCode(SplittingCode):
                 self._executed(k, room, self._column(k, room.type, numbers, step))
 
     def _executed(self, k: int, room: Room, column: Sequence[Any]) -> None:
-        self._kicked(room, self._splitting.terms[k], column)
-        self._drifted(room, column)
+        self.kicked(room, self._splitting.terms[k], column)
+        self.drifted(room, column)
 
-    def _kicked(self, room: Room, terms: int, given: Sequence[Any]) -> None:
+    def kicked(self, room: Room, terms: int, given: Sequence[Any]) -> None:
+        """Write a kick of so many terms, by the numbers of a column."""
         splitting, code, forces = self._splitting, room.code, self._forces
         d, kicks = self._ndof(room), given[1 : 1 + len(splitting.kick_numbers)]
         letters = self._letters(given)
@@ -262,7 +270,8 @@ class ArrayCode(SplittingCode):
         for i, x in enumerate(traced(slopes, *names)(*(room.load(i) for i in range(d)), *kicks[1:])):
             room.store(x, i, out)
 
-    def _drifted(self, room: Room, given: Sequence[Any]) -> None:
+    def drifted(self, room: Room, given: Sequence[Any]) -> None:
+        """Write a drift."""
         splitting, code, forces = self._splitting, room.code, self._forces
         d, a = self._ndof(room), given[0]
         q, p = room.state, room.part(d)

@@ -6,17 +6,17 @@ import ctypes
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Protocol
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.compiler.control import DOUBLE, POINTER, Code, Module, Rows, Value
-from sympflow.compiler.machine import compiled, host
+from sympflow.compiler import NotCompiled
+from sympflow.compiler.control import DOUBLE, POINTER, Code, Rows, Value
 from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
-from sympflow.kernels.runs import Numbers, Room, reverse_function
+from sympflow.kernels.runs import Numbers, Room, begun, finished
+from sympflow.lazy import kept
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
 
@@ -32,7 +32,7 @@ class Tableau(Protocol):
 
 def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system; a ValueError says why there are none."""
-    field = _field(system)
+    field = field_of(system)
     kind = _InMemory if field.large else _InRegisters
     A = tuple(tuple(map(float, row)) for row in tableau.A)
     code = kind(field, A, tuple(map(float, tableau.B)))
@@ -41,16 +41,7 @@ def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKerne
 
 def compiled_field(system: HamiltonianSystem) -> CompiledField:
     """The vector field of a symbolic system, compiled, for one solver; a ValueError says why there is none."""
-    return CompiledField(_field(system))
-
-
-def _field(system: HamiltonianSystem) -> Field:
-    if system not in _FIELDS:
-        _FIELDS[system] = Field(system)
-    return _FIELDS[system]
-
-
-_FIELDS: WeakKeyDictionary[HamiltonianSystem, Field] = WeakKeyDictionary()
+    return CompiledField(field_of(system))
 
 
 class Field:
@@ -64,7 +55,7 @@ class Field:
         assert symbols is not None
         forces = () if force is None else force.expressions
         if force is not None and not (forces and system.symbols):
-            raise ValueError("`system` has a force by a function, which is not compiled: use backend='array'.")
+            raise NotCompiled("`system` has a force by a function, which is not compiled: use backend='array'.")
         self.large = is_large(symbols) and force is None
         symbols = symbols if is_large(symbols) else symbols.parametric
         self.lettered = lettered(symbols, [symbols.H, *forces])
@@ -104,8 +95,7 @@ class Field:
     @cached_property
     def function(self) -> Callable[..., None]:
         """f compiled: of addresses (y, out, time, numbers, room, data)."""
-        module, lettered = Module(host().fused), self.lettered
-        code = module.function("field_at", [POINTER] * 6)
+        code, lettered = begun("field_at", [POINTER] * 6), self.lettered
         y, out, time, numbers, room, data = code.arguments
         k, n = len(lettered.symbols.parameters), 2 * self.ndof
         given = [code.load(numbers, i) for i in range(k)]
@@ -121,8 +111,7 @@ class Field:
             rates = [code.load(numbers, k + i) for i in range(len(self.rates))]
             for i, x in enumerate(self.program(*(code.load(y, i) for i in range(n)), *given, *rates)):
                 code.store(code.operand(x, DOUBLE), out, i)
-        code.give()
-        return compiled(str(module), "field_at", ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 6))
+        return finished(code)
 
     def fill(self, y: Value, out: Value, g: Value, letters: Value, *data: Value) -> None:
         """f(y) into `out` by loops over the terms of each kind; `g` is room for ∇H."""
@@ -145,11 +134,15 @@ class Field:
             code.store(force, out, m + d)
 
 
+field_of = kept(Field)
+
+
 class _Explicit(OneStep):
     """Steps of an explicit Runge–Kutta method."""
 
     def __init__(self, field: Field, A: tuple[tuple[float, ...], ...], B: tuple[float, ...]) -> None:
         super().__init__(field.lettered, 2 * field.ndof, len(field.rates))
+        self._given = field, A, B
         self.field, self.A, self.B = field, A[: len(B)], B
         self.work = 4.0 * len(B) * field.ndof
 
@@ -160,9 +153,9 @@ class _InRegisters(_Explicit):
     lanes = 8
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-        return self._advanced(*values, *self._given(numbers, values[0].code, step))
+        return self._advanced(*values, *self._numbers(numbers, values[0].code, step))
 
-    def _given(self, numbers: Numbers, code: Code, step: Value) -> list[Value]:
+    def _numbers(self, numbers: Numbers, code: Code, step: Value) -> list[Value]:
         """The numbers of a step: h, the parameters, the letters at each stage, the rates."""
         column = self.column(code, numbers, step)
         letters = [x for row in self.A for x in self.letters_at(column, sum(row))]
@@ -192,16 +185,10 @@ class _InRegisters(_Explicit):
         return len(self.field.program) * len(self.A) <= MOST_REVERSED
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
     ) -> tuple[list[Value], list[Value]]:
-        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
-        found = self._reverse(*values, *self._given(numbers, step.code, step), *cotangents)
+        found = self._reverse(*values, *self._numbers(numbers, step.code, step), *cotangents)
         return [step.code.operand(x, values[0].type) for x in found], []
-
-    def made(self, name: str, width: int) -> Callable[..., None]:
-        if name != "reverse":
-            return super().made(name, width)
-        return reverse_function(self.n_values, self.n_out, self.size, self.adjoint, width, closing=False)
 
 
 class _InMemory(_Explicit):

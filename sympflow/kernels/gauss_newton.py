@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler.control import DOUBLE, INT, POINTER, Code, Module, Type, Value
+from sympflow.compiler.control import DOUBLE, INT, POINTER, Code, Type, Value
 from sympflow.compiler.functions import apply, fma
-from sympflow.compiler.machine import address, host
-from sympflow.kernels.runs import finished
+from sympflow.compiler.machine import address
+from sympflow.kernels.runs import begun, finished
 
 __all__ = ["bent", "damped", "factored"]
 
@@ -239,6 +239,6 @@ _FUNCTIONS: dict[str, tuple[Callable[[Code], None], list[Type]]] = {
 @cache
 def _function(name: str) -> Callable[..., None]:
     write, types = _FUNCTIONS[name]
-    code = Module(host().fused).function(name, types)
+    code = begun(name, types)
     write(code)
-    return finished(code, types)
+    return finished(code)

@@ -24,6 +24,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import INT, Type, Value
 from sympflow.compiler.dual import Dual
 from sympflow.compiler.functions import where
@@ -498,7 +499,7 @@ class KeplerLoops:
     def __init__(self, frame: Frame) -> None:
         n, light = len(frame.order), places_of_light(frame)
         if not n or n > MOST_GROUPS * LANES - 1 or (light and not frame.jacobi):
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, with "
                 "bodies without mass in Jacobi's coordinates only: use backend='array'."
             )
@@ -528,7 +529,7 @@ class KeplerLoops:
             If there are none.
         """
         if self._light and (form.vectors or form.gradients):
-            raise ValueError(
+            raise NotCompiled(
                 "`system` has bodies without mass, and compiled deviation vectors and force gradients are for bodies "
                 "with mass: use backend='array'."
             )

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import ALWAYS, Arrangement
 from sympflow.compiler.control import INT, Sweep, Type, Value
 from sympflow.compiler.functions import FUNCTIONS, added, is_zero, times
@@ -936,7 +937,7 @@ class LatticeCode(SharedRollouts):
 
     def __init__(self, lattice: LatticeHamiltonian, level: int, compensated: bool, damped: bool) -> None:
         if level == POLYNOMIAL:
-            raise ValueError(
+            raise NotCompiled(
                 "`scheme` has polynomials, which are of systems by their coordinates one by one: use backend='array'."
             )
         super().__init__(2 * lattice.ndof * (1 + compensated), 2 * lattice.ndof)
@@ -951,9 +952,6 @@ class LatticeCode(SharedRollouts):
         self._functions, self._lock = self._stages.functions, self._stages.lock
         self.memory = partial(LatticeInMemory, self._stages)
         self.work, self.terms = lattice.ndof, 1 + level
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return LatticeCode, self._given
 
     @cached_property
     def size(self) -> int:

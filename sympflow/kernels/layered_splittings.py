@@ -13,7 +13,6 @@ those by W_l are Σ r_l ẋ_l + s_l x_l, which are added up over stages and traj
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.kernels.rollouts import LINE, Columns, SplittingRollouts, zeros
-from sympflow.kernels.runs import Numbers, reverse_function, step_function
+from sympflow.kernels.runs import Numbers, step_function
 
 __all__ = ["LayeredCode"]
 
@@ -45,10 +44,7 @@ class LayeredCode(SplittingRollouts):
 
     def __init__(self, potential: LayeredPotential) -> None:
         super().__init__(2 * potential.ndof, 2 * potential.ndof)
-        self._potential = potential
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return LayeredCode, (self._potential,)
+        self._potential, self._given = potential, (potential,)
 
     def prepared(self, table: Any) -> Columns:
         """The columns, whose kinds are followed by the weights and room for sums over trajectories."""
@@ -81,20 +77,17 @@ class LayeredCode(SplittingRollouts):
         return [fma(a, dot(row, p), x) for row, x in zip(self._potential.inverse_mass.tolist(), q, strict=True)]
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, sums: bool
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
     ) -> tuple[list[Value], list[Value]]:
-        """The reverse of `stage`, which adds up the derivatives by the weights if `sums`."""
+        """The reverse of `stage`, which adds up the derivatives by the weights with `slopes`."""
         d = self._potential.ndof
         of_q, a, b = cotangents[:d], numbers(0), numbers(1)
         of_p = self._drifted(cotangents[d:], of_q, a)  # M⁻¹ is symmetric
         v = [-(b * x) for x in of_p]
-        bend = _Layers(self._potential, values[0], kind, sums).bend(values[:d], v)
+        bend = _Layers(self._potential, values[0], kind, slopes).bend(values[:d], v)
         return [*(x + y for x, y in zip(of_q, bend, strict=True)), *of_p], []
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        if name in ("reverse", "slopes"):
-            adjoint = partial(self.adjoint, sums=name == "slopes")
-            return reverse_function(self.n_values, self.n_out, self.size, adjoint, width)
         if name != "step":
             return super().made(name, width)
 

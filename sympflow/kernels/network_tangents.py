@@ -22,13 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sympflow.compiler.control import INT, POINTER, Code, Module, Rows, Type, Value
+from sympflow.compiler.control import INT, POINTER, Code, Rows, Type, Value
 from sympflow.compiler.dual import Dual, DualRows
 from sympflow.compiler.functions import fma
-from sympflow.compiler.machine import host
 from sympflow.kernels.activations import bent
 from sympflow.kernels.rollouts import filled
-from sympflow.kernels.runs import finished
+from sympflow.kernels.runs import begun, finished
 from sympflow.kernels.threads import run_rows
 
 __all__ = ["NetworkTangents", "TrainedNetwork"]
@@ -453,7 +452,6 @@ class _Points:
 def _compiled(name: str, sizes: _Sizes, activation: str, velocity: bool) -> Callable[..., None]:
     """The function `values` or `jacobian`."""
     more, flags = {"values": (1, 0), "jacobian": (6, 2)}[name]
-    types = [*[POINTER] * (6 + more), *[INT] * (4 + flags)]
-    code = Module(host().fused).function(name, types)
+    code = begun(name, [*[POINTER] * (6 + more), *[INT] * (4 + flags)])
     getattr(_Points(code, sizes, activation, velocity, more), name)()
-    return finished(code, types)
+    return finished(code)

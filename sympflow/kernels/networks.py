@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import DOUBLE, INT, POINTER, Type, Value
 from sympflow.compiler.functions import fma
 from sympflow.compiler.program import traced
@@ -68,7 +69,7 @@ class MLPFlowKernel(Kernel):
         depths, activations = {len(layer.biases) for layer in layers}, {layer.activation for layer in layers}
         slopes = layers[0].slopes
         if len(depths) > 1 or len(activations) > 1 or not (activations <= set(SLOPES) or slopes is not None):
-            raise ValueError(
+            raise NotCompiled(
                 "`flow` must have potentials of one depth with one activation out of "
                 f"{', '.join(SLOPES)}, or one that was registered with `compiled`, to be compiled: use "
                 "backend='array'."
@@ -315,7 +316,7 @@ def _by_numba(function: Any, reason: str) -> Any:
         from numba import carray, cfunc, njit, types
         from numba.extending import is_jitted
     except ImportError as error:
-        raise ValueError(
+        raise NotCompiled(
             "`compiled`, with which the activation of the flow was registered, cannot be traced, so that Numba must "
             f"compile it ({reason.rstrip('.')}): {needed('numba', 'numba')}, or write it by operators."
         ) from error

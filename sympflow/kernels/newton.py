@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from functools import cached_property, reduce
 from itertools import pairwise
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import BOOL, DOUBLE, INT, Code, Rows, Type, Value
 from sympflow.compiler.functions import added, fma, is_zero, where
 from sympflow.compiler.program import Program, gradient, traced
@@ -26,6 +26,7 @@ from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_larg
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
+from sympflow.lazy import kept
 
 __all__ = ["implicit_kernel", "newton_code"]
 
@@ -37,32 +38,23 @@ ABREAST = 4  # numbers of a row of a matrix that are changed together
 LONG = 4e6  # operations between two looks for a stop
 
 
+@kept
 def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
 
-    A ValueError says why there are none.
+    NotCompiled says why there are none.
     """
-    kernels = _KERNELS.setdefault(system, {})
-    if (tableau, compensated) not in kernels:
-        kernels[tableau, compensated] = _kernel(system, tableau, compensated)
-    return kernels[tableau, compensated]
-
-
-_KERNELS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Tableau, bool], OneStepKernel]] = WeakKeyDictionary()
-
-
-def _kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool) -> OneStepKernel:
     written = system.spelled
     if written is None:
-        raise ValueError(
+        raise NotCompiled(
             "`system` cannot be compiled: its Hessian is not symbolic. Use HamiltonianSystem.from_sympy, "
             "or use backend='array'."
         )
     friction = system.friction
     if friction and compensated:
-        raise ValueError("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
+        raise NotCompiled("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
     if friction.kind == 2:
-        raise ValueError("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
+        raise NotCompiled("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
     symbols = written if is_large(written) else written.parametric
     of_time = with_letters(symbols, [symbols.H])
     code = newton_code(of_time, tableau, compensated, bool(friction))
@@ -96,6 +88,7 @@ class NewtonCode(OneStep):
     counted = True
 
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
+        self._given = lettered, tableau, compensated, damped
         self._tableau, self._compensated, self._damped = tableau, compensated, damped
         self._nodes, self.stages = stage_nodes(tableau), len(tableau[1])
         n = 2 * lettered.symbols.ndof
@@ -103,9 +96,6 @@ class NewtonCode(OneStep):
         self.unknowns = n * self.stages
         self.work = 4 * self.unknowns**3
         self.block = int(min(max(LONG / self.unknowns**3, 1), Rollouts.block))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return newton_code, (self.lettered, self._tableau, self._compensated, self._damped)
 
     def _changes(self, K: Sequence[Value]) -> Value:
         """Σ B_i K_i of one variable."""

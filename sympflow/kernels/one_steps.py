@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Code, Value
 from sympflow.hamiltonian.formulas import TracedHamiltonian, TracedLetters
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
@@ -59,7 +60,7 @@ def terms_of(lettered: Lettered) -> Terms:
 def check_size(form: TracedHamiltonian) -> None:
     """Refuse a traced function that would take long to compile, by a ValueError."""
     if form.size > MOST_COMPILED:
-        raise ValueError(
+        raise NotCompiled(
             f"`system` has {form.size:,} operations in its gradient, more than {MOST_COMPILED:,}, which are not "
             "compiled: write it with HamiltonianSystem.from_sympy, lattice or pairs, or use backend='array'."
         )

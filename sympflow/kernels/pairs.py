@@ -17,15 +17,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 import numpy as np
 import sympy as sp
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import INT, POINTER, Code, Module, Type, Value
-from sympflow.compiler.functions import added, apply, fma, summed
-from sympflow.compiler.machine import address, host
+from sympflow.compiler.control import INT, POINTER, Code, Type, Value
+from sympflow.compiler.functions import apply, fma, summed
+from sympflow.compiler.machine import address
 from sympflow.hamiltonian.bodies import PairsHamiltonian
 from sympflow.hamiltonian.formulas import evaluator
+from sympflow.kernels.array_splittings import ARRAYS, ArrayCode, Forces, FunctionSplitting
 from sympflow.kernels.cells import MOST_RANGES, Cells, most_along, most_cells
 from sympflow.kernels.rollouts import aligned, zeros
-from sympflow.kernels.runs import Numbers, Room, finished
+from sympflow.kernels.runs import Numbers, Room, begun, finished
 from sympflow.kernels.splittings import Shape, Splitting, Stage, WithinRange
 from sympflow.kernels.teams import Member, SharedMemory, SharedRollouts, meet
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL
@@ -334,94 +336,50 @@ class BodiesInMemory(SharedMemory):
                         code.store(code.load(room.state, at), start, place)
 
 
-class PairStages:
-    """The code of stages that change a state in memory.
+class PairSums(Forces):
+    """The code of sums over all pairs, of velocities, and of stages, which are those of states in memory.
 
-    `sites` has a row of 1/m and one of each column. `work` holds the sum that was taken last and, behind it, the
-    velocities that sums are taken along.
+    A state is a `Room` as wide as the bodies that one meets at a time. `sites` has a row of 1/m and one of each column.
     """
 
     def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
-        self.dim, self.columns = local.dim, len(local.first)
-        self.level, self.compensated, self.damped = level, compensated, damped
-        self.helpers = {0: 1, FORCE_GRADIENT: 2, CURVATURE: 3}[level]
-        self.laws = {kind: PairLaw(local, KINDS[kind]) for kind in tuple(KINDS)[: self.helpers]}
+        super().__init__(None)
+        self.dim, self.columns, self.data = local.dim, len(local.first), []
+        none: Any = None
+        self.splitting = FunctionSplitting(none, level, (), compensated, 0 if damped else None)
+        self._stages = ArrayCode(self.splitting, self)
+        kinds = tuple(KINDS)[: len(self.splitting.terms)]
+        self.laws = {kind: PairLaw(local, KINDS[kind]) for kind in kinds}
         self.cells = None if local.cutoff is None else Cells(local.dim, local.box is not None)
 
     def numbers(self) -> np.ndarray:
         """The numbers of all laws."""
         return np.concatenate([law.numbers() for law in self.laws.values()])
 
-    # a stage ----------------------------------------------------------------------------------------------------------
-
     def stage(self, context: Value, state: Value, kind: Value, numbers: Sequence[Value]) -> None:
-        """Kicks of the sums that a kind of kick has, and a drift."""
-        code = state.code
-        code.outlined("stage", (state, context, kind, *numbers), self._stage)
+        """A kick, plain (1), with a force gradient (2) or with curvature terms too (3), or none (0); and a drift."""
+        state.code.outlined("stage", (state, context, kind, *numbers), self._stage)
 
     def _stage(self, state: Value, context: Value, kind: Value, *numbers: Value) -> None:
-        """A kick, plain (1), with a force gradient (2) or with curvature terms too (3), or none (0); and a drift."""
-        code = state.code
-        a, b, *more = numbers
-        with code.given(kind > 0):
-            self._kick(context, state, "gradient", 0, -b, kind > 1, 1)
-        if self.level:
-            g = more[0]
-            with code.given(kind > 1):
-                self._kick(context, state, "hessian_vector", 1, g, kind > 2, 2)
-        if self.level == CURVATURE:
-            c = -more[1]
-            with code.given(kind > 2):
-                self._kick(context, state, "bend", 1, c)
-                self._kick(context, state, "hessian_vector", 2, c)
-        size, sites = field(context, "size"), place(context, "sites")
-        factors = more[-2:] if self.damped else [a]
-        factors = [code.splat(x, LANES) for x in factors]
-        with self._blocks(size) as i:
-            w = code.load(sites, i, _LANES)
+        code, column = state.code, [state.code.splat(x, LANES) for x in numbers]
+        blocks = (field(context, "size") * (self.dim * (4 if self.splitting.compensated else 2))) >> SHIFT
+        room = Room(code, LANES, state, place(context, "work"), blocks, context)
+        for k, terms in enumerate(self.splitting.terms):
+            with code.given(code.apply("eq", (kind, k + 1))):
+                self._stages.kicked(room, terms, column)
+        self._stages.drifted(room, column)
+
+    def velocity(self, room: Room, p: Value, out: Value, d: Value, letters: Sequence[Any]) -> None:
+        code, sites, count = room.code, place(room.places, "sites"), field(room.places, "size") >> SHIFT
+        with code.over(count) as i:
+            w = code.load(sites, i << SHIFT, _LANES)
             for k in range(self.dim):
-                p = code.load(state, size * (self.dim + k) + i, _LANES)
-                self._add(state, size, k, i, factors[0], w * p)
-                if self.damped:
-                    code.store(p * factors[1], state, size * (self.dim + k) + i)
+                at = count * k + i
+                room.store(w * room.load(at, p), at, out)
 
-    def _kick(
-        self,
-        context: Value,
-        state: Value,
-        kind: str,
-        along: int,
-        factor: Value,
-        kept: Value | None = None,
-        helper: int = 0,
-    ) -> None:
-        """A kick by a sum, which is kept as a velocity where a condition holds."""
-        code, dim = state.code, self.dim
-        size, work = field(context, "size"), place(context, "work")
-        code.outlined(f"sum_{kind}", (context, state, code.at(work, size * (dim * along))), self._sum(kind))
-        factor = code.splat(factor, LANES)
-        with self._blocks(size * dim) as i:
-            self._add(state, size, dim, i, factor, code.load(work, i, _LANES))
-        if kept is None or helper >= self.helpers:
-            return
-        sites = place(context, "sites")
-        with code.given(kept), self._blocks(size) as i:
-            w = code.load(sites, i, _LANES)
-            for k in range(dim):
-                code.store(w * code.load(work, size * k + i, _LANES), work, size * (dim * helper + k) + i)
-
-    def _add(self, state: Value, size: Value, row: int, i: Value, factor: Value, x: Value) -> None:
-        """Add a change, factor·x, to numbers of a row of a state."""
-        code = state.code
-        at = size * row + i
-        value = code.load(state, at, _LANES)
-        if not self.compensated:
-            code.store(code.fma(factor, x, value), state, at)
-            return
-        error = size * (2 * self.dim) + at
-        total, left = added(value, factor * x - code.load(state, error, _LANES))
-        code.store(left, state, error)
-        code.store(total, state, at)
+    def sum(self, order: int, room: Room, given: Sequence[Value], out: Value, d: Value, letters: Sequence[Any]) -> None:
+        kind = tuple(KINDS)[order]
+        room.code.outlined(f"sum_{kind}", (room.places, room.state, given[-1], out), self._sum(kind))
 
     @contextmanager
     def _blocks(self, size: Value) -> Iterator[Value]:
@@ -430,10 +388,10 @@ class PairStages:
 
     # a sum ------------------------------------------------------------------------------------------------------------
 
-    def _sum(self, kind: str) -> Callable[[Value, Value, Value], None]:
+    def _sum(self, kind: str) -> Callable[[Value, Value, Value, Value], None]:
         """The sum over all pairs, of this thread's chunks and, when all threads are here, of all chunks."""
 
-        def summed_up(context: Value, state: Value, along: Value) -> None:
+        def summed_up(context: Value, state: Value, along: Value, out: Value) -> None:
             code, dim = state.code, self.dim
             n, size, chunks, member, members = (field(context, name) for name in FIELDS[:5])
             rows = self._rows(kind, context, state, along)
@@ -448,8 +406,8 @@ class PairStages:
                     code.store(code.constant(0.0, _LANES), F, i)
                 self._chunk(kind, context, rows, F, chunk, chunks, n)
             meet(field(context, "meeting"), members, field(context, "stop"))
-            work, order = place(context, "work"), place(context, "order")
-            to = work if self.cells is None else code.at(place(context, "sorted"), size * dim)
+            order = place(context, "order")
+            to = out if self.cells is None else code.at(place(context, "sorted"), size * dim)
             with self._blocks(size * dim) as i:
                 total = code.variable(code.load(sums, i, _LANES))
                 with code.over(chunks - 1) as k:
@@ -459,7 +417,7 @@ class PairStages:
                 with code.over(n) as i:
                     body = code.load(order, i, INT)
                     for axis in range(dim):
-                        code.store(code.load(to, size * axis + i), work, size * axis + body)
+                        code.store(code.load(to, size * axis + i), out, size * axis + body)
 
         return summed_up
 
@@ -558,7 +516,7 @@ def pair_code(
 
 def _check_level(level: int) -> None:
     if level == POLYNOMIAL:
-        raise ValueError("`scheme` has polynomials, which need a symbolic system: take one without them.")
+        raise NotCompiled("`scheme` has polynomials, which need a symbolic system: take one without them.")
 
 
 class PairCode(SharedRollouts):
@@ -568,10 +526,10 @@ class PairCode(SharedRollouts):
         _check_level(level)
         self._given = local, level, compensated, damped
         self._local = local
-        self._stages = PairStages(local, level, compensated, damped)
+        self._stages = PairSums(local, level, compensated, damped)
         self._sets = 4 if compensated else 2
         self.memory = partial(BodiesInMemory, local.dim, self._sets)
-        self.work, self.terms = local.work, self._stages.helpers
+        self.work, self.terms = local.work, len(self._stages.splitting.terms)
         self.pieces = CHUNKS if local.work >= WORTH_CHUNKS else 1
         self._numbers = self._stages.numbers()
         n = local.n_bodies
@@ -579,12 +537,9 @@ class PairCode(SharedRollouts):
         self._sites[0, :n], self._sites[1:, :n] = 1 / local.masses, local.columns
         super().__init__(2 * local.ndof * (1 + compensated), 2 * local.ndof)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return PairCode, self._given
-
     @cached_property
     def size(self) -> int:
-        return self._stages.helpers + 1 + 2 * self._stages.damped
+        return len(self._stages.splitting.numbers)
 
     def stage(self, room: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
         self._stages.stage(room.places, room.state, kind, [numbers(i) for i in range(self.size)])
@@ -601,7 +556,7 @@ class PairCode(SharedRollouts):
             ready = zeros((2 * dim + stages.columns) * size * sorts)
             order, cells = np.arange(n), np.zeros(most_cells(n, dim) * sorts, dtype=np.int64)
             arrays = shared | {"sorted": ready, "order": order, "cells": cells}
-            arrays["work"] = zeros(stages.helpers * dim * size)
+            arrays["work"] = zeros(ARRAYS * dim * size)
             numbers = sizes | {"member": k} | {name: address(x) for name, x in arrays.items()}
             context = np.array([numbers[name] for name in FIELDS], dtype=np.int64)
             return Member(aligned(3 * sets * dim * size), context, arrays)
@@ -654,7 +609,7 @@ class PairForces:
     @cached_property
     def _forces(self) -> Callable[..., None]:
         """The function of (n, P, sites, numbers, q, F, G) that adds F and G at P states to zeros."""
-        code = Module(host().fused).function("forces", [INT, INT, *[POINTER] * 5])
+        code = begun("forces", [INT, INT, *[POINTER] * 5])
         *_, F, G = code.arguments
         states = _States(self._law, code)
         with states.groups():
@@ -663,13 +618,12 @@ class PairForces:
             if self._has_gradient:
                 for i, j, pair in states.pairs(F):
                     states.add(G, (i, j), parts("hessian_vector", *pair), 1.0)
-        return finished(code, [INT, INT, *[POINTER] * 5])
+        return finished(code)
 
     @cached_property
     def _products(self) -> Callable[..., None]:
         """The function of (n, P, sites, numbers, q, F, v, DF, DG, K) that adds derivatives along K directions."""
-        types = [INT, INT, *[POINTER] * 7, INT]
-        code = Module(host().fused).function("products", types)
+        code = begun("products", [INT, INT, *[POINTER] * 7, INT])
         *_, F, v, DF, DG, K = code.arguments
         states = _States(self._law, code)
         with states.groups(), states.some(K) as (first, count):
@@ -689,7 +643,7 @@ class PairForces:
                         m = first + k
                         u = states.between(DF, i, j, m)
                         states.add(DG, (i, j), parts("hessian_vector", d, u, g), 1.0, m)
-        return finished(code, types)
+        return finished(code)
 
 
 class _States:

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged, Arrangement
 from sympflow.compiler.control import Value
 from sympflow.compiler.functions import fma, summed, times
@@ -28,6 +28,7 @@ from sympflow.kernels.runs import Numbers
 from sympflow.kernels.stage_times import SymbolicLetters
 from sympflow.kernels.terms import MOST_IN_REGISTERS, written_out
 from sympflow.kernels.threads import given
+from sympflow.lazy import kept
 
 __all__ = ["Maps", "PartsKernel", "PartsLoops", "parts_loops"]
 
@@ -171,11 +172,8 @@ class PartsCode(Rollouts):
 
     def __init__(self, maps: PartMaps, groups: Sequence[tuple[int, ...]]) -> None:
         super().__init__(2 * maps.ndof, 2 * maps.ndof)
-        self.maps, self.groups = maps, tuple(groups)
+        self.maps, self.groups = self._given = maps, tuple(groups)
         self.size = maps.size * max(map(len, groups))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return PartsCode, (self.maps, self.groups)
 
     def columns(self, groups: Sequence[Sequence[int]], entries: np.ndarray) -> Columns:
         """The columns (n, k, size) of groups of maps, whose numbers are (n, m, size), and their kinds (k,)."""
@@ -205,15 +203,10 @@ class PartsCode(Rollouts):
         return values
 
 
+@kept
 def parts_loops(parts: ExactParts) -> PartsLoops:
-    """The compiled loops of the parts of a system, made once; a ValueError says why there are none."""
-    loops = _LOOPS.get(parts)
-    if loops is None:
-        loops = _LOOPS[parts] = PartsLoops(parts)
-    return loops
-
-
-_LOOPS: WeakKeyDictionary[ExactParts, PartsLoops] = WeakKeyDictionary()
+    """The compiled loops of the parts of a system, made once; NotCompiled says why there are none."""
+    return PartsLoops(parts)
 
 
 class PartsLoops:
@@ -227,15 +220,15 @@ class PartsLoops:
 
     def __init__(self, parts: ExactParts) -> None:
         if parts.linear is not None and not parts.linear.dense:
-            raise ValueError("`system` has its normal modes by fast transforms, on arrays: use backend='array'.")
+            raise NotCompiled("`system` has its normal modes by fast transforms, on arrays: use backend='array'.")
         if not all(isinstance(part, PartFunctions) for part in parts.rest):
-            raise ValueError(
+            raise NotCompiled(
                 "`system` has parts that are not formulas, and exact flows of parts are compiled of formulas alone: "
                 "define it with from_sympy, or use backend='array'."
             )
         rest = sum(written_out(part.H, (*part.q, *part.p)) for part in parts.rest)
         if parts.ndof > MOST_IN_REGISTERS or rest > MOST_WRITTEN_OUT:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` is too large for compiled flows of its parts: {parts.ndof} degrees of freedom, about "
                 f"{rest:,} operations in its gradient, at most {MOST_IN_REGISTERS} and {MOST_WRITTEN_OUT}."
                 " Use backend='array'."
@@ -329,7 +322,7 @@ class PartsLoops:
     def _of(self, sequence: Sequence[SubFlow]) -> PartMaps:
         """The code of maps with what these have."""
         if any(map(has_gradient, sequence)) and not self.parts.has_force_gradient:
-            raise ValueError("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
+            raise NotCompiled("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
         filters = any(m.filters is not None for m in sequence)
         if filters not in self._maps:
             self._maps[filters] = PartMaps(self.parts, filters)

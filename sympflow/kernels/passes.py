@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.compiler.control import BOOL, INT, POINTER, Module
-from sympflow.compiler.machine import address, host
-from sympflow.kernels.runs import Lanes, finished, groups
+from sympflow.compiler.control import BOOL, INT, POINTER
+from sympflow.compiler.machine import address
+from sympflow.kernels.runs import Lanes, begun, finished, groups
+from sympflow.lazy import kept
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.domain import Box, EnergySublevel
@@ -22,8 +22,6 @@ __all__ = ["all_within", "row_products"]
 
 LANES = 16
 MOST_OPERATIONS = 2000  # of an H that is written out
-
-_SUBLEVELS: WeakKeyDictionary[SymbolicHamiltonian, Callable[..., None] | None] = WeakKeyDictionary()
 
 
 def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: np.ndarray, slack: float) -> bool:
@@ -41,9 +39,7 @@ def all_within(system: HamiltonianSystem, domain: Box | EnergySublevel, states: 
     else:
         low, high = domain.limits(slack)
         if symbols is not None and (domain.hamiltonian is None or domain.hamiltonian == system.hamiltonian):
-            if symbols not in _SUBLEVELS:
-                _SUBLEVELS[symbols] = _sublevel_function(symbols)
-            within = _SUBLEVELS[symbols]
+            within = _sublevel_function(symbols)
     if within is None or states.dtype != np.float64 or len(low) != width + 2 * (not isinstance(domain, Box)):
         return False
     rows, inside = np.ascontiguousarray(states), np.zeros(1, dtype=np.int64)
@@ -56,6 +52,7 @@ def _box_function(width: int) -> Callable[..., None]:
     return _within_function(width, None)
 
 
+@kept
 def _sublevel_function(symbols: SymbolicHamiltonian) -> Callable[..., None] | None:
     """The test of an H; None if that cannot be recorded or is long."""
     import sympy as sp
@@ -69,8 +66,7 @@ def _sublevel_function(symbols: SymbolicHamiltonian) -> Callable[..., None] | No
 
 def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..., None]:
     """Compile the test of rows of n numbers, and of H and, in a plane, |L|, of (rows, n_rows, low, high, inside)."""
-    types = [POINTER, INT, POINTER, POINTER, POINTER]
-    code = Module(host().fused).function("within", types)
+    code = begun("within", [POINTER, INT, POINTER, POINTER, POINTER])
     rows, n_rows, low, high, result = code.arguments
     lanes = Lanes(code, n, LANES)
     inside = code.variable(code.constant(1, BOOL))
@@ -91,7 +87,7 @@ def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..
             any_out = any_out | each
         inside.value = inside.value & ~code.any(any_out)
     code.store(code.convert("zext", inside.value, "i64"), result)
-    return finished(code, types)
+    return finished(code)
 
 
 def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -105,8 +101,7 @@ def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 @cache
 def _products_function() -> Callable[..., None]:
-    types = [POINTER, INT, POINTER, INT, POINTER]
-    code = Module(host().fused).function("products", types)
+    code = begun("products", [POINTER, INT, POINTER, INT, POINTER])
     A, n, x, n_rows, out = code.arguments
     with code.over(n_rows) as i, code.over(n) as j:
         row, start = code.at(A, j * n), code.at(x, i * n)
@@ -114,4 +109,4 @@ def _products_function() -> Callable[..., None]:
         with code.over(n) as k:
             total.value = total.value + code.load(row, k) * code.load(start, k)
         code.store(total.value, out, i * n + j)
-    return finished(code, types)
+    return finished(code)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.kernels.threads import NEVER, given, run_rows
 
 __all__ = ["Batch", "Kernel", "Run", "RunCheckpoint", "Steps", "Task", "both_ways", "run_states"]
@@ -251,7 +252,7 @@ class Kernel(ABC):
 
     def check_reverse(self) -> None:
         """Raise a ValueError, with the reason, where runs cannot be differentiated: see `SplittingKernel.recorded`."""
-        raise ValueError("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
+        raise NotCompiled("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
 
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The `step` from each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d); None where they are not compiled."""

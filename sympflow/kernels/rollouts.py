@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.protocol import Batch
-from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, run_function
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "zeros"]
@@ -99,14 +100,26 @@ class Rollouts(ABC):
     counted = False
     closing = True
 
+    _given: tuple[Any, ...]
+    """The arguments of the class."""
+
     def __init__(self, n_values: int, n_out: int) -> None:
         self.n_values, self.n_out = n_values, n_out
         self._lock = threading.RLock()
         self._functions: dict[Any, Callable[..., None]] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), self._given
+
     @abstractmethod
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
+
+    def adjoint(
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
+    ) -> tuple[list[Value], list[Value]]:
+        """The reverse of `stage`, where there is one: see `sympflow.kernels.runs.Adjoint`."""
+        raise NotImplementedError
 
     def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
         """One column of many states: see `sympflow.kernels.runs.Over`."""
@@ -158,16 +171,16 @@ class Rollouts(ABC):
         return found
 
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "run" or "kept", each " own" too, or "map"."""
-        memory, (what, _, own_tables) = self.place, name.partition(" ")
+        """Compile the function of a name: "run", "kept", "reverse" or "slopes", each " own" too, or "map"."""
+        sizes, memory, (what, _, own_tables) = (self.n_values, self.n_out, self.size), self.place, name.partition(" ")
         if name == "map":
-            return map_function(self.n_values, self.n_out, self.size, self.stage, width, memory, self.timed)
-        look, every = (None, self.block) if self.every is None else (self.look, self.every)
+            return map_function(*sizes, self.stage, width, memory, self.timed)
         own, kept = bool(own_tables), what == "kept"
+        if what in ("reverse", "slopes"):
+            return reverse_function(*sizes, self.adjoint, width, own, what == "slopes", self.closing)
+        look, every = (None, self.block) if self.every is None else (self.look, self.every)
         over = self.over if self.chunked and not kept else None
-        return run_function(
-            self.n_values, self.n_out, self.size, self.stage, width, own, memory, look, every, self.closing, over, kept
-        )
+        return run_function(*sizes, self.stage, width, own, memory, look, every, self.closing, over, kept)
 
     @cached_property
     def _places(self) -> np.ndarray:
@@ -282,4 +295,4 @@ class SplittingRollouts(Rollouts):
 
     def check_reverse(self) -> None:
         """Raise a ValueError, with the reason, where stages have no compiled reverse: see `SplittingCode.adjoint`."""
-        raise ValueError("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")
+        raise NotCompiled("`system` has compiled loops without a reverse, which gradients need: use backend='array'.")

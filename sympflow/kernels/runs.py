@@ -24,6 +24,7 @@ __all__ = [
     "Numbers",
     "Room",
     "assign",
+    "begun",
     "finished",
     "groups",
     "map_function",
@@ -42,9 +43,9 @@ Numbers = Callable[..., Any]
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 """``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
 `step` tells after how many whole steps the stage is executed."""
-Adjoint = Callable[[list[Value], list[Value], Numbers, Value, Value], tuple[list[Value], list[Value]]]
-"""``adjoint(values, cotangents, numbers, kind, step)``: the cotangents of the values before a stage, and of its
-numbers, for those of the values after it."""
+Adjoint = Callable[[list[Value], list[Value], Numbers, Value, Value, bool], tuple[list[Value], list[Value]]]
+"""``adjoint(values, cotangents, numbers, kind, step, slopes)``: the cotangents of the values before a stage, and with
+`slopes` of its numbers, for those of the values after it."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
 Over = Callable[[Callable[..., None], Numbers, Value, Value], None]
@@ -106,10 +107,9 @@ def run_function(
         trajectories side by side only whether it is `n_steps`, else −1. Where `keeps` is 1, `running` is left with the
         state of the run. Ends soon if ``stop[0]`` becomes 1.
     """
-    module = Module(host().fused)
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
     types += MEMORY if memory else [POINTER] if kept else []
-    code = module.function("run", types)
+    code = begun("run", types)
     table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite, running, keeps, stop = (
         code.arguments[:15]
     )
@@ -180,7 +180,7 @@ def run_function(
             _mark(code, alive.value, n.value, finite, begin, n_rows)
         with code.given(one <= keeps):
             state.keep(running, begin, n_rows)
-    return finished(code, types)
+    return finished(code)
 
 
 def reverse_function(
@@ -201,7 +201,7 @@ def reverse_function(
     table of its own for every `width` trajectories would hold is added to that array, in the same order.
     """
     types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER]
-    code = Module(host().fused).function("reverse", types)
+    code = begun("reverse", types)
     table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, derivatives = code.arguments
     one, zero = code.constant(1, INT), code.constant(0, INT)
     lanes, outputs = Lanes(code, n_values, width), Lanes(code, n_out, width)
@@ -215,7 +215,7 @@ def reverse_function(
         n, saved = code.variable(n_steps), code.variable(n_saved)
 
         def pulled(j: Value, step: Value, state: list[Value], given: list[Value]) -> list[Value]:
-            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step)
+            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step, slopes)
             for i, x in enumerate(of_numbers if slopes else ()):
                 at = j * (size * width) + i * width
                 code.store(code.load(found, at, x.type) + x, found, at)
@@ -247,7 +247,7 @@ def reverse_function(
                 r.value = code.select(opens, link, r.value)
             n.value = to
         lanes.store([x.value for x in cotangents], rows, begin, n_rows, one, zero)
-    return finished(code, types)
+    return finished(code)
 
 
 def map_function(
@@ -265,7 +265,7 @@ def map_function(
     `MEMORY`: row i is mapped after ``steps[i % n_steps]`` whole steps; `out` may be `rows`.
     """
     types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
-    code = Module(host().fused).function("map", types)
+    code = begun("map", types)
     table, kinds, n_columns, steps, n_steps, rows, n_rows, out = code.arguments[:8]
     state = _state(code, n_values, n_out, width, memory, code.arguments[8:])
     column = ColumnStage(code, table, kinds, size, 1, width, stage)
@@ -277,7 +277,7 @@ def map_function(
             state.change(column, j, step)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return finished(code, types)
+    return finished(code)
 
 
 def _steps_of_lanes(code: Code, steps: Value, n_steps: Value, begin: Value, width: int) -> Value:
@@ -307,7 +307,7 @@ def step_function(
     Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
     """
     types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
-    code = Module(host().fused).function("steps", types)
+    code = begun("steps", types)
     table, n_columns, n_powers, x, h, t, rows, n_rows, out = code.arguments[:9]
     state = _state(code, n_values, n_out, width, memory, code.arguments[9:])
     alone, behind = Lanes(code, 1, width), Lanes(code, own, width) if own else None
@@ -329,7 +329,7 @@ def step_function(
             state.change(lambda j, x, step, entries=entries: stage(x, entries.__getitem__, j, step), j, j)
         state.end()
         state.store(out, begin, n_rows, code.constant(1, INT), code.constant(0, INT))
-    return finished(code, types)
+    return finished(code)
 
 
 MEMORY = [INT, INT, POINTER, POINTER]
@@ -733,7 +733,13 @@ def _due(code: Code, save: Value, n_saved: Value, saved: Variable, n: Variable) 
 _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "double": ctypes.c_double}
 
 
-def finished(code: Code, types: Sequence[Type]) -> Callable[..., None]:
+def begun(name: str, types: Sequence[Type]) -> Code:
+    """Begin the code of a function for this machine."""
+    return Module(host().fused).function(name, types)
+
+
+def finished(code: Code) -> Callable[..., None]:
     """End the code of a function, and compile it."""
     code.give()
-    return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *[_C[t.scalar] for t in types]))
+    types = [_C[x.type.scalar] for x in code.arguments]
+    return compiled(str(code.module), code.name, ctypes.CFUNCTYPE(None, *types))

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary, ref
+from weakref import ref
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.formulas import TracedDriving, TracedHamiltonian
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -18,6 +19,7 @@ from sympflow.kernels.one_steps import check_size
 from sympflow.kernels.protocol import Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.stages import StageTable, check_damping, run_table, step_table
 from sympflow.kernels.threads import given
+from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, Scheme
 
 if TYPE_CHECKING:
@@ -30,20 +32,14 @@ if TYPE_CHECKING:
     from sympflow.kernels.stage_times import Driving
 
 
+@kept
 def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> SplittingLoops:
     """The compiled loops of splitting schemes on a separable system, made once per system.
 
-    With `names` the values of `SplittingLoops` are those of these parameters. A ValueError says why there are none.
+    With `names` the values of `SplittingLoops` are those of these parameters. NotCompiled says why there are none.
     """
-    known = _LOOPS.get(system)
-    if known is None:
-        known = _LOOPS[system] = {}
-    if names not in known:
-        known[names] = SplittingLoops(system, names)
-    return known[names]
+    return SplittingLoops(system, names)
 
-
-_LOOPS: WeakKeyDictionary[HamiltonianSystem, dict[tuple[str, ...], SplittingLoops]] = WeakKeyDictionary()
 
 LANES_OF_SUMS, LANES = 16.0, 2.0
 """By how much less a kick takes in a batch than `SplittingLoops.work`: of sums and products alone, and of functions."""
@@ -75,7 +71,7 @@ class SplittingLoops:
         self.abreast = 1.0
         self.driven = not system.autonomous
         if not (system.separable if symbols is None else symbols.separable):
-            raise ValueError("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
+            raise NotCompiled("`system` is not separable, so no splitting method applies: use 'gauss_legendre6'.")
         if symbols is not None:
             from sympflow.hamiltonian.recorded import check_recorded  # SymPy, which Numba functions do without
             from sympflow.kernels.terms import is_large
@@ -88,7 +84,7 @@ class SplittingLoops:
 
                 self._driving = driven_form(symbols if self._large else symbols.parametric)
                 if self._large and self._driving.means:
-                    raise ValueError(
+                    raise NotCompiled(
                         "`system` has many terms and a kinetic energy that depends on t: use backend='array'."
                     )
                 self._driving.check()
@@ -123,12 +119,12 @@ class SplittingLoops:
             self._compile = partial(function_code, system.ndof, *given, ndim)
         elif system.local is not None:
             if system.damping is not None and system.damping.ndim:
-                raise ValueError(
+                raise NotCompiled(
                     f"`system` {system.name!r} has friction, and its loops take one rate for all momenta: use "
                     "backend='array'."
                 )
             if system.local.arrays_only:
-                raise ValueError(
+                raise NotCompiled(
                     f"`system` has {system.local.arrays_only}, whose kicks are array operations: use 'array'."
                 )
             if system.local.loops == "pairs":
@@ -144,14 +140,14 @@ class SplittingLoops:
             self.traced = self._written is not None
         elif system.layered is not None:
             if system.friction:
-                raise ValueError(
+                raise NotCompiled(
                     f"`system` {system.name!r} has friction, and weights that torch follows: use backend='array'."
                 )
             self._has_force_gradient, self.tensors = False, system.layered.tensors
             self.work = system.layered.n_weights
             self._compile = partial(_layered_code, system.layered)
         else:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` cannot be compiled, for its functions could not be traced: {system.untraced}. Change them, "
                 "or define it with HamiltonianSystem.from_sympy, or use backend='array'."
             )
@@ -188,13 +184,13 @@ class SplittingLoops:
         variant = (level, compensated, monomials, varied, ranges)
         if variant not in self._variants:
             if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
-                raise ValueError(
+                raise NotCompiled(
                     "`scheme` has force gradients, which need a kinetic energy quadratic in p and, for a system of "
                     "Numba functions, `hessian_vector`: take a scheme without them, for instance 'kahan_li8'."
                 )
             if level > FORCE_GRADIENT and not self._has_curvature:
                 what = "curvature terms" if level == CURVATURE else "polynomials"
-                raise ValueError(f"`scheme` has {what}, which need a symbolic system: take one without them.")
+                raise NotCompiled(f"`scheme` has {what}, which need a symbolic system: take one without them.")
             self._variants[variant] = self._made(*variant)
         return self._variants[variant]
 
@@ -343,24 +339,38 @@ class SplittingLoops:
 
 def _layered_code(layered: LayeredPotential, level: int, compensated: bool, monomials: Monomials) -> Any:
     if compensated:
-        raise ValueError("`compensated` sums are not compiled for weights that torch follows: leave it out.")
+        raise NotCompiled("`compensated` sums are not compiled for weights that torch follows: leave it out.")
     from sympflow.kernels.layered_splittings import LayeredCode
 
     return LayeredCode(layered)
 
 
 class SplittingKernel(Kernel):
-    """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`."""
+    """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`.
+
+    With `values` (k, N) those of batches of N trajectories, each with its own values of `SplittingLoops.values`. They
+    take the steps of a system with its values; with compensated sums, force gradients, friction and driving up to
+    rounding: products of values, which are part of the code there, or taken out of loops, may be fused with sums here.
+    A batch may be several of such ones, one after the other.
+    """
 
     def __init__(
-        self, loops: SplittingLoops, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None
+        self,
+        loops: SplittingLoops,
+        scheme: Scheme,
+        compensated: bool = False,
+        ranges: Ranges | None = None,
+        values: np.ndarray | None = None,
     ) -> None:
         self.loops, self.scheme, self.compensated, self._ranges = loops, scheme, compensated, ranges
         self._width, self.tensors = 2 * loops.ndof * (1 + compensated), loops.tensors
+        self._values = None if values is None else np.ascontiguousarray(values.T, dtype=np.float64)
+        self._of_kind: Any = {"varied": values is not None, "ranges": ranges}
+        self._latest = np.empty((0, 0))
 
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         """The numbers of a run whose steps are h, as the loops read them; of a driven system from a time t0 on."""
-        return self.loops.rows(run_table(self.scheme, h), h, t0, ranges=self._ranges)
+        return self.loops.rows(run_table(self.scheme, h), h, t0, **self._of_kind)
 
     def runs(self, task: Task) -> Run:
         code, table, start = self._functions(), self.table(task.h, task.t0), self._rows(task)
@@ -369,9 +379,10 @@ class SplittingKernel(Kernel):
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
-        h = np.asarray(h, dtype=np.float64)
+        h, rows = np.asarray(h, dtype=np.float64), self._with_values(y)
         h = h.repeat(len(y)) if h.ndim == 0 else h
-        return Steps(self.loops.step_rows(step_table(self.scheme), h, h, y, self.scheme.monomials, t))
+        varied = self._values is not None
+        return Steps(self.loops.step_rows(step_table(self.scheme), h, h, rows, self.scheme.monomials, t, varied))
 
     def check_reverse(self) -> None:
         self._functions().check_reverse()
@@ -391,40 +402,14 @@ class SplittingKernel(Kernel):
         code: Any = self._functions()
         return code.stepped(rows, y, h, t, values)
 
-    def varied(self, values: np.ndarray) -> VariedKernel:
+    def varied(self, values: np.ndarray) -> SplittingKernel:
         """The loops of batches whose trajectories have these values (k, N) of `SplittingLoops.values`."""
-        return VariedKernel(self.loops, self.scheme, self.compensated, values)
+        return SplittingKernel(self.loops, self.scheme, self.compensated, values=values)
 
     def _rows(self, task: Task) -> np.ndarray | None:
         """The states of a task as the loops read them, where they have more; a run that goes on reads none."""
-        return None
-
-    def _functions(self) -> SplittingRollouts:
-        return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, ranges=self._ranges)
-
-
-class VariedKernel(SplittingKernel):
-    """The loops of batches of N trajectories that have their own values (k, N) of `SplittingLoops.values`.
-
-    Each takes the steps of `SplittingKernel` on a system with its values; with compensated sums, force gradients,
-    friction and driving up to rounding: products of values, which are part of the code there, or taken out of loops,
-    may be fused with sums here. A batch may be several of such ones, one after the other.
-    """
-
-    def __init__(self, loops: SplittingLoops, scheme: Scheme, compensated: bool, values: np.ndarray) -> None:
-        super().__init__(loops, scheme, compensated)
-        self._values = np.ascontiguousarray(values.T, dtype=np.float64)
-        self._latest = np.empty((0, 0))
-
-    def table(self, h: float, t0: float = 0.0) -> np.ndarray:
-        return self.loops.rows(run_table(self.scheme, h), h, t0, varied=True)
-
-    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        lengths, times = (np.broadcast_to(np.asarray(x, dtype=np.float64), len(y)) for x in (h, t))
-        table, rows, of_kicks = step_table(self.scheme), self._with_values(y), self.scheme.monomials
-        return Steps(self.loops.step_rows(table, lengths, lengths, rows, of_kicks, times, varied=True))
-
-    def _rows(self, task: Task) -> np.ndarray | None:
+        if self._values is None:
+            return None
         if len(task.y0) % len(self._values):
             raise TypeError("`y0` must be a batch (N, 2d): trajectories have their own parameters.")
         if not (task.goes_on and len(self._latest) == len(task.y0)):
@@ -432,11 +417,13 @@ class VariedKernel(SplittingKernel):
         return self._latest
 
     def _with_values(self, y: np.ndarray) -> np.ndarray:
-        """The states of a batch with the values behind them."""
+        """States with the values of their trajectories behind them."""
+        if self._values is None:
+            return y
         return np.concatenate([y, np.tile(self._values, (len(y) // len(self._values), 1))], axis=1, dtype=np.float64)
 
     def _functions(self) -> SplittingRollouts:
-        return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, varied=True)
+        return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, **self._of_kind)
 
 
 @lru_cache(maxsize=256)

@@ -22,7 +22,7 @@ from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gra
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, reverse_function, step_function
+from sympflow.kernels.runs import Numbers, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
@@ -381,16 +381,13 @@ class SplittingCode(SplittingRollouts):
     """The compiled functions of splitting schemes on one system; `chunked` by default if no polynomials."""
 
     def __init__(self, splitting: Splitting, chunked: bool | None = None) -> None:
-        self._splitting = splitting
+        self._splitting, self._given = splitting, (splitting,)
         self._tables: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
         super().__init__(2 * splitting.ndof * (1 + splitting.compensated), 2 * splitting.ndof)
         self.timed = splitting.timed
         self.chunked = self.timed or not splitting.polynomial if chunked is None else chunked
         self.lanes = 8 if self.chunked else 16  # chunks need not wait for each other, registers side by side do
         self._own = splitting.own
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return SplittingCode, (self._splitting,)
 
     @cached_property
     def _kinds(self) -> Sequence[Any]:
@@ -472,9 +469,8 @@ class SplittingCode(SplittingRollouts):
         self._adjoints  # noqa: B018
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value
+        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
     ) -> tuple[list[Value], list[Value]]:
-        """The reverse of `stage`: see `sympflow.kernels.runs.Adjoint`."""
         code, type = step.code, values[0].type
         zero = code.constant(0.0, type)
         found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]
@@ -530,22 +526,9 @@ class SplittingCode(SplittingRollouts):
             state = self._kinds[k].plain(*state, *self._kinds[k].table(*given))
         return torch.stack([x.expand(y.shape[:-1]) for x in state[: self.n_out]], dim=-1)
 
-    @property
-    def given_numbers(self) -> int:
-        """How many numbers of a column are given, from which those are computed that the code reads."""
-        return len(self._splitting.numbers)
-
-    def executed(self, given: Sequence[Any], values: list[Value]) -> list[Value]:
-        """The values after a stage of the last kind, by the numbers that are given."""
-        last = self._kinds[-1]
-        return last.body(*values, *last.table(*given))
-
     def made(self, name: str, width: int) -> Callable[..., None]:
-        """Compile the function of a name: "step", "reverse" and "slopes", each " own" too."""
+        """Compile the function of a name, "step" too."""
         what, _, own = name.partition(" ")
-        if what in ("reverse", "slopes"):
-            sizes = self.n_values, self.n_out, self.size
-            return reverse_function(*sizes, self.adjoint, width, bool(own), what == "slopes")
         if what != "step":
             return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]

@@ -8,21 +8,28 @@ and force-gradient schemes among them, and the kicks of these are taken at a fix
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
-from sympflow.compiler.control import Value
+from sympflow.compiler import NotCompiled
+from sympflow.compiler.control import DOUBLE, INT, Code, Value
 from sympflow.compiler.functions import apply, where
-from sympflow.hamiltonian.driving import DURATION, Samples, drift, sampled, with_symbols
+from sympflow.hamiltonian.driving import DURATION, Samples, drift, with_symbols
 from sympflow.hamiltonian.formulas import evaluator, recorded
 from sympflow.hamiltonian.recorded import check_recorded
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
-from sympflow.kernels.samples import check_samples, sampled_value
 
 __all__ = ["Driving", "SymbolicLetters", "driven_form", "letters_of_time"]
+
+
+MOST_SAMPLED = 200_000
+"""Numbers of samples that compiled code holds."""
+UNIFORM = 1e-9
+"""Relative deviation of equal intervals."""
 
 
 @dataclass(frozen=True)
@@ -47,24 +54,20 @@ class Driving:
 
     def values_at(self, time: Value, length: Value, fixed: Sequence[Value]) -> list[Any]:
         """The letters at a time, and their means over a length from there, in compiled code."""
-        known = {self.time: time, DURATION: length, **dict(zip(self.form.parameters, fixed, strict=False))}
-        expressions = [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
-        of_time = evaluator(known)
-        for each in {a for f in expressions for a in f.atoms(sampled)}:
-            known[each] = sampled_value(self.samples[each.name_of_samples], each.order, of_time(each.at))
-        value = evaluator(known)
-        values = [value(f) for f in self.letters.values()]
-        for f, integral in self.means.values():
-            values.append(where(apply("eq", length, 0.0), value(f), value(integral) / length))
-        return values
+        parameters = dict(zip(self.form.parameters, fixed, strict=False))
+        values = _values(self._expressions, {self.time: time, DURATION: length, **parameters}, self.samples)
+        means, first = list[Any](), len(self.letters)
+        for f, integral in zip(values[first::2], values[first + 1 :: 2], strict=True):
+            means.append(where(apply("eq", length, 0.0), f, integral / length))
+        return [*values[:first], *means]
+
+    @property
+    def _expressions(self) -> list[sp.Expr]:
+        return [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
 
     def check(self) -> None:
         """Refuse what has no compiled form, by a ValueError."""
-        letters = [*self.letters.values(), *(f for pair in self.means.values() for f in pair)]
-        for f in (self.form.V, self.form.T, *with_symbols(letters)[0]):
-            check_recorded(f)
-        for samples in self.samples.values():
-            check_samples(samples)
+        _check((self.form.V, self.form.T, *self._expressions), self.samples)
 
 
 def driven_form(symbols: SymbolicHamiltonian) -> Driving:
@@ -95,7 +98,7 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
         letters = {*found.values()}
         if not any(sp.diff(lettered, s).free_symbols & letters for s in letters):
             return lettered, found
-    raise ValueError(
+    raise NotCompiled(
         f"`system` has the kinetic energy {symbols.T}, which is not a sum of products of functions of {symbols.time} "
         "and of p: use an implicit method such as 'gauss_legendre6'."
     )
@@ -109,10 +112,7 @@ class SymbolicLetters:
     """
 
     def __init__(self, symbols: SymbolicHamiltonian, expressions: Sequence[sp.Expr]) -> None:
-        for samples in symbols.samples.values():
-            check_samples(samples)
-        for f in with_symbols(list(expressions))[0]:
-            check_recorded(f)
+        _check(expressions, symbols.samples)
         found: dict[sp.Expr, sp.Symbol] = {}
         time, fixed = symbols.time, {*symbols.parameters}
         self.expressions = list(expressions)
@@ -123,12 +123,24 @@ class SymbolicLetters:
 
     def at(self, t: Value, parameters: Sequence[Value]) -> list[Value]:
         """The letters at times t."""
-        symbols = self.symbols
-        expressions, sampled = with_symbols(list(self.letters.values()))
-        of_time = evaluator({symbols.time: t, **dict(zip(symbols.parameters, parameters, strict=True))})
-        values = [sampled_value(symbols.samples[f.name_of_samples], f.order, of_time(f.at)) for f in sampled]
-        program = recorded(expressions, (symbols.time, *symbols.parameters, *sampled.values()))
-        return [t.code.operand(x, t.type) for x in program(t, *parameters, *values)]
+        known = {self.symbols.time: t, **dict(zip(self.symbols.parameters, parameters, strict=True))}
+        return [t.code.operand(x, t.type) for x in _values(self.letters.values(), known, self.symbols.samples)]
+
+
+def _check(expressions: Iterable[sp.Expr], samples: Mapping[str, Samples]) -> None:
+    """Refuse what has no compiled form."""
+    for f in with_symbols(list(expressions))[0]:
+        check_recorded(f)
+    for each in samples.values():
+        check_samples(each)
+
+
+def _values(expressions: Iterable[sp.Expr], known: dict[Any, Any], samples: Mapping[str, Samples]) -> list[Any]:
+    """The values of expressions, in compiled code, for those of their symbols."""
+    without, found = with_symbols(list(expressions))
+    at = evaluator(known)
+    values = [sampled_value(samples[f.name_of_samples], f.order, at(f.at)) for f in found]
+    return recorded(without, (*known, *found.values()))(*known.values(), *values)
 
 
 def letters_of_time(
@@ -146,3 +158,64 @@ def letters_of_time(
         others = [letters_of_time(a, t, fixed, found, prefix) for a in f.args if not a.free_symbols <= known]
         return f.func(letters_of_time(f.func(*alone), t, fixed, found, prefix), *others)
     return f.func(*[letters_of_time(a, t, fixed, found, prefix) if isinstance(a, sp.Basic) else a for a in f.args])
+
+
+# functions of the time that are given by samples ----------------------------------------------------------------------
+
+
+def check_samples(samples: Samples) -> None:
+    """Raise a ValueError if there are more than compiled code holds."""
+    c = samples.c
+    if c.size > MOST_SAMPLED:
+        raise NotCompiled(
+            f"`params` has samples of {len(samples.x)} times, more than compiled code holds: give fewer than "
+            f"{MOST_SAMPLED // len(c)}, or use backend='array'."
+        )
+
+
+def sampled_value(samples: Samples, order: int, t: Value) -> Value:
+    """A derivative of samples, of order −1 the antiderivative, at times t, each lane at its own."""
+    name = f"sampled_{samples.digest}_{order}".replace("-", "m")
+
+    def one(t: Value) -> Value:
+        return t.code.outlined(name, [t], lambda t: _polynomial(samples, order, name, t), DOUBLE, rare=False)
+
+    return t.code.lanes(one, [t], t.type)
+
+
+def _polynomial(samples: Samples, order: int, name: str, t: Value) -> Value:
+    """The polynomial of the interval of t, found at once where all are equal, else by bisection."""
+    code, c, x = t.code, samples.polynomials(order), samples.x
+    n, first, last = len(x) - 1, float(x[0]), float(x[-1])
+    times, coefficients = code.array(f"{name}_times", x), code.array(f"{name}_c", c.T.ravel())
+    turns = None
+    if samples.periodic:
+        turns = apply("floor", (t - first) / (last - first))
+        t = t - turns * (last - first)
+    width = (last - first) / n
+    if np.all(np.abs(np.diff(x) - width) <= UNIFORM * width):
+        place = apply("floor", (t - first) * (1 / width))
+        place = where(place > 0.0, where(place < n - 1.0, place, n - 1.0), 0.0)  # NaN too is in the first
+        i = code.convert("fptosi", place, "i64")
+    else:
+        i = _bisected(code, times, n, t)
+    s, k = t - code.load(times, i), len(c)
+    total = code.load(coefficients, i * k)
+    for j in range(1, k):
+        total = total * s + code.load(coefficients, i * k + j)
+    if turns is not None and order < 0:
+        total = total + turns * float(np.polyval(c[:, -1], last - float(x[-2])))
+    return total
+
+
+def _bisected(code: Code, times: Value, n: int, t: Value) -> Value:
+    """The last of the first n times that is at most t, the first one if none is."""
+
+    def halved(_: Value, values: list[Value]) -> list[Value]:
+        low, high = values
+        middle = (low + high) >> 1
+        below = code.load(times, middle) <= t
+        return [code.select(below, middle, low), code.select(below, high, middle)]
+
+    low, high = code.constant(0, INT), code.constant(n, INT)
+    return code.loop(max(n - 1, 1).bit_length(), [low, high], halved)[0]

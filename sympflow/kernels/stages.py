@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT, POLYNOMIAL, Scheme
 
 if TYPE_CHECKING:
@@ -207,7 +208,7 @@ MOST_COUPLED = 6
 def check_damping(system: HamiltonianSystem, in_memory: bool) -> None:
     """Refuse a damping matrix that compiled loops do not take, by a ValueError."""
     if system.damping is not None and system.damping.ndim == 2 and (in_memory or system.ndof > MOST_COUPLED):
-        raise ValueError(
+        raise NotCompiled(
             f"`system` {system.name!r} has a damping matrix, which is compiled for symbolic systems of up to "
             f"{MOST_COUPLED} degrees of freedom: use backend='array'."
         )

@@ -17,16 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.compiler.control import INT, POINTER, Module, Rows, Type, Value
+from sympflow.compiler import NotCompiled
+from sympflow.compiler.control import INT, POINTER, Rows, Type, Value
 from sympflow.compiler.functions import dot, fma, summed
-from sympflow.compiler.machine import address, host
+from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, fused, gradient, reached, tangent, traced
 from sympflow.hamiltonian.formulas import TracedHamiltonian, evaluator
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.rollouts import aligned, filled
-from sympflow.kernels.runs import finished
+from sympflow.kernels.runs import begun, finished
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["LabelErrors", "TableLoops", "table_loops"]
@@ -202,7 +203,7 @@ def table_loops(
         return None
     try:
         return TableLoops(symbols, kicks, level, monomials, friction)
-    except ValueError:
+    except NotCompiled:
         return None
 
 
@@ -284,7 +285,7 @@ class _Maps:
 
 def _check_length(n: int) -> None:
     if n > MOST_OPERATIONS:
-        raise ValueError(f"`system` has a kick of {n} operations.")
+        raise NotCompiled(f"`system` has a kick of {n} operations.")
 
 
 def _product(A: Sequence[Sequence[Any]], x: Sequence[Any]) -> list[Any]:
@@ -309,8 +310,7 @@ class _Errors:
 
     def __init__(self, maps: _Maps, linearized: bool) -> None:
         self.maps, self.linearized = maps, linearized
-        self._types = [*[POINTER] * 6, INT, INT]
-        self.code = code = Module(host().fused).function("errors", self._types)
+        self.code = code = begun("errors", [*[POINTER] * 6, INT, INT])
         plan, self.c, self.motions, self.r, self.J, memory, self.first, self.last = code.arguments
         (
             self.kinds, self.values, self.X, self.Y, self.scale, self.slope, self.places, self.design,
@@ -356,7 +356,7 @@ class _Errors:
                 with code.over(n_errors) as row:
                     self.back(row)
                     self.derivatives((j * n_errors + row) * n + start, self.n_times * n_errors * n)
-        return finished(code, self._types)
+        return finished(code)
 
     @contextmanager
     def stages(self, back: bool = False) -> Iterator[tuple[Value, Value, Value, Rows]]:

@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged
 from sympflow.compiler.control import INT, Value
 from sympflow.compiler.functions import dot, is_zero, summed
@@ -28,6 +28,7 @@ from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import Shape, Splitting, SplittingCode, shared
 from sympflow.kernels.stages import StageTable, run_table
 from sympflow.kernels.threads import given
+from sympflow.lazy import kept
 from sympflow.schemes import FORCE_GRADIENT, Scheme
 
 __all__ = ["TangentCode", "TangentKernel", "TangentRun", "step_tangents", "tangent_kernel"]
@@ -154,15 +155,12 @@ class TangentCode(SplittingCode):
 
     def __init__(self, splitting: Splitting, vectors: int, grows: bool) -> None:
         super().__init__(splitting, chunked=False)
-        self.vectors, self._grows = vectors, grows
+        self.vectors, self._grows, self._given = vectors, grows, (splitting, vectors, grows)
         self._d = d = splitting.symbols.ndof
         self.n_values = self.n_out = 2 * d * (1 + vectors) + (vectors if grows else 0)
         products = d * d + (d if splitting.symbols.inverse_mass is not None else d * d)
         self.room = 0 if vectors * products > MOST_WRITTEN_OUT else None
         self.every = EVERY if grows else None
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return TangentCode, (self._splitting, self.vectors, self._grows)
 
     @cached_property
     def _kinds(self) -> list[Arranged]:
@@ -338,30 +336,35 @@ def _looks(save: np.ndarray, n_steps: int, limit: float) -> np.ndarray:
 
 
 def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool) -> TangentCode:
-    """The compiled functions of a system with k vectors, made once; a ValueError says why there are none."""
-    codes, key = _CODES.setdefault(system, {}), (level, monomials, vectors, grows)
-    if key not in codes:
-        codes[key] = _lacks(system)
-        if not codes[key]:
-            splitting = splitting_loops(system).splitting(level, monomials)
-            codes[key] = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
-    found = codes[key]
-    if isinstance(found, str):
-        raise ValueError(found)
-    return found
+    """The compiled functions of a system with k vectors, made once; NotCompiled says why there are none."""
+    lacks = _lacks(system)
+    if lacks:
+        raise NotCompiled(lacks)
+    return _tangent_code(system, level, monomials, vectors, grows)
 
 
+@kept
+def _tangent_code(
+    system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool
+) -> TangentCode:
+    splitting = splitting_loops(system).splitting(level, monomials)
+    code: TangentCode = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
+    return code
+
+
+@kept
 def _lacks(system: HamiltonianSystem) -> str:
     """The reason why a system has no compiled vectors, "" if it has."""
-    if not system.autonomous:
-        return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
     if system.symbols is None:
         given = system.local is not None or system.form is not None
     else:
         from sympflow.kernels.terms import is_long
 
         given = not is_long(system.symbols, FORCE_GRADIENT)
-    if not given or not splitting_loops(system).traced:
+    loops = splitting_loops(system) if given else None
+    if loops is not None and loops.driven:
+        return f"`system` {system.name!r} depends on t, for which vectors are moved by arrays."
+    if loops is None or not loops.traced:
         return (
             f"`system` {system.name!r} has no compiled deviation vectors, which are made for symbolic systems of "
             "few terms: use backend='auto'."
@@ -386,13 +389,10 @@ def step_tangents(
     n = y.shape[1]
     try:
         code = tangent_code(system, table.level, monomials, n, False)
-    except ValueError:
+    except NotCompiled:
         return None
     rows = np.empty((len(y), n * (1 + n)))
     rows[:, :n], rows[:, n:] = y, np.eye(n).reshape(-1)
     out = np.empty_like(rows)
     code.step_rows(splitting_loops(system).rows(table), given(x), given(h), given(h), rows, out)
     return out[:, :n], out[:, n:].reshape(-1, n, n).swapaxes(1, 2)
-
-
-_CODES: WeakKeyDictionary[HamiltonianSystem, dict[Any, TangentCode | str]] = WeakKeyDictionary()

@@ -8,11 +8,13 @@ however many there are.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
 
+from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arrangement
 from sympflow.compiler.control import INT, Rows, Value
 from sympflow.compiler.functions import is_zero
@@ -48,7 +50,8 @@ def is_long(symbols: SymbolicHamiltonian, level: int) -> bool:
     return bool(len(operations) * each ** {FORCE_GRADIENT: 1, CURVATURE: 2}.get(level, 0) > MOST_OPERATIONS)
 
 
-def written_out(f: sp.Expr, variables: Sequence[sp.Symbol]) -> int:
+@lru_cache(maxsize=64)
+def written_out(f: sp.Expr, variables: tuple[sp.Symbol, ...]) -> int:
     """Operations of ∇f, roughly: those of each term as often as it has variables."""
     known = set(variables)
     return sum(sp.count_ops(term) * len(term.free_symbols & known) for term in sp.Add.make_args(f))
@@ -188,7 +191,7 @@ class Terms:
         """The terms, refused where the formulas of all kinds have too many operations."""
         n = sum(4 * sp.count_ops(family.f) for family in self._families)
         if n > MOST_COMPILED:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` has so many terms of different kinds, about {n:,} operations, that it is not compiled. Give "
                 "it by Numba functions that loop over its terms: HamiltonianSystem(V, ndof=…, gradient=…, "
                 "hessian_vector=…), or use backend='array'."

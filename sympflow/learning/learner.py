@@ -260,7 +260,7 @@ def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
     if not isinstance(known, HamiltonianSystem):
         raise TypeError(f"`known` must be a HamiltonianSystem, a part of H; got {known!r}.")
     symbols = known.symbols
-    if symbols is None or known.ndof != d or not known.autonomous or known.friction:
+    if symbols is None or known.ndof != d or not known.keeps_energy:
         raise ValueError(
             f"`known` must be a symbolic system of {d} degrees of freedom that depends on no time and has no friction: "
             "define it by HamiltonianSystem.from_sympy."

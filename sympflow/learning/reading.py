@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import MAX_ASKED_VALUES, floats, is_number_word
-from sympflow.arrays import is_tensor, to_numpy
+from sympflow.arrays import without_torch
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
 
 UNITS = {
@@ -64,7 +64,7 @@ Found = tuple[str, np.ndarray, np.ndarray]
 def _numbers(values: Any, name: str) -> np.ndarray:
     """Real numbers as a float64 array of NumPy, NaN where they are masked."""
     try:
-        array = to_numpy(values) if is_tensor(values) else values
+        array = without_torch(values)
         if isinstance(array, np.ma.MaskedArray):
             array = np.ma.filled(array.astype(float), np.nan)
         array = np.asarray(array)
@@ -82,7 +82,7 @@ def _is_array(values: Any, ndim: int) -> bool:
     if isinstance(values, str | bytes | Mapping) or values is None:
         return False
     try:
-        return np.ndim(to_numpy(values) if is_tensor(values) else values) == ndim
+        return np.ndim(without_torch(values)) == ndim
     except ValueError:  # lists of different lengths
         return False
 

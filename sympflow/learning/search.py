@@ -644,12 +644,13 @@ class Search:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
             flow = self._primed(system, dt, session) if system.separable else self._collocated(system, dt)
-        if system.separable and system.autonomous and self._is_worse(flow):
+        still = system.autonomous
+        if system.separable and still and self._is_worse(flow):
             flow, told = self._collocated(system, dt), []
         for warning in told:
             warnings.warn(str(warning.message), warning.category, stacklevel=3)
         flow.figures = {**flow.figures, **self.figures(flow.dt)}
-        whole = system.autonomous and not isinstance(system, DoubledSystem)
+        whole = still and not isinstance(system, DoubledSystem)
         flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole and not session.deadline.over() else None
         if self._is_worse(flow):
             error, noise = flow.figures["one_step_error"], flow.figures["noise"]
@@ -663,7 +664,7 @@ class Search:
         physical = system.physical if isinstance(system, DoubledSystem) else system
         scene = {
             "damping": None if physical.damping is None else physical.damping.tolist(),
-            "time": None if physical.autonomous else "t",
+            "time": None if still else "t",
             "period": physical.period,
             "drag": self._drag,
             "physical": physical.expression,

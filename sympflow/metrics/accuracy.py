@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arrays import Array, is_tensor, to_numpy
+from sympflow.arrays import Array, masked, to_numpy
 from sympflow.hamiltonian.scales import distance, weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import failed
@@ -141,7 +141,7 @@ def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
     there = _end(sol, (t0, t1), y0)
     finite = np.isfinite(to_numpy(there)).all(-1)
     if not finite.all():
-        there = _replace(there, finite, y0)
+        there = masked(there, ~finite[..., None], y0)
     try:
         back = _end(sol, (t1, t0), there)
     except (ValueError, TypeError, NotImplementedError) as refused:  # it ran forwards, so it is the direction
@@ -155,17 +155,6 @@ def time_reversal_error(sol: Solution) -> np.floating | np.ndarray:
 
 def _end(sol: Solution, t_span: tuple[float, float], y0: Array) -> Array:
     """The last state, NaN if the run did not reach it."""
-    end = solve(sol.system, sol.integrator, t_span, y0, t_eval=[t_span[1]], dtype=_dtype(y0), on_domain_exit="ignore")
+    dtype = y0.dtype if isinstance(y0, np.ndarray) else None
+    end = solve(sol.system, sol.integrator, t_span, y0, t_eval=[t_span[1]], dtype=dtype, on_domain_exit="ignore")
     return end.y[..., -1] if len(end.t) else y0 * np.nan
-
-
-def _dtype(y0: Array) -> np.dtype | None:
-    return None if is_tensor(y0) else y0.dtype
-
-
-def _replace(y: Array, keep: np.ndarray, other: Array) -> Array:
-    if not is_tensor(y):
-        return np.where(keep[..., None], y, other)
-    import torch
-
-    return torch.where(torch.as_tensor(keep, device=y.device)[..., None], y, other)

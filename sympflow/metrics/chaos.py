@@ -294,10 +294,10 @@ def check_followed(orbits: Orbits) -> None:
             f"`method` {integrator.name!r} {what}, so that deviation vectors of states are not known: use a splitting "
             "method such as 'kahan_li8', or an implicit one such as 'gauss_legendre6'."
         )
-    if not (system.autonomous or integrator.on_grid) and orbits.batch:
-        raise ValueError(
-            f"`y0` is a batch, whose steps by method {integrator.name!r} begin at times of their own, and "
-            f"{system.name!r} depends on t: pass one state at a time, or use a method of fixed steps."
+    if orbits.batch and not integrator.on_grid:
+        system.check_autonomous(
+            f"and the steps of a batch `y0` by method {integrator.name!r} begin at times of their own",
+            "pass one state at a time, or use a method of fixed steps",
         )
 
 

@@ -77,11 +77,10 @@ def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
 
 def kept_by(system: HamiltonianSystem) -> str:
     """Return the name of what the flow of a system keeps: its "energy", or the "balance" of a drive, or "" for none."""
-    if not system.conservative:
-        return ""
-    if system.autonomous:
+    if system.keeps_energy:
         return "energy"
-    return "" if system.symbols is not None and system.symbols.jumps else "balance"
+    jumps = system.symbols is not None and system.symbols.jumps
+    return "balance" if system.conservative and not jumps else ""
 
 
 def _start_energy(sol: Solution) -> np.ndarray:
@@ -94,7 +93,7 @@ def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
     system = sol.system
     y = to_numpy(sol.states).astype(float)  # (..., n, 2d)
     H = np.asarray(system.hamiltonian(y, np.broadcast_to(sol.t, y.shape[:-1])))
-    if system.autonomous:
+    if system.keeps_energy:
         return H, np.zeros(H.shape)
     extended = extended_system(system)
     integrator = None if extended is None else sol.integrator.on_extended(system, extended)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sympflow.arguments import real_number, warn
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
-from sympflow.integrators.contract import FINISHED, Problem, start_of
+from sympflow.integrators.contract import FINISHED, Problem
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings, pieces_of
 from sympflow.integrators.registry import naming_plugin
@@ -253,13 +253,12 @@ def _escapes(
 
 
 def _located(
-    integrator: FixedStep, system: HamiltonianSystem, times: np.ndarray, y: np.ndarray, h: float, region: Outside
+    integrator: FixedStep, system: HamiltonianSystem, times: Any, y: np.ndarray, h: float, region: Outside
 ) -> tuple[np.ndarray, np.ndarray]:
     """The parts (n,) of steps from y (n, 2d) at times (n,) after which states are outside, and these states."""
-    t = start_of(system, times)
     inside, out = np.zeros(len(y)), np.ones(len(y))
     for _ in range(HALVINGS):
         middle = (inside + out) / 2
-        kept = _inside(region, integrator.step(system, t, y, middle * h))
+        kept = _inside(region, integrator.step(system, times, y, middle * h))
         inside, out = np.where(kept, middle, inside), np.where(kept, out, middle)
-    return out * h, np.asarray(integrator.step(system, t, y, out * h))
+    return out * h, np.asarray(integrator.step(system, times, y, out * h))

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_positive, checked_number, warn
-from sympflow.arrays import is_tensor, to_numpy
+from sympflow.arguments import check_array, check_positive, checked_number, warn
+from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.problems import check_y0
@@ -126,8 +126,7 @@ def floquet_multipliers(
         raise ValueError(f"`period` is needed: the system {system.name!r} has none of its own.")
     check_positive("period", T)
     checked_number("t0", t0)
-    if is_tensor(y0):
-        raise TypeError("`y0` is a tensor, but multipliers are of NumPy arrays: pass y0.numpy().")
+    check_array(y0, "multipliers are of NumPy arrays")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
     if start.ndim != 1:
         raise ValueError(f"`y0` must be one state, of shape ({2 * system.ndof},); got {start.shape}.")

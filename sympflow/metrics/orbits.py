@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_t_span
-from sympflow.arrays import is_tensor
+from sympflow.arguments import check_array, check_t_span
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.choosing import integrator_for, with_start
 from sympflow.integrators.contract import Integrator
@@ -101,8 +100,7 @@ def checked_orbits(
     """
     system = given_system(system)
     span = check_t_span(system.t_span if t_span is None else t_span)
-    if is_tensor(y0):
-        raise TypeError(f"`y0` is a tensor, but {purpose} NumPy arrays: pass y0.numpy().")
+    check_array(y0, f"{purpose} NumPy arrays")
     start = check_y0(system, system.y0 if y0 is None else y0, None)
     integrator = integrator_for(system, method, options, span, start)
     system = with_start(integrator, system, start)

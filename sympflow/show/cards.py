@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import sys
+import unicodedata
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from contextlib import suppress
@@ -69,6 +70,9 @@ class Shown(ABC):
     def __repr__(self) -> str:
         return self.card().plain()
 
+    def __str__(self) -> str:
+        return legible(repr(self))
+
     def _repr_html_(self) -> str:
         figure = None
         if "matplotlib" in sys.modules:
@@ -85,6 +89,40 @@ def _picture(figure: Figure | None) -> str:
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=80)
     return f'<img src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+
+
+def legible(text: str) -> str:
+    """A text in characters that can be printed, in the encoding of the terminal."""
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    with suppress(UnicodeEncodeError):
+        text.encode(encoding)
+        return text
+    plain = "".join(SPELLED.get(c) or _spelled(c) for c in text)
+    return plain.encode(encoding, "replace").decode(encoding)
+
+
+SPELLED = {
+    "…": "...",
+    "µ": "u",
+    "±": "+-",
+    "─": "-",
+    "–": "-",
+    "—": "-",
+    "−": "-",
+    "×": "x",
+    "·": "*",
+    "∞": "inf",
+    "≤": "<=",
+    "≥": ">=",
+    "→": "->",
+}
+
+
+def _spelled(character: str) -> str:
+    """A letter without its accent, a Greek one by its name."""
+    if "α" <= character <= "ω":
+        return unicodedata.name(character).rpartition(" ")[2].lower()
+    return "".join(c for c in unicodedata.normalize("NFKD", character) if not unicodedata.combining(c))
 
 
 def cut(text: str, longest: int = LONGEST) -> str:

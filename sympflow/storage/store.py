@@ -46,6 +46,7 @@ KEPT = "sympflow_state"
 TOLD = 90  # characters of what differs between two calls
 STATE = re.compile(r"\.state-([1-9]\d{0,17})\.npz")
 MOST_METADATA = 2**26  # bytes
+MOST_STATES = 64  # bytes that are kept to go on, over those of a chunk of each array
 STORABLE = "biufc"
 """Kinds of dtypes that a store takes: truth values and numbers."""
 
@@ -196,6 +197,11 @@ class Store:
                     raise ValueError(f"{links[0]!r} is a link to elsewhere")
             return cls(place, fields, attributes)
         except FileNotFoundError:
+            if (place / ".zgroup").exists():
+                raise ValueError(
+                    f"`store` {str(place)!r} has no {METADATA}, the metadata of all its arrays, which sympflow writes: "
+                    "write it by zarr.consolidate_metadata(path), or give another place."
+                ) from None
             if place.exists():
                 raise ValueError(f"`store` {str(place)!r} is not a store of sympflow: give another place.") from None
             raise FileNotFoundError(f"`store` {str(place)!r} does not exist.") from None
@@ -342,7 +348,8 @@ class Store:
         if name is None:
             return {}
         try:
-            return read_arrays(self.path / name)
+            held = sum(prod(known.chunks or ()) * known.dtype.itemsize for known in self.fields.values())
+            return read_arrays(self.path / name, MOST_METADATA + MOST_STATES * held)
         except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
             raise self.damaged(f"its state cannot be read ({error})") from None
 
@@ -440,9 +447,11 @@ def is_name(name: Any) -> bool:
     return PurePath(name).name == name != "" and "\\" not in name
 
 
-def read_arrays(file: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file, none of which takes more memory than the file has bytes."""
+def read_arrays(file: Path, most: int) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file of so many bytes at most, none of which takes more memory than these."""
     arrays = {}
+    if file.stat().st_size > most:
+        raise ValueError(f"more than {most:,} bytes")
     with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():
             if member.compress_type != zipfile.ZIP_STORED:

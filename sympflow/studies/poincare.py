@@ -212,13 +212,10 @@ def _checked_period(system: HamiltonianSystem, period: float | None, plane: list
             )
         check_positive("period", period)
         return float(period)
-    if plane or system.autonomous:
+    if plane:
         return None
     if system.period is None:
-        raise ValueError(
-            f"`period` is needed: {system.name!r} is driven and has none of its own. Give it, or a plane by "
-            "`coordinate`."
-        )
+        system.check_autonomous("and has no period of its own", "give `period`, or a plane by `coordinate`")
     return system.period
 
 

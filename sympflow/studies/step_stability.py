@@ -14,8 +14,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_SAVED_VALUES, check_counts, check_t_span, checked_number, positive_numbers
-from sympflow.arrays import is_tensor, to_numpy
+from sympflow.arguments import (
+    MAX_SAVED_VALUES,
+    check_array,
+    check_counts,
+    check_t_span,
+    checked_number,
+    positive_numbers,
+)
+from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.scales import smallest_size, started
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
@@ -176,8 +183,7 @@ def _say(progress: Callable[[str], None] | None, what: str, detail: str) -> None
 
 def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarray:
     """The states (n, 2d) that runs start from: those given, or one and three more along its orbit."""
-    if is_tensor(y0):
-        raise TypeError("`y0` must be a NumPy array, for every method of the study takes one: pass y0.numpy().")
+    check_array(y0, "every method of the study takes NumPy arrays")
     given = check_y0(system, system.y0 if y0 is None else y0, None)
     if given.ndim > 2:
         raise ValueError(f"`y0` must have shape (2d,) or (n, 2d); got {given.shape}.")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from functools import partial
 from typing import Any, ClassVar, Self
@@ -25,7 +25,7 @@ from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.split import SplitFlow
-from sympflow.flow.sympflow import SympFlow
+from sympflow.flow.sympflow import Drive, SympFlow
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -34,7 +34,6 @@ Resolved = Any
 """A fit or a solver in which no choice is left open."""
 Which = bool | tuple[int, ...]
 
-SCHEDULES = ("one-cycle", "cosine", "constant")
 LOSSES = ("residual", "matching", "labels")
 WEIGHTS = ("residual_weight", "matching_weight", "label_weight")
 
@@ -45,8 +44,7 @@ WEIGHTS = ("residual_weight", "matching_weight", "label_weight")
 def check_weights(**weights: Any) -> None:
     """Weights of the losses: some may be 0, but not all."""
     for name, value in weights.items():
-        if not (real_number(value) and 0 <= value < math.inf):
-            raise ValueError(f"`{name}` must be finite and at least 0; got {value!r}: 0 leaves the loss out.")
+        weight(name, value)
     if not any(weights.values()):
         *most, last = (f"`{name}`" for name in weights)
         raise ValueError(f"{', '.join(most)} and {last} are all 0: give one of them a positive value.")
@@ -58,19 +56,58 @@ def check_of(name: str, value: Any, known: Iterable[str]) -> None:
         raise ValueError(f"`{name}` {value!r} is unknown: choose one of {', '.join(known)}.")
 
 
-class _Options:
-    """A frozen dataclass of options."""
+Check = Callable[[str, Any], None]
+"""Raises an error unless an option of that name may have the value."""
 
-    COUNTS: ClassVar[tuple[str, ...]] = ()
+
+def count(name: str, value: Any) -> None:
+    check_counts(**{name: plain(value)})
+
+
+def one_of(*known: str) -> Check:
+    return lambda name, value: check_of(name, value, known)
+
+
+def weight(name: str, value: Any, what: str = "loss") -> None:
+    """A weight; 0 leaves the loss out."""
+    if not (real_number(value) and 0 <= value < math.inf):
+        raise ValueError(f"`{name}` must be finite and at least 0; got {value!r}: 0 leaves the {what} out.")
+
+
+def seed_number(name: str, value: Any) -> None:
+    seed = plain(value)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ValueError(f"`{name}` must be a non-negative integer; got {value!r}: give 0 or more.")
+
+
+def duration(name: str, value: Any) -> None:
+    if not (real_number(value) and 0 < value < math.inf):
+        raise ValueError(f"`{name}` must be a positive finite number; got {value!r}: leave it out for the default.")
+
+
+def option(check: Check | None = None, default: Any = None, *, left_open: bool = False, of_flow: bool = False) -> Any:
+    """Return a field: its check, if None is a choice too, and if it describes a new flow."""
+    return field(default=default, metadata={"check": check, "open": left_open or default is None, "of_flow": of_flow})
+
+
+class _Options:
+    """A frozen dataclass of options, the fields of which hold their checks."""
 
     def __post_init__(self) -> None:
-        left_open = {f.name for f in fields(self) if getattr(self, f.name) is None and "None" in f.type}  # type: ignore[arg-type]
-        check_counts(**{name: plain(getattr(self, name)) for name in self.COUNTS if name not in left_open})
+        for f in fields(self):  # type: ignore[arg-type]
+            check, value = f.metadata.get("check"), getattr(self, f.name)
+            if check is not None and not (value is None and f.metadata["open"]):
+                check(f.name, value)
 
     @classmethod
     def names(cls) -> list[str]:
         """The names of the options."""
         return [f.name for f in fields(cls)]  # type: ignore[arg-type]
+
+    @classmethod
+    def of_flow(cls) -> list[str]:
+        """The options that describe the new flow."""
+        return [f.name for f in fields(cls) if f.metadata.get("of_flow")]  # type: ignore[arg-type]
 
     def given(self) -> list[str]:
         """The options that have another value than their default."""
@@ -101,14 +138,13 @@ class GaussNewton(_Options):
         taken, and a checkpoint is written.
     """
 
-    steps: int | None = None
-    restarts: int | None = None
-    refresh: int | None = None
-    validate_every: int = 5
-    checkpoint_every: int = 10
+    steps: int | None = option(count)
+    restarts: int | None = option(count)
+    refresh: int | None = option(count)
+    validate_every: int = option(count, 5)
+    checkpoint_every: int = option(count, 10)
 
     name: ClassVar[str] = "gauss-newton"
-    COUNTS: ClassVar[tuple[str, ...]] = ("steps", "restarts", "refresh", "validate_every", "checkpoint_every")
     POINTS: ClassVar[int] = 1500
 
 
@@ -129,24 +165,16 @@ class Adam(_Options):
         See `GaussNewton`.
     """
 
-    steps: int = 20_000
-    learning_rate: float = 5e-3
-    schedule: str = "one-cycle"
-    clip: float | None = 1.0
-    refresh: int | None = 1
-    validate_every: int = 500
-    checkpoint_every: int = 1000
+    steps: int = option(count, 20_000)
+    learning_rate: float = option(check_positive, 5e-3)
+    schedule: str = option(one_of("one-cycle", "cosine", "constant"), "one-cycle")
+    clip: float | None = option(check_positive, 1.0, left_open=True)
+    refresh: int | None = option(count, 1, left_open=True)
+    validate_every: int = option(count, 500)
+    checkpoint_every: int = option(count, 1000)
 
     name: ClassVar[str] = "adam"
-    COUNTS: ClassVar[tuple[str, ...]] = ("steps", "refresh", "validate_every", "checkpoint_every")
     POINTS: ClassVar[int] = 700
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_of("schedule", self.schedule, SCHEDULES)
-        check_positive("learning_rate", self.learning_rate)
-        if self.clip is not None:
-            check_positive("clip", self.clip)
 
     def rate(self, step: int) -> float:
         """The learning rate of a step."""
@@ -164,13 +192,12 @@ class Adam(_Options):
 class BFGS(_Options):
     """BFGS with a dense matrix, 20 iterations in each of `steps` on the points of the step: see `GaussNewton`."""
 
-    steps: int = 200
-    refresh: int | None = None
-    validate_every: int = 5
-    checkpoint_every: int = 5
+    steps: int = option(count, 200)
+    refresh: int | None = option(count)
+    validate_every: int = option(count, 5)
+    checkpoint_every: int = option(count, 5)
 
     name: ClassVar[str] = "bfgs"
-    COUNTS: ClassVar[tuple[str, ...]] = ("steps", "refresh", "validate_every", "checkpoint_every")
     POINTS: ClassVar[int] = 4000
 
 
@@ -178,7 +205,7 @@ class BFGS(_Options):
 class LBFGS(BFGS):
     """Limited-memory BFGS, likewise; for networks of more than 8000 parameters."""
 
-    steps: int = 500
+    steps: int = option(count, 500)
 
     name: ClassVar[str] = "lbfgs"
 
@@ -217,32 +244,21 @@ class Fit(_Options):
         Held-out states of the figures.
     """
 
-    dt: float | None = None
+    dt: float | None = option(duration, of_flow=True)
     _: KW_ONLY
-    points: int | None = None
-    label_times: int = 8
-    seed: int = 0
-    reference_states: int = 100
+    points: int | None = option(count)
+    label_times: int = option(count, 8)
+    seed: int = option(seed_number, 0)
+    reference_states: int = option(count, 100)
 
     kind: ClassVar[str]
-    COUNTS: ClassVar[tuple[str, ...]] = ("points", "label_times", "reference_states")
-    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt",)
-    """The options that describe the new flow."""
     OPEN: ClassVar[dict[str, int]] = {}
     """The numbers of a solver that leaves them open."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        seed = plain(self.seed)
-        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            raise ValueError(f"`seed` must be a non-negative integer; got {self.seed!r}: give 0 or more.")
-        if self.dt is not None and not (real_number(self.dt) and 0 < self.dt < math.inf):
-            raise ValueError(f"`dt` must be a positive finite number; got {self.dt!r}: leave it out for the default.")
 
     @property
     def of_a_given_flow(self) -> Self:
         """The same without what describes the new flow."""
-        described: Any = {f.name: f.default for f in fields(self) if f.name in self.OF_FLOW}
+        described: Any = {f.name: f.default for f in fields(self) if f.name in self.of_flow()}
         return replace(self, **described)
 
     def flow(self, system: HamiltonianSystem, domain: Domain, earlier: FlowMap | None = None) -> Any:
@@ -256,7 +272,7 @@ class Fit(_Options):
 
     def record(self, solver: Solver) -> dict[str, Any]:
         """The record of a recipe and a checkpoint: what determines the trained numbers."""
-        mine = {name: getattr(self, name) for name in self.names() if name not in (*self.OF_FLOW, "data", "loss")}
+        mine = {name: getattr(self, name) for name in self.names() if name not in (*self.of_flow(), "data", "loss")}
         mine |= {name: getattr(solver, name) for name in solver.names()}
         found = {"optimizer": solver.name, "loss": self.losses, **mine}
         return {name: plain(value) for name, value in found.items() if value is not None}
@@ -270,10 +286,8 @@ class _LossFit(Fit):
     residual_weight: float | None = None
     matching_weight: float | None = None
     label_weight: float | None = None
-    matching_times: int = 10
+    matching_times: int = option(count, 10)
     data: Data | None = field(default=None, repr=False, compare=False)
-
-    COUNTS: ClassVar[tuple[str, ...]] = (*Fit.COUNTS, "matching_times")
 
     def record(self, solver: Solver) -> dict[str, Any]:
         return super().record(solver) | ({} if self.data is None else {"data": _checksum(self.data)})
@@ -336,33 +350,25 @@ class PrimedFit(_LossFit):
         See `Fit`.
     """
 
-    stages: int | None = None
-    processor: int | None = None
-    curvature: Which = False
-    polynomial: int | None = None
-    first: str = "drift"
-    scheme: str | None = None
-    force_gradient: Which | None = None
-    dtype: torch.dtype = torch.float64
-    device: torch.device | str | None = None
-    frozen_weight: float = 1.0
-    energy_weight: float = 10.0
-    loss_points: int = 300
-    runs: int | None = None
+    stages: int | None = option(of_flow=True)
+    processor: int | None = option(of_flow=True)
+    curvature: Which = option(default=False, of_flow=True)
+    polynomial: int | None = option(of_flow=True)
+    first: str = option(default="drift", of_flow=True)
+    scheme: str | None = option(of_flow=True)
+    force_gradient: Which | None = option(of_flow=True)
+    dtype: torch.dtype = option(default=torch.float64, of_flow=True)
+    device: torch.device | str | None = option(of_flow=True)
+    frozen_weight: float = option(check_positive, 1.0)
+    energy_weight: float = option(partial(weight, what="energy"), 10.0)
+    loss_points: int = option(count, 300)
+    runs: int | None = option(count)
 
     kind: ClassVar[str] = "primed"
-    COUNTS: ClassVar[tuple[str, ...]] = (*_LossFit.COUNTS, "loss_points", "runs")
-    SHAPE: ClassVar[tuple[str, ...]] = ("curvature", "polynomial", "first", "scheme", "force_gradient")
-    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "stages", "processor", *SHAPE, "dtype", "device")
     OPEN: ClassVar[dict[str, int]] = {"restarts": 24, "steps": 1000}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive("frozen_weight", self.frozen_weight)
-        if not (real_number(self.energy_weight) and 0 <= self.energy_weight < math.inf):
-            raise ValueError(
-                f"`energy_weight` must be finite and at least 0; got {self.energy_weight!r}: 0 leaves the energy out."
-            )
         if self.loss is None:
             for name in (name for name in WEIGHTS if getattr(self, name) is not None):
                 raise TypeError(
@@ -393,14 +399,14 @@ class PrimedFit(_LossFit):
         return levels if self.first == "drift" else levels[:-1]
 
     def flow(self, system: HamiltonianSystem, domain: Domain | None = None, earlier: FlowMap | None = None) -> Any:
-        shape = {name: getattr(self, name) for name in (*self.SHAPE, "dtype", "device")}
-        flow = SympFlow.primed(
-            system,
-            (3 if self.stages is None else self.stages) if self.scheme is None else None,
-            dt=1.0 if self.dt is None else float(self.dt),
-            processor=6 if self.processor is None else self.processor,
-            **shape,
-        )
+        shape: Any = {name: getattr(self, name) for name in self.of_flow()}
+        shape["dt"] = 1.0 if self.dt is None else float(self.dt)
+        shape["processor"] = 6 if self.processor is None else self.processor
+        if self.scheme is None and self.stages is None:
+            shape["stages"] = 3
+        elif self.scheme is not None:
+            shape["stages"] = None
+        flow = SympFlow.primed(system, **shape)
         if earlier is not None:
             assert isinstance(earlier, PrimedFlow)
             flow.take_over(earlier)
@@ -427,23 +433,20 @@ class SplitFit(Fit):
         See `Fit`.
     """
 
-    points: int = 150
-    label_times: int = 16
-    turn: float = 10.0
-    stages: int = 4
-    terms: int = 8
-    force_gradient: Which | None = None
-    frozen_weight: float = 30.0
+    points: int = option(count, 150)
+    label_times: int = option(count, 16)
+    turn: float = option(check_positive, 10.0, of_flow=True)
+    stages: int = option(default=4, of_flow=True)
+    terms: int = option(default=8, of_flow=True)
+    force_gradient: Which | None = option(of_flow=True)
+    frozen_weight: float = option(check_positive, 30.0)
     loss: str | None = None
 
     kind: ClassVar[str] = "split"
-    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "turn", "stages", "terms", "force_gradient")
     OPEN: ClassVar[dict[str, int]] = {"restarts": 8, "steps": 150}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive("frozen_weight", self.frozen_weight)
-        check_positive("turn", self.turn)
         if self.loss not in (None, "labels"):
             raise ValueError(f"`loss` {self.loss!r} is not one that Gauss–Newton fits split flows by: use 'labels'.")
 
@@ -479,10 +482,9 @@ class LossFit(_LossFit):
         See `Fit`.
     """
 
-    validation_points: int = 2000
+    validation_points: int = option(count, 2000)
 
     kind: ClassVar[str] = "losses"
-    COUNTS: ClassVar[tuple[str, ...]] = (*_LossFit.COUNTS, "validation_points")
     OPEN: ClassVar[dict[str, int]] = {"steps": 200}
 
     def resolved(self, solver: Solver, kind: str) -> LossFit:
@@ -520,14 +522,12 @@ class NetworkFit(LossFit):
         See `LossFit`.
     """
 
-    pairs: int = 3
-    hidden: Sequence[int] = (10, 10)
-    activation: str = "tanh"
-    dtype: torch.dtype = torch.float64
-    device: torch.device | str | None = None
-    baseline: bool = False
-
-    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "pairs", "hidden", "activation", "dtype", "device", "baseline")
+    pairs: int = option(default=3, of_flow=True)
+    hidden: Sequence[int] = option(default=(10, 10), of_flow=True)
+    activation: str = option(default="tanh", of_flow=True)
+    dtype: torch.dtype = option(default=torch.float64, of_flow=True)
+    device: torch.device | str | None = option(of_flow=True)
+    baseline: bool = option(default=False, of_flow=True)
 
     @property
     def kind(self) -> str:  # type: ignore[override]
@@ -541,9 +541,9 @@ class NetworkFit(LossFit):
         ValueError
             If no baseline has as many parameters.
         """
-        make = partial(SympFlow, system.ndof) if system.autonomous else partial(SympFlow.timed, system)
         like: Any = {"dtype": self.dtype, "device": self.device, "seed": self.seed, "scale": scaling}
-        flow = make(self.pairs, hidden=self.hidden, activation=self.activation, dt=dt, **like)
+        drawn: Any = {"hidden": self.hidden, "activation": self.activation, "dt": dt, "drive": Drive.of(system)}
+        flow = SympFlow(system.ndof, self.pairs, **drawn, **like)
         if not self.baseline:
             return flow
         if matching_widths(flow.ndof, flow.n_parameters) is None:
@@ -570,13 +570,12 @@ class ClockedFit(Fit):
         See `Fit`.
     """
 
-    points: int = 100
-    label_times: int = 12
-    scheme: str = "leapfrog"
-    terms: int = 10
+    points: int = option(count, 100)
+    label_times: int = option(count, 12)
+    scheme: str = option(default="leapfrog", of_flow=True)
+    terms: int = option(default=10, of_flow=True)
 
     kind: ClassVar[str] = "clocked"
-    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "scheme", "terms")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -639,8 +638,8 @@ DEFAULTS: dict[str, Any] = {"residual_weight": 1.0} | {
 }
 """Values that mean the same as a keyword that is left out, for every fit and solver."""
 
-OF_NETWORKS = tuple(n for n in NetworkFit.OF_FLOW if n not in (*PrimedFit.OF_FLOW, "baseline"))
-OF_PRIMED = tuple(n for n in PrimedFit.OF_FLOW if n not in NetworkFit.OF_FLOW)
+OF_NETWORKS = [n for n in NetworkFit.of_flow() if n not in (*PrimedFit.of_flow(), "baseline")]
+OF_PRIMED = [n for n in PrimedFit.of_flow() if n not in NetworkFit.of_flow()]
 OF_SEARCHES = ("restarts", "frozen_weight", "energy_weight", "runs")
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from sympflow.arrays import to_numpy
+from sympflow.flow.sympflow import Drive
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -85,9 +86,8 @@ def states(domain: Domain, n: int, seed: int, stream: Stream, block: int = 0) ->
 
 def drive_times(system: HamiltonianSystem) -> tuple[float, float] | None:
     """The times of labels where the drive has no period, those of its `t_span`; None for another system."""
-    if system.autonomous or system.period is not None:
-        return None
-    return min(system.t_span), max(system.t_span)
+    drive = Drive.of(system)
+    return None if drive is None else drive.times
 
 
 def times_of(system: HamiltonianSystem, dt: float) -> tuple[float, float]:
@@ -132,7 +132,7 @@ class PointSource:
         labels: tuple[np.ndarray, ...] | None = None,
         system: HamiltonianSystem | None = None,
     ) -> None:
-        self._driven = None if system is None or system.autonomous else system
+        self._system = system
         self.domain, self.dt, self.seed, self.streams = domain, dt, seed, streams
         self.points, self.times = points, matching_times
         self.block_length = block
@@ -167,10 +167,11 @@ class PointSource:
         t = self.dt * (np.arange(self.points) + rng.random((k, self.points))) / self.points
         tm = self.dt * (np.arange(m) + rng.random((k, m))) / m
         drawn = [t, x, tm[..., None], xm]
-        if self._driven is not None:
-            for stream, shape in zip(self.streams, ((k, self.points), (k, m, 1)), strict=True):
-                t0 = start_times(self._driven, self.dt, math.prod(shape), self.seed, stream, block)
-                drawn.append(np.reshape(t0, shape))  # type: ignore[arg-type]
+        for stream, shape in zip(self.streams, ((k, self.points), (k, m, 1)), strict=True):
+            if self._system is None:
+                break
+            t0 = start_times(self._system, self.dt, math.prod(shape), self.seed, stream, block)
+            drawn += [] if t0 is None else [np.reshape(t0, shape)]
         self._arrays = tuple(torch.as_tensor(a, **self._like) for a in drawn)  # type: ignore[arg-type]
         self._block = block
 

@@ -1,13 +1,14 @@
-"""The command that makes the flows that ship: networks, ladders of primed flows, flows of stiff systems.
+"""The command that makes the flows that ship again, each by the recipe in its file, and measures their figures.
 
 python -m sympflow.training.pretrained                                  all of them
 python -m sympflow.training.pretrained henon_heiles --kind sympflow     one
 python -m sympflow.training.pretrained kepler --rung primed-3-0.08      one rung of a ladder of primed flows
 python -m sympflow.training.pretrained kepler --workers 2                the ladder of a scene, by two processes
-python -m sympflow.training.pretrained fput_50                          one of a stiff system
 python -m sympflow.training.pretrained --measure                        their figures, without training
 python -m sympflow.training.pretrained --measure --keep                 and put them into the files
 python -m sympflow.training.pretrained --identify                       put the H that flows know into the files
+
+A new one is trained by `sympflow.train`, saved in the folder as scene-name.safetensors, and measured with --keep.
 """
 
 from __future__ import annotations
@@ -20,10 +21,7 @@ from typing import Any
 
 import torch
 
-from sympflow.flow.files import load
-from sympflow.flow.flow_map import FlowMap
-from sympflow.training.shipped import rows
-from sympflow.training.shipped.recipe import Recipe, file_of, made, scenes
+from sympflow.training.shipped.recipe import Recipe, made
 
 KINDS = ("sympflow", "mlp", "primed", "split")
 
@@ -35,12 +33,10 @@ def package_folder() -> Path:
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
-    recipes = rows.recipes()
-    known, rungs = scenes(recipes), [recipe.name for recipe in recipes if recipe.kind == "primed"]
     parser = argparse.ArgumentParser(
         prog="python -m sympflow.training.pretrained", description="Train the shipped flows."
     )
-    parser.add_argument("scenes", nargs="*", metavar="scene", help=f"of {', '.join(known)}; all if none is named")
+    parser.add_argument("scenes", nargs="*", metavar="scene", help="the first word of the files' names; all if none")
     parser.add_argument("--kind", choices=KINDS, help="one architecture only")
     parser.add_argument("--rung", help="one rung only of a ladder of primed flows, for instance primed-3-0.08")
     parser.add_argument("--workers", type=int, default=1, help="processes that share the flows (default: 1)")
@@ -51,47 +47,42 @@ def main(arguments: list[str] | None = None) -> None:
         "--identify", action="store_true", help="only put the H by which flows know their system into the files"
     )
     options = parser.parse_args(arguments)
-    unknown = sorted(set(options.scenes) - set(known))
-    if unknown:
+    files = sorted(package_folder().glob("*.safetensors"))
+    known = list(dict.fromkeys(file.stem.partition("-")[0] for file in files))
+    rungs = [file.stem.partition("-")[2] for file in files]
+    if unknown := sorted(set(options.scenes) - set(known)):
         parser.error(f"unknown scene {', '.join(unknown)}: choose from {', '.join(known)}")
     if options.rung is not None and options.rung not in rungs:
         parser.error(f"unknown rung {options.rung}: choose from {', '.join(dict.fromkeys(rungs))}")
     torch.set_num_threads(1)  # as in the workers, which do the same as one
+    only_measured = options.out is not None and (options.identify or options.measure)
     wanted = [
-        recipe
-        for scene in options.scenes or known
-        for recipe in recipes
-        if recipe.scene == scene
-        and options.kind in (None, recipe.kind)
-        and (options.rung is None or (recipe.kind == "primed" and recipe.name == options.rung))
+        Recipe.of(options.out / file.name if only_measured else file)
+        for file in files
+        if (not options.scenes or file.stem.partition("-")[0] in options.scenes)
+        and options.rung in (None, file.stem.partition("-")[2])
     ]
-    for file, figures in _figures(wanted, options):
+    wanted = [recipe for recipe in wanted if options.kind in (None, recipe.kind)]
+    for name, figures in _figures(wanted, options):
         values = "  ".join(f"{k} {'diverges' if v is None else f'{v:.2e}'}" for k, v in figures.items())
-        print(f"{file.stem}: {values}", flush=True)
+        print(f"{name}: {values}", flush=True)
 
 
-def _figures(recipes: list[Recipe], options: argparse.Namespace) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The files of the recipes, as they are written or only measured, and their figures."""
-    folder = package_folder() if options.out is None else options.out
-    for recipe in recipes if options.identify or options.measure else ():
-        path, figures = file_of(recipe, folder), {}
-        flow = load(path)
-        if options.identify:
-            recipe.identify(flow)
-        else:
-            figures = recipe.measure(flow)
-        if options.identify or options.keep:
-            flow.save(path)
-        yield path, figures
-    if options.identify or options.measure:
+def _figures(recipes: list[Recipe], options: argparse.Namespace) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The names of flows, as they are written or only measured, and their figures."""
+    if not (options.identify or options.measure):
+        for recipe, flow in made(recipes, workers=options.workers):
+            flow.save((recipe.path.parent if options.out is None else options.out) / recipe.path.name)
+            yield recipe.name, flow.figures
         return
-
-    def earlier(recipe: Recipe, name: str) -> FlowMap:
-        return load(folder / f"{recipe.scene}-{name}.safetensors")
-
-    for recipe, flow in made(recipes, earlier, workers=options.workers):
-        flow.save(file_of(recipe, folder))
-        yield file_of(recipe, folder), flow.figures
+    for recipe in recipes:
+        if options.identify:
+            recipe.identify()
+        else:
+            recipe.measure()
+        if options.identify or options.keep:
+            recipe.flow.save(recipe.path)
+        yield recipe.name, {} if options.identify else recipe.flow.figures
 
 
 if __name__ == "__main__":

@@ -199,9 +199,10 @@ def _fastest_met(system: HamiltonianSystem, y: np.ndarray) -> np.ndarray:
 @np.errstate(all="ignore")
 def _less_energy(system: HamiltonianSystem, y: np.ndarray, rates: np.ndarray) -> str:
     """A sublevel of the energy where the motion is half as fast or less, in words that go on; none if there is none."""
-    energies = system.hamiltonian(y, start_times(system, 0.0, len(y), SEED, Stream.SCALING))
+    t = start_times(system, 0.0, len(y), SEED, Stream.SCALING)
+    energies = system.hamiltonian(y, t)
     fastest = np.quantile(rates[np.isfinite(rates)], QUANTILE)
-    for share in ENERGIES if system.autonomous else ():
+    for share in ENERGIES if t is None else ():
         below = energies <= np.quantile(energies, share)
         if 2 * (rate := np.quantile(rates[below & np.isfinite(rates)], QUANTILE)) <= fastest:
             low, high = ([float(f"{v:.2g}") for v in corner] for corner in (y[below].min(0), y[below].max(0)))

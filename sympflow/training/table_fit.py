@@ -30,7 +30,7 @@ from scipy.linalg import null_space
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.weights import check_memory
+from sympflow.flow.weights import check_memory, doubles
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.fits import GaussNewton, PrimedFit, Resolved
@@ -554,8 +554,8 @@ class Table:
         return np.concatenate(
             [
                 np.linalg.lstsq(
-                    _array(c.basis)[:, 0],
-                    self._column(coefficients, place) / self.dt**c.power - _array(c.offset)[:, 0],
+                    doubles(c.basis)[:, 0],
+                    self._column(coefficients, place) / self.dt**c.power - doubles(c.offset)[:, 0],
                     rcond=None,
                 )[0]
                 for c, place in zip(self._unbound(), self._places, strict=True)
@@ -581,9 +581,9 @@ class Table:
     def _assembled(self, columns: list[Coefficients], t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         offset, blocks = np.zeros((len(t), self.n)), []
         for c, place in zip(columns, self._places, strict=True):
-            powers = t[:, None] ** c.power * (t[:, None] / self.dt) ** np.array(c.exponents)
-            blocks.append(np.einsum("mn,nkf,jk->jmf", place, _array(c.basis), powers, optimize=True))
-            offset += powers @ _array(c.offset).T @ place.T
+            constant, design = c.affine(t)
+            blocks.append(place @ design)
+            offset += constant @ place.T
         return offset, np.concatenate(blocks, axis=-1)
 
     def free_at_dt(self) -> np.ndarray:
@@ -597,7 +597,7 @@ class Table:
         """The parameters for which the table at Δt is the given one (n,), and varies with t as little as may be."""
         parts = []
         for c, place in zip(self.columns, self._places, strict=True):
-            basis, offset = _array(c.basis), _array(c.offset)
+            basis, offset = doubles(c.basis), doubles(c.offset)
             A = np.concatenate([basis.sum(1), *np.moveaxis(STIFFNESS * basis[:, 1:], 1, 0)])
             b = np.zeros(len(A))
             b[: len(offset)] = self._column(coefficients, place) / self.dt**c.power - offset.sum(1)
@@ -610,7 +610,7 @@ class Table:
         return place.T @ coefficients / np.abs(place).sum(0)
 
     def parameters(self) -> np.ndarray:
-        return np.concatenate([_array(c.free) for c in self.columns])
+        return np.concatenate([doubles(c.free) for c in self.columns])
 
     def assign(self, theta: np.ndarray) -> None:
         """Put the parameters into the flow."""
@@ -637,10 +637,6 @@ class Table:
             if c.power == 1:
                 table += place @ rng.normal(0, PROCESSOR_SPREAD * self.dt, c.offset.shape[0])
         return table
-
-
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().double().numpy()
 
 
 # errors at held-out states ------------------------------------------------------------------------------------------

@@ -56,7 +56,7 @@ class TableStep:
             )
         self.ndof, self.sequence, self._driven = system.ndof, tuple(sequence), not system.autonomous
         self.balanced = self._driven and not system.friction
-        self._times_inverse_mass, self._friction = _velocities(system, 1.0), system.friction
+        self._times_inverse_mass, self._friction = partial(_velocity, system, 1.0), system.friction
         if self._driven and system.friction:
             self._friction = Friction(_extended(system.friction.matrix(system.ndof), 0.0))
         self._forces_of = system, level, monomials, compiled
@@ -209,12 +209,8 @@ def _extended(matrix: np.ndarray, of_time: float) -> np.ndarray:
     return extended
 
 
-def _velocities(system: HamiltonianSystem, of_time: float) -> Callable[[np.ndarray], np.ndarray]:
+def _velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.ndarray:
     """M⁻¹p of rows (..., D), extended likewise."""
-    return system.velocity if system.autonomous else partial(_extended_velocity, system, of_time)
-
-
-def _extended_velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.ndarray:
     d = system.ndof
     return np.concatenate([system.velocity(p[..., :d]), of_time * p[..., d : d + 1], 0 * p[..., d + 1 :]], axis=-1)
 
@@ -250,7 +246,7 @@ class ArrayForces:
         if level == CURVATURE:
             self._terms = [partial(_curvature, system)]
         self._has_gradient = level in (FORCE_GRADIENT, CURVATURE)
-        self._velocity = _velocities(system, 0.0)
+        self._velocity = partial(_velocity, system, 0.0)
         self._gradient, self._product = _row_functions(system)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -290,7 +286,7 @@ def _of_monomial(exponents: tuple[int, ...], rows: np.ndarray) -> np.ndarray:
 def _curvature(system: HamiltonianSystem, rows: np.ndarray) -> np.ndarray:
     """The gradient of W = ½ v·∇²V v of rows (..., d), of a driven system with 0 for t and ∂W/∂t for s."""
     d = system.ndof
-    q, t = rows[..., :d], None if system.autonomous else rows[..., d]
+    q, t = rows[..., :d], rows[..., d] if rows.shape[-1] > d else None
     slope, of_time = system.curvature_gradient(q, t), []
     if t is not None:
         of_time = [0 * t[..., None], _by_time(lambda t: system.curvature(q, t), t, _short(system))[..., None]]

@@ -60,9 +60,8 @@ from sympflow.training.table_fit import MadeRuns, TableRun
 from sympflow.workers import WorkerPool
 
 DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
-BUDGET = 60.0  # seconds of a fit of which nothing else is said
-SHORT_BUDGET = 15.0  # the least of such a fit that has trials
-STARTS = 72  # of such a fit, where it is compiled: these take a second
+SHORT_BUDGET = 15.0  # seconds of the least that has trials
+STARTS = 72  # of a fit of which nothing is said, where it is compiled: these take a second
 SOME, SMALL, FEWEST = 24, 6, 3  # of other systems, up to so many degrees of freedom, and of the largest
 BOUGHT = 1000  # starts that a budget buys at most
 
@@ -109,9 +108,9 @@ def train(
     budget : float, optional
         Stop after so many seconds, to 20 %, and a few seconds for what is imported and compiled. All counts: trials (at
         most two thirds of it), labels (at most 0.3 of what is left, each set), starts, fits, held-out figures. Where
-        labels take longer the flow is returned as it was, and a warning says how far they came. Without a budget a new
-        primed flow has 60 seconds, and a warning says where these were not enough. With a budget a symbolic system of
-        up to three degrees of freedom has as many starts as two fifths of the time allow, up to 1000.
+        labels take longer the flow is returned as it was, and a warning says how far they came. With a budget a
+        symbolic system of up to three degrees of freedom has as many starts as two fifths of the time allow, up to
+        1000: another flow on another machine. Without one the same call gives the same flow, however long it takes.
     checkpoint : path, optional
         Write the state of the run there at intervals, atomically; of a primed flow after each start of the search, and
         first as soon as there is a run: of one that is killed in the trials nothing is kept.
@@ -239,9 +238,6 @@ def _fitted(
     new = flow is None
     untold = isinstance(solver, GaussNewton) and solver.restarts is None and solver.steps is None
     open_starts = new and isinstance(fit, PrimedFit) and untold and session.resume is None
-    by_default = open_starts and session.time_budget is None
-    if by_default:
-        session.time_budget = BUDGET
     with session.interruption, session.pool, np.errstate(divide="ignore", invalid="ignore"):
         tried = None
         if new and fit.dt is not None:
@@ -260,15 +256,16 @@ def _fitted(
             domain.sample(1, 0), start_times(system, 0.0, 1, 0, Stream.LABELS)
         )  # what is compiled for it counts, but not as labels
         compiled = trials.can_try(system)
-        bought = open_starts and session.checkpoint is None and (compiled or by_default)
+        limited = session.time_budget is not None
+        bought = open_starts and session.checkpoint is None and (compiled or not limited)
         if bought and isinstance(solver, GaussNewton):
             few = max(FEWEST, round(SOME * min(1.0, (SMALL / system.ndof) ** 2)))
-            solver = replace(solver, restarts=few if not compiled else STARTS if by_default else BOUGHT)
+            solver = replace(solver, restarts=few if not compiled else BOUGHT if limited else STARTS)
         run = _run_of(system, domain, kind, flow, tried, fit, solver, session.deadline, runs)
         if session.resume is not None:
             run.load(session.resume)
         reason = run.go(session)
-    return run.finish(reason, expected=bought and not by_default)
+    return run.finish(reason, expected=bought and limited)
 
 
 # arguments --------------------------------------------------------------------------------------------------------
@@ -366,7 +363,7 @@ def _described(
             _check_primable(system, named, searches)
     start = None
     if kind == "primed" and flow is None and not searches:
-        start = PrimedFit(**{n: options.pop(n) for n in PrimedFit.OF_FLOW if n in options})
+        start = PrimedFit(**{n: options.pop(n) for n in PrimedFit.of_flow() if n in options})
     made, found = from_keywords(options, kind, by, flow)
     if solver is not None and (twice := [name for name in options if name in found.names()]):
         raise TypeError(f"`{twice[0]}` was given beside `solver`: make it an option of that.")
@@ -433,7 +430,7 @@ def _checked_kind(system: HamiltonianSystem, flow: FlowMap | None, fit: Fit) -> 
         raise TypeError(
             f"`fit` {type(fit).__name__} is not one of a given {type(flow).__name__}: pass LossFit(), or leave it out."
         )
-    for name in (name for name in fit.given() if name in fit.OF_FLOW):
+    for name in (name for name in fit.given() if name in fit.of_flow()):
         raise ValueError(f"`{name}` describes a new flow, but `flow` is given: leave out one of them.")
     flow.check_system(system)
     if not flow.n_parameters:
@@ -457,7 +454,7 @@ def _new_primed(
 ) -> tuple[PrimedFlow, PrimedFlow | None]:
     """A new primed flow, and the one of a trial if trials chose it; of a run to go on with that one's shape."""
     given = set(fit.given())
-    if not given & set(fit.OF_FLOW) and trials.can_try(system):
+    if not given & set(fit.of_flow()) and trials.can_try(system):
         hurried = session.time_budget is not None and session.time_budget < SHORT_BUDGET
         if session.resume is not None:
             theirs = checkpoints.read(session.resume)["architecture"]

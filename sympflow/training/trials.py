@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sympflow.compiler import NotCompiled
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.hamiltonian.domain import Domain
@@ -87,10 +88,10 @@ def chosen_trial(system: HamiltonianSystem, domain: Domain, session: Session | N
     assert system.symbols is not None
     starts: list[Resolved] = tried_starts(system, domain, curvature=False)
     try:
-        ranges = position_ranges(system.symbols, domain) if system.autonomous else ()
+        ranges = position_ranges(system.symbols, domain)
         loops = splitting_loops(system)
         costs = [loops.kick_cycles(level, ranges if level else ()) for level in (0, FORCE_GRADIENT, CURVATURE)]
-    except ValueError:  # H has no compiled form
+    except NotCompiled:
         return Trial(starts[0], math.inf)
     session, found = Session() if session is None else session, dict[PrimedFit, Trial]()
     interruption, deadline = session.interruption, session.deadline.part(SHARE)

@@ -158,6 +158,8 @@ def test_energy_errors_where_some_values_drive_the_system():
         ({"params": {"lam": [1.0]}}, ValueError, "`params` has 'lam', no parameter of 'henon_heiles', which has none"),
         ({"params": 3}, TypeError, "`params` must map names"),
         ({"workers": 0}, ValueError, "`workers` must be a positive number"),
+        ({"reduce": lambda t, y: {"messages": 1.0}}, ValueError, "returns 'messages', a name that the result has"),
+        ({"reduce": lambda t, y: {"t": 1.0}}, ValueError, "returns 't', a name that the result has already"),
         ({"reduce": "finall"}, ValueError, "Did you mean 'final'"),
         ({"reduce": 3}, TypeError, "`reduce` must be a name"),
         (
@@ -274,3 +276,10 @@ def test_windows_are_pieces_of_the_run(method, monkeypatch):
     assert np.array_equal(np.concatenate([y for _, y in windows], axis=-1), expected, equal_nan=True)
     assert cut.messages == whole.messages
     assert cut.status.tolist() == whole.status.tolist()
+
+
+def test_masked_values_of_a_reduction_are_missing():
+    found = kept(reduce=lambda t, y: {"a": np.ma.array([1.0, 2.0], mask=[False, True]), "b": np.ma.array([3, 4])})
+    assert (found.a[:, 0] == 1).all()
+    assert np.isnan(found.a[:, 1]).all()
+    assert (found.b == [3, 4]).all()

@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+import math
 import pickle
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import torch
 from test_primed import FLOWS as PRIMED
 
-from sympflow import HamiltonianSystem, MLPFlow, SympFlow, Tube, load, solve, systems, time_transformed
+from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, Tube, load, solve, systems, time_transformed
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.families import FAMILIES, family, family_of
 from sympflow.flow.flow_map import FlowMap
@@ -95,7 +96,8 @@ def test_what_is_asked_of_a_flow_map(name):
     make, system = FLOWS[name]
     flow, x = make(), torch.as_tensor(system.y0)
     assert flow.matches(system)
-    assert flow.matches(systems.henon_heiles()) == (flow.fingerprint is None and flow.ndof == 2)
+    with pytest.raises(ValueError, match=r"^`system` .*(degrees of freedom|is not the one|driven)"):
+        solve(systems.toda_lattice(), flow, (0, 1), np.zeros(6))
     assert flow.origin is None
     assert len(flow.clock_numbers()) == (3 if name == "clocked" else 0)
     assert any(flow.evaluations(10, 1, 0, "array").values()) == (name not in ("sympflow", "timed", "mlp"))
@@ -155,6 +157,16 @@ def split(system, **options):
     return rough(SympFlow.split(system, terms=4, **options), 0.05)
 
 
+def damped(damping):
+    hh = systems.henon_heiles()
+    return HamiltonianSystem.from_sympy(hh.symbols.H, damping=damping, y0=hh.y0, domain=hh.domain)
+
+
+DRIVEN_AND_DAMPED = HamiltonianSystem.from_sympy(
+    "p**2/2 - cos(q)*(1 + cos(2*t)/9)", time="t", period=np.pi, damping=0.2, domain=Box([-1, -1], [1, 1])
+)
+
+
 def hh(**options):
     return split(systems.henon_heiles(), dt=0.7, **options)
 
@@ -179,6 +191,9 @@ LAWFUL = {
     "planets": of_planets,
     "timed": FLOWS["timed"][0],
     "driven": lambda: rough(SympFlow.primed(DRIVEN, 2, processor=2, dt=0.4), 0.05),
+    "damped": lambda: rough(SympFlow.primed(systems.damped_pendulum(0.3), 2, processor=2, dt=0.4), 0.05),
+    "damped by a matrix": lambda: rough(SympFlow.primed(damped([[0.3, 0.1], [0.1, 0.2]]), 2, dt=0.8), 0.05),
+    "driven and damped": lambda: rough(SympFlow.primed(DRIVEN_AND_DAMPED, 2, processor=1, dt=0.4), 0.05),
 }
 
 
@@ -218,15 +233,36 @@ def test_it_is_the_identity_at_zero_and_has_an_exact_inverse(lawful):
         torch.testing.assert_close(flow(t, flow.inverse(t, x, **begun), **begun) / unit, x / unit, **close)
     alone = torch.stack([flow(float(t), row, **begun) for t, row in zip(each, x, strict=True)])
     torch.testing.assert_close(y / unit, alone / unit, rtol=1e-13, atol=1e-13)
+    if flow.driven:
+        starts = torch.linspace(0.1, 5.0, 5).double()
+        alone = torch.stack([flow(2.3, row, float(t0)) for t0, row in zip(starts, x, strict=True)])
+        torch.testing.assert_close(flow(2.3, x, starts + 7 * flow.period), alone, rtol=0, atol=1e-12)
+
+
+def test_palindromes_are_time_reversible(lawful):
+    """With the momenta turned they are their own inverse: ρ ψ̄_t ρ ψ̄_t = 1; with a processor K_t is."""
+    flow, x, _ = lawful
+    d, t = flow.ndof, 0.7 * flow.dt
+    if getattr(flow, "palindromic", flow.kind != "mlp" and flow.system is not None) and not flow.driven:
+        if flow.system.friction or flow.system is TRANSFORMED:
+            return
+        rho = torch.cat([torch.ones(d), -torch.ones(d)]).double()
+        y = rho * flow.kernel_step(t, rho * flow.kernel_step(t, x))
+        torch.testing.assert_close(y, x, rtol=0, atol=1e3 * EPS * float(1 + x.abs().max()))
 
 
 def test_it_is_symplectic_at_every_t(lawful):
+    """With friction it shrinks the form, by exp(−γt) in each of d degrees of freedom."""
     flow, x, _ = lawful
-    J = canonical(flow.ndof)
+    friction = flow.system is not None and flow.system.friction
+    if friction and np.ndim(flow.system.damping):
+        return
+    form, rate = canonical(flow.ndof), flow.system.damping if friction else 0.0
     for t in (0.3 * flow.dt, 2.6 * flow.dt, -1.4 * flow.dt):
         for row in x[:2]:
             A = torch.autograd.functional.jacobian(lambda y, t=t: flow(t, y, **started(flow)), row)
-            assert (A.T @ J @ A - J).abs().max() < 1e-13 * torch.linalg.matrix_norm(A, 2) ** 2
+            J = math.exp(-rate * t) * form
+            assert (A.T @ form @ A - J).abs().max() < 1e-13 * torch.linalg.matrix_norm(A, 2) ** 2
 
 
 def test_its_velocity_is_the_time_derivative_and_that_of_its_hamiltonian(lawful):
@@ -241,6 +277,10 @@ def test_its_velocity_is_the_time_derivative_and_that_of_its_hamiltonian(lawful)
     h = 1e-3 * flow.dt  # the differences are right to (h/Δt)⁴ = 1e-12 times the fifth derivative of ψ in t/Δt
     near, far = (flow.psi(t + k * h, x, **begun) - flow.psi(t - k * h, x, **begun) for k in (1, 2))
     torch.testing.assert_close(velocity / unit, (8 * near - far) / (12 * h) / unit, rtol=0, atol=1e-8 * size)
+    if flow.system is not None and flow.system.friction:
+        with pytest.raises(ValueError, match="has friction"):
+            flow.hamiltonian(t, y, **begun)
+        return
     y = y.detach().requires_grad_()
     (slope,) = torch.autograd.grad(flow.hamiltonian(t, y, **begun).sum(), y)
     torch.testing.assert_close(velocity / unit, slope @ canonical(flow.ndof).T / unit, rtol=0, atol=generated * size)

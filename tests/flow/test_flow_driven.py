@@ -97,30 +97,6 @@ def test_it_is_symplectic_and_goes_back_and_keeps_the_energy_balance(system, flo
     np.testing.assert_allclose(back.y[:, -1], system.y0, atol=1e-13)
 
 
-@pytest.mark.parametrize("damping", [None, 0.2], ids=["conservative", "damped"])
-def test_loops_arrays_and_the_map_itself_agree(system, flow, damping):
-    if damping is not None:
-        system = driven(damping=damping)
-        flow = flow.transferred(system)
-    x, times = states(system), [T0, T0 + 0.3, T0 + 2.0, T0 + 3.1]
-    compiled, arrays = (
-        solve(system, "sympflow", (T0, times[-1]), x, flow=flow, t_eval=times, backend=backend).y
-        for backend in ("compiled", "array")
-    )
-    np.testing.assert_allclose(compiled, arrays, atol=1e-14)
-    one = solve(system, flow, (T0, times[-1]), x[1], t_eval=times)
-    np.testing.assert_array_equal(one.y, compiled[1])
-    y, t = torch.tensor(x), torch.tensor(3.1, dtype=torch.float64)
-    for time in (t, 3.1):
-        end = flow(time, y, T0)
-        np.testing.assert_allclose(end.detach(), compiled[..., -1], atol=1e-14)
-        torch.testing.assert_close(flow.inverse(time, end, T0), y, atol=1e-14, rtol=0)
-    starts = torch.tensor([0.1, 1.0, 5.0, T0], dtype=torch.float64)
-    np.testing.assert_allclose(flow(t, y, starts)[3].detach(), compiled[3, :, -1], atol=1e-14)
-    later = flow(t, y, T0 + 7 * system.period)
-    torch.testing.assert_close(later, flow(t, y, T0), atol=1e-13, rtol=0)
-
-
 def test_a_drive_given_by_samples_is_fitted(plain):
     from scipy.interpolate import CubicSpline
 

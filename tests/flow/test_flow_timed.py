@@ -49,25 +49,6 @@ def hardly(system):
     return sympflow.train(system, kind="sympflow", pairs=2, hidden=(8,), dt=DT, optimizer="adam", steps=3, **few)
 
 
-def test_it_has_the_period_of_the_drive(system, bare):
-    here, later = bare(1.7, X, t0=0.3), bare(1.7, X, t0=0.3 + 5 * system.period)
-    torch.testing.assert_close(later, here, rtol=0, atol=1e-13)
-    assert (bare(1.7, X, t0=0.9) - here).abs().max() > 1e-4
-
-
-def test_steps_of_solve_are_chained_calls(system, bare):
-    y, t0 = X, 0.3
-    for k in range(4):
-        y = bare(DT, y, t0=t0 + k * DT)
-    y = bare(0.1, y, t0=t0 + 4 * DT)
-    torch.testing.assert_close(bare(4 * DT + 0.1, X, t0=t0), y, rtol=0, atol=1e-14)
-    sol = solve(system, bare, (t0, t0 + 4 * DT + 0.1), X.numpy())
-    np.testing.assert_allclose(sol.y[..., -1], y, rtol=0, atol=1e-14)
-    back = solve(system, bare, (sol.t[-1], t0), sol.y[..., -1])
-    end = bare(-(4 * DT + 0.1), y, t0=sol.t[-1])
-    np.testing.assert_allclose(back.y[..., -1], end, rtol=0, atol=1e-14)
-
-
 def test_training_fits_it_at_all_times_of_the_drive(system, trained):
     assert (type(trained), trained.drive) == (SympFlow, Drive.of(system))
     start, end = trained.history[0], trained.figures

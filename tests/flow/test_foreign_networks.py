@@ -298,11 +298,8 @@ class Square(Potential):
     def impulse(self, t, x):
         return t * self.c * x
 
-    def impulse_and_rate(self, t, x):
-        return self.impulse(t, x), self.c * (x * x).sum(0) / 2
-
-    def impulse_and_tangent(self, t, x, dx):
-        return self.impulse(t, x), self.c * (x + t * dx)
+    def value(self, t, x):
+        return t * self.c * (x * x).sum(0) / 2
 
     def to_dict(self):
         return {"type": "square"}

@@ -186,3 +186,17 @@ def test_no_system_is_kept_alive():
     del system
     gc.collect()
     assert gone() is None
+
+
+def test_a_file_is_known_again_where_h_overflows_at_common_states(tmp_path):
+    """A Morse well of hydrogen in SI units: exp(−aq) is infinite at q = −0.3 m."""
+
+    def well(depth):
+        numbers = {"D": depth, "a": 1.9e10, "m": 8.4e-28}
+        domain = Box([-1e-11, -5e-24], [1.2e-11, 5e-24])
+        return HamiltonianSystem.from_sympy("p**2/(2*m) + D*(1 - exp(-a*q))**2", params=numbers, domain=domain)
+
+    SympFlow.primed(well(7.5e-19), 1, dt=1e-15).save(tmp_path / "flow.safetensors")
+    sympflow.load(tmp_path / "flow.safetensors", system=well(7.5e-19))
+    with pytest.raises(ValueError, match="is not the one that this flow was trained for"):
+        sympflow.load(tmp_path / "flow.safetensors", system=well(7.6e-19))

@@ -240,7 +240,7 @@ HERE = "^`system` 'driven_pendulum' is driven"
         (
             lambda: HamiltonianSystem(lambda q: q[..., 0], ndof=1, time=True),
             TypeError,
-            r"^`potential` of a driven system",
+            r"^`potential` is called with \(t, q\), the time first",
         ),
         (lambda: HamiltonianSystem(potential, ndof=1, time="t"), TypeError, "^`time` must be True"),
         (lambda: DRIVEN.hamiltonian(Y), TypeError, "^`t` is missing"),

@@ -13,7 +13,7 @@ from watchdog import watched
 from sympflow import HamiltonianSystem, SympFlow, load, solve, systems
 from sympflow.flow.records import KEY, SUM, text_checksum
 from sympflow.hamiltonian.expression import Unreadable, read
-from sympflow.hamiltonian.removable import sinc
+from sympflow.hamiltonian.removable import Max, sinc
 
 q, p, q1, q2 = sp.symbols("q p q1 q2", real=True)
 
@@ -25,7 +25,7 @@ UNDERSTOOD = {
     "1/(q1**2+q2**2)**(3/2)": (q1**2 + q2**2) ** sp.Rational(-3, 2),
     "Rational(1, 3)*q\n + pi": q / 3 + sp.pi,
     "E**q + ln(q2)": sp.exp(q) + sp.log(q2),
-    "max(q, 0) + abs(p)": sp.Max(q, 0) + sp.Abs(p),
+    "max(q, 0) + abs(p)": Max(q, 0) + sp.Abs(p),
     "besselj(0, q)*gamma(5)": 24 * sp.besselj(0, q),
     "Piecewise((q, q > 0), (0, True))": sp.Piecewise((q, q > 0), (0, True)),
 }
@@ -215,3 +215,43 @@ def test_derivatives_of_sinc_have_their_values_on_both_sides_of_where_its_series
 def test_compiled_runs_through_the_zero_of_sinc(V, method):
     runs = [solve(of_sinc(V), method, (0, 3), [0.0, 0.7], dt=0.1, backend=each) for each in ("compiled", "array")]
     np.testing.assert_allclose(runs[0].y, runs[1].y, rtol=1e-12, atol=1e-13)
+
+
+def nested(choices):
+    """Max and Min in each other, fourteen deep, as text."""
+    text = "q"
+    for k in range(7):
+        text = (
+            f"{choices[1]}({choices[0]}({text} + 0.2*q, {choices[1]}(q - {k}, -q)) - 0.1, -{choices[0]}(p, {k + 1}*q))"
+        )
+    return text
+
+
+@pytest.mark.parametrize(
+    "text", [nested(("Min", "Max")), nested(("Max", "Min")), "Max(q, -p, q + p/2, Min(q, 1), 0.3)"]
+)
+def test_extremes_have_the_values_and_slopes_of_arrays(text):
+    """SymPy compares each argument with all others: of nested ones that takes minutes."""
+    f, x = read(text), np.random.default_rng(0).uniform(-2, 2, (2, 200))
+    own = {"Max": lambda *a: np.max(np.broadcast_arrays(*a), 0), "Min": lambda *a: np.min(np.broadcast_arrays(*a), 0)}
+    expected = eval(text, own | {"q": x[0], "p": x[1]})
+    np.testing.assert_array_equal(sp.lambdify((q, p), f, "numpy")(*x), expected)
+    moved = [eval(text, own | {"q": x[0] + h, "p": x[1]}) for h in (-1e-7, 1e-7)]
+    slope = sp.lambdify((q, p), sp.diff(f, q), [{"Heaviside": np.heaviside}, "numpy"])(*x)
+    np.testing.assert_allclose(slope, (moved[1] - moved[0]) / 2e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("Max(3, q, 5)", Max(5, q)), ("Min(q**2, -1)", -1), ("Max(q**2, 0)", q**2), ("Max(q, q)", q)]
+)
+def test_extremes_of_numbers_are_taken(text, expected):
+    assert read(text) == expected
+
+
+def test_ninety_pieces_and_a_sum_to_a_high_power():
+    pieces = ", ".join(f"({k}*q - {k * (k - 1) / 2}, q < {k})" for k in range(1, 91))
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + Piecewise({pieces}, (91*q - 4095, True))", y0=[0.0, 0.0])
+    at = np.array([[-0.5], [0.5], [41.5], [95.0]])
+    np.testing.assert_array_equal(system.force(at)[:, 0], [-1, -1, -42, -91])
+    assert not HamiltonianSystem.from_sympy("(1 + q + p)**300").separable
+    assert HamiltonianSystem.from_sympy("(q + p)**2 - 2*q*p").separable

@@ -466,15 +466,32 @@ def test_metrics_of_a_run_that_lands_on_jumps_are_those_of_its_steps():
 
 
 def test_runs_that_do_not_land_on_jumps_warn(tmp_path):
-    fast = made(p**2 / 2 + q**2 / 2 - q * sp.sign(sp.sin(5000 * t)), time="t", y0=[0.5, 0.1])
+    fast = made(p**2 / 2 + q**2 / 2 - q * sp.sign(sp.sin(50000 * t)), time="t", y0=[0.5, 0.1])
     for run in (
         lambda: solve(LATE, "kahan_li8", store=tmp_path / "run.zarr"),
         lambda: solve(fast, "leapfrog", (0, 10), dt=0.1),
         lambda: solve(LATE, "mclachlan4"),  # whose forces lie beyond the ends of its steps
         lambda: odeint(LATE, torch.tensor([0.5, 0.1]).double(), torch.tensor([0.0, 3.0]), method="kahan_li8"),
+        lambda: odeint(LATE, torch.tensor([0.5, 0.1]), torch.tensor([0.0, 3.0]), method="implicit_adams"),
+        lambda: solve(fast, "dop853", (0, 10), max_steps=10),
     ):
-        with pytest.warns(RuntimeWarning, match="jumps within a step, at t ="):
+        with pytest.warns(RuntimeWarning, match="jumps (within a step|in t), at t ="):
             run()
+
+
+@pytest.mark.parametrize("method", ["dopri5", "dopri8", "bosh3", "rk4"])
+@pytest.mark.parametrize("back", [False, True])
+def test_methods_of_torchdiffeq_end_their_steps_at_jumps(method, back):
+    """A pulse of a ten-thousandth of the interval, in which no step would begin."""
+    a, b, height = 50.003, 50.013, 100.0
+    pulse = height * (sp.Heaviside(t - a) - sp.Heaviside(t - b))
+    system = driven(pulse, y0=[0.0, 0.0])
+    ends = torch.tensor([100.0, 0.0] if back else [0.0, 100.0], dtype=torch.float64)
+    options = {"step_size": 0.02} if method == "rk4" else None
+    found = odeint(system, torch.zeros(2, dtype=torch.float64), ends, method=method, options=options)[-1, 0].item()
+    T = ends[1].item()
+    exact = height * ((T - a) ** 2 - (T - b) ** 2) / 2 * (-1 if back else 1)
+    assert found == pytest.approx(exact, rel=1e-9)
 
 
 @pytest.mark.parametrize(

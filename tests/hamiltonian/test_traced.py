@@ -386,3 +386,30 @@ def test_derivatives_that_are_not_in_the_table_are_refused_where_they_are_needed
     order = HamiltonianSystem(lambda q: special.jv(q, q).sum(-1), ndof=1)
     with pytest.raises(ValueError, match="`jv` has no derivative by its order"):
         solve(order, "verlet", (0, 1), y0, dt=0.05)
+
+
+def test_a_sum_in_one_function_is_told_from_what_cannot_be_separated():
+    def together(q, p):
+        return (p**2).sum(-1) / 2 + (q**4).sum(-1) / 4
+
+    def product(q, p):
+        return (p**2).sum(-1) / 2 * (1 + (q**2).sum(-1))
+
+    for H, words in ((together, "is given by one function: define it with V as `potential`"), (product, "is not: use")):
+        system = HamiltonianSystem(hamiltonian=H, ndof=2, y0=[0.1, 0.2, 0.3, 0.1])
+        with pytest.raises(ValueError, match=words):
+            solve(system, "verlet", (0, 1))
+        assert solve(system, "tao4", (0, 1), dt=0.1).stats["backend"] == "compiled"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"hamiltonian": lambda t, q, p: 0.0}, r"`hamiltonian` is called with \(q, p\), .* where time=True is passed"),
+        ({"potential": lambda t, q: 0.0}, r"`potential` is called with \(q\), .* where time=True is passed"),
+        ({"potential": lambda q: 0.0, "time": True}, r"`potential` is called with \(t, q\), the time first"),
+    ],
+)
+def test_functions_take_their_arguments(given, message):
+    with pytest.raises(TypeError, match=message):
+        HamiltonianSystem(**given, ndof=1)

@@ -75,6 +75,21 @@ def test_the_error_of_states_can_be_asked_for():
     assert dt < choose_step(system, "srkn11b", 1e-8, t_span=(0, 40))
 
 
+@pytest.mark.parametrize(
+    ("H", "y0", "method"),
+    [
+        ("p**2/2 + q**2/2", [1.0, 0.0], "gauss_legendre6"),
+        ("(p1 + q2/2)**2/2 + (p2 - q1/2)**2/2", [1.0, 0.0, 0.0, 1.0], "gauss_legendre4"),
+    ],
+    ids=["oscillator", "charge"],
+)
+def test_where_every_step_keeps_the_energy_the_error_is_that_of_the_states(H, y0, method):
+    """Both motions have the period 2π."""
+    span = (0.0, 20 * np.pi)
+    sol = solve(text(H), method, span, y0, tol=1e-7, t_eval=[span[1]])
+    assert 1e-11 < np.abs(sol.y[:, -1] - y0).max() <= 2e-7
+
+
 @pytest.mark.parametrize("unit", [1e-20, 1e12])
 def test_steps_scale_with_the_unit_of_time(unit):
     """H = ½ p² + ½ (q/T)²: with times in units of T the steps are the same."""

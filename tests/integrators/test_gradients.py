@@ -323,7 +323,7 @@ ONE = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
         (lambda y: solve(CUBIC, "verlet", (0, ONE), y, dt=0.1), TypeError, r"^`t_span`.*pass `\.detach\(\)`"),
         (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=0.1, t_eval=[ONE]), TypeError, r"^`t_eval`.*`\.detach\(\)`"),
         (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=ONE / 10), ValueError, "^`dt`"),
-        (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=0.1, store="out"), TypeError, r"^`store`.*y0\.detach"),
+        (lambda y: solve(CUBIC, "verlet", (0, 1), y, dt=0.1, store="out"), TypeError, r"^`y0`.*`store`.*y0\.detach"),
         (lambda y: solve(CUBIC, "verlet", (0, 1), y.to("meta"), dt=0.1), TypeError, "^`y0` must be a dense tensor"),
         (lambda y: CUBIC.with_params(k=ONE), TypeError, r"^`params\['k'\]`.*params=\{name: tensor\}"),
         (lambda y: HamiltonianSystem.pairs("-1/r", masses=ONE.expand(3)), TypeError, "^`masses`.*hamiltonian="),

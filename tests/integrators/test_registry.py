@@ -132,24 +132,20 @@ def test_registered_classes_solve():
     assert solve(systems.pendulum(), SymplecticEuler(dt=0.01), (0, 1)).success
 
 
-def test_built_ins_cannot_be_replaced():
-    with pytest.raises(ValueError, match=r"^`name` 'verlet' is a built-in method"):
-        register("verlet", SymplecticEuler)
-    with pytest.raises(TypeError, match=r"^`integrator` must be a subclass"):
-        register("mine", lambda: None)
-
-
-@pytest.mark.parametrize(("name", "error"), [(3, TypeError), (None, TypeError), ("", ValueError), (" ", ValueError)])
-def test_a_name_must_be_one(name, error):
-    with pytest.raises(error, match=r"^`name` must"):
-        register(name, SymplecticEuler)
-    assert "verlet" in available()
-
-
-def test_a_class_without_name_is_not_registered():
-    with pytest.raises(TypeError, match=r"^`integrator` Nameless has no `name`"):
-        register("nameless", Nameless)
-    assert "nameless" not in available()
+@pytest.mark.parametrize(
+    ("name", "integrator", "error", "message"),
+    [
+        ("verlet", SymplecticEuler, ValueError, r"^`name` 'verlet' is a built-in method"),
+        ("mine", lambda: None, TypeError, r"^`integrator` must be a subclass"),
+        ("nameless", Nameless, TypeError, r"^`integrator` Nameless has no `name`"),
+        *((name, SymplecticEuler, TypeError, r"^`name` must") for name in (3, None)),
+        *((name, SymplecticEuler, ValueError, r"^`name` must") for name in ("", " ")),
+    ],
+)
+def test_what_cannot_be_registered(name, integrator, error, message):
+    with pytest.raises(error, match=message):
+        register(name, integrator)
+    assert not {"mine", "nameless"} & set(available())
 
 
 @pytest.mark.filterwarnings("ignore:The integrator 'verlet' of")
@@ -255,19 +251,20 @@ def test_plugins_are_compared_under_the_name_that_was_asked_for(plugins):
     assert "No volume: `method` 'good' of the plug-in" in report.rows[0].reason  # its NumPy step takes no tensors
 
 
-def test_max_step_of_a_fixed_step_method_is_explained():
-    with pytest.raises(
-        TypeError, match=r"^`max_step` is not an option of method 'verlet'.*`event_step` samples events"
-    ):
-        solve(systems.pendulum(), "verlet", (0, 1), max_step=0.1)
+EULER = Scheme("euler_of_mine", order=1, kicks=(1.0,), drifts=(1.0,))
 
 
-@pytest.mark.parametrize("name", ["h", "step", "step_size"])
-def test_other_names_of_the_step_are_answered_with_ours(name):
-    with pytest.raises(TypeError, match=rf"^`{name}` is not an option of method 'verlet'.*: the step .* is `dt`"):
-        solve(systems.pendulum(), "verlet", (0, 1), **{name: 0.1})
-
-
-def test_a_scheme_for_a_method_is_pointed_to_splitting_method():
-    with pytest.raises(TypeError, match=r"^`method` must be .* got Scheme\. Make one of it by"):
-        get(Scheme("euler_of_mine", order=1, kicks=(1.0,), drifts=(1.0,)))
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("verlet", {"max_step": 0.1}, r"^`max_step` is not an option of method 'verlet'.*`event_step` samples events"),
+        *(
+            ("verlet", {name: 0.1}, rf"^`{name}` is not an option of method 'verlet'.*: the step .* is `dt`")
+            for name in ("h", "step", "step_size")
+        ),
+        (EULER, {}, r"^`method` must be .* got Scheme\. Make one of it by"),
+    ],
+)
+def test_what_is_meant_is_answered_with_our_name_for_it(method, options, message):
+    with pytest.raises(TypeError, match=message):
+        solve(systems.pendulum(), method, (0, 1), **options)

@@ -3,8 +3,6 @@
 import gc
 import pickle
 import weakref
-from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,8 +10,8 @@ import pytest
 from sympflow import available, compare, get, reference_error, solve, systems
 from sympflow.integrators.compositions import SPLITTINGS
 from sympflow.integrators.methods import TRIPLES
-from sympflow.integrators.splitting import CLOCKS, Splitting
-from sympflow.schemes import SCHEMES, Scheme
+from sympflow.integrators.splitting import CLOCKS
+from sympflow.schemes import SCHEMES
 
 FPUT, PENDULUM, KEPLER = systems.fput(m=2, omega=20.0), systems.spring_pendulum(), systems.kepler(0.3)
 
@@ -73,7 +71,7 @@ def test_the_array_form_of_a_written_triple_is_the_compiled_one():
         ({"splitting": "oblique"}, r"^`splitting` must be one of 'kinetic', 'linear', .*; got 'oblique'"),
         ({"clock": ["physical"]}, r"^`clock` must be one of 'physical', 'logarithmic'; got \['physical'\]"),
         ({"shift": 1.0}, r"^`shift` is for the clock 'logarithmic'"),
-        ({"parts": ["p**2/2"]}, r"^`parts` are for the splitting 'parts'"),
+        ({"parts": ["p**2/2"]}, r"^`parts` is for the splitting 'parts'"),
         ({"splitting": "parts", "compensated": True}, r"^`compensated` sums are for the splittings 'kinetic'"),
     ],
 )
@@ -91,23 +89,6 @@ def test_strang_steps_are_what_parts_compose():
 
 
 # classes of a user's own ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, repr=False)
-class OwnScheme(Splitting):
-    """A scheme that no table has: Verlet's under another name."""
-
-    name: ClassVar[str] = "own"
-    order: ClassVar[int | None] = 2
-    scheme: ClassVar[Scheme] = replace(SCHEMES["verlet"], name="own")
-
-
-@pytest.mark.parametrize(
-    ("system", "options"), [(KEPLER, {}), (KEPLER, {"clock": "logarithmic"}), (FPUT, {"splitting": "linear"})]
-)
-def test_a_scheme_of_a_users_own_runs_with_every_splitting_and_clock(system, options):
-    own, known = (solve(system, cls(**options), (0, 2), t_eval=[1.3]).y for cls in (OwnScheme, get("verlet")))
-    np.testing.assert_array_equal(own, known)
 
 
 @pytest.mark.parametrize("name", ["verlet", "gauss_legendre4", "impulse"])

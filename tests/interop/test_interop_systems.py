@@ -216,6 +216,33 @@ def test_a_kinetic_energy_that_is_trained_keeps_its_gradients(frozen):
             assert slope.item() == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-6)
 
 
+def give_gradients(module):
+    module.m.requires_grad_(True)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda module: module.m.data.fill_(4.0), "has another ∂H/∂p than when"),
+        (lambda module: module.b.data.fill_(0.1), "has another ∂H/∂p than when"),
+        (lambda module: module.c.data.fill_(0.1), "has another ∂H/∂p than when"),
+        (give_gradients, "depends in ∂H/∂p on tensors that require gradients"),
+    ],
+)
+@pytest.mark.parametrize("method", ["verlet", "rk4"])
+def test_a_mass_that_changes_after_it_was_fixed_is_refused(method, change, words):
+    """Beside it V may change: it is read in each call."""
+    module = Trained().requires_grad_(False)
+    made = [from_hamiltonian(module.hamiltonian, 1), from_module(module, 1)]
+    assert all(system.separable for system in made)
+    module.k.data.fill_(4.0)
+    assert solve(made[1], method, (0, 1.0), [1.0, 0.0], dt=0.01).y[0, -1] == pytest.approx(np.cos(2.0), abs=1e-3)
+    change(module)
+    for system, argument in zip(made, ("H", "module"), strict=True):
+        with pytest.raises(ValueError, match=rf"`{argument}` {words}.*Make a new system"):
+            solve(system, method, (0, 1.0), [1.0, 0.0], dt=0.01)
+
+
 def test_a_network_in_q_alone_leaves_the_system_separable():
     """The zeros that a slice of [q, p] sends back to p are no dependence."""
     V = torch.nn.Sequential(torch.nn.Linear(1, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1)).double()

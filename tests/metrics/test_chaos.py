@@ -115,7 +115,7 @@ def test_vectors_of_a_driven_system_are_those_of_neighbouring_orbits():
     lengths = [np.linalg.norm(scale * w) for w in (ends[0] - ends[1], 2 * step * w0)]
     rate = np.log(lengths[0] / lengths[1]) / 10
     assert found.value == pytest.approx(rate, abs=1e-7)
-    with pytest.raises(ValueError, match="`y0` is a batch, whose steps"):
+    with pytest.raises(ValueError, match="the steps of a batch `y0`"):
         sympflow.lyapunov(system, "dop853", (0, 1), [y0, y0])
 
 

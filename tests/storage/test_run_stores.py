@@ -250,7 +250,7 @@ def test_a_store_of_another_run_is_left_as_it_is(tmp_path):
         with pytest.raises(ValueError, match="`t_eval` does not begin with the 3 times that `store`"):
             solve(SYSTEM, "verlet", (0, END), store=other, resume=True, t_eval=times)
     torch = pytest.importorskip("torch")
-    with pytest.raises(TypeError, match="`store` takes NumPy states"):
+    with pytest.raises(TypeError, match="`y0` is a tensor, but a `store`"):
         solve(SYSTEM, "verlet", (0, END), torch.tensor(SYSTEM.y0), store=path, resume=True)
     with Store.open(path).locked(), pytest.raises(StoreError, match="is being written by another process"):
         solve(SYSTEM, "verlet", (0, END), store=path, resume=True)

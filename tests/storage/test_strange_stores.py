@@ -84,7 +84,7 @@ def state(change, packed=False):
 
     def spoil(path):
         (file,) = path.glob(".state-*.npz")
-        arrays = read_arrays(file)
+        arrays = read_arrays(file, 2**20)
         change(arrays)
         (np.savez_compressed if packed else np.savez)(file, **arrays)
 
@@ -108,6 +108,12 @@ def longer(path):
             archive.writestr(name, content)
 
 
+def endless(path):
+    """A state of more bytes than such a run keeps."""
+    (file,) = path.glob(".state-*.npz")
+    os.truncate(file, 2**27)
+
+
 BOMB = zlib.compress(bytes(3 * 10**8), 9)
 STRANGE = {
     "path up": (renamed("../victim"), "../victim"),
@@ -125,6 +131,7 @@ STRANGE = {
     "objects": (array("q", dtype="|O"), "not a store of sympflow"),
     "another order": (array("q", order="F"), "not a store of sympflow"),
     "filter": (array("q", filters=[{"id": "pickle"}]), "not a store of sympflow"),
+    "no metadata": (lambda path: (path / METADATA).unlink(), r"has no .zmetadata, .*consolidate_metadata"),
     "bomb": (chunk("q", BOMB), r"damaged: .* of 'q'"),
     "no zlib": (chunk("q", b"text"), r"damaged: .* of 'q'"),
     "lost p0": (lambda path: shutil.rmtree(path / "p0"), "'p0' is missing"),
@@ -137,6 +144,7 @@ OF_RUNS = {
     "lost chunk of q": (lambda path: (path / "q" / "0.0").unlink(), r"0\.0 of 'q' is missing"),
     "lost status": (lambda path: (path / "status" / "0").unlink(), "0 of 'status' is missing"),
     "lost state": (lambda path: next(path.glob(".state*")).unlink(), "its state cannot be read"),
+    "endless state": (endless, r"its state cannot be read \(more than"),
     "packed state": (state(lambda arrays: None, packed=True), "its state cannot be read .*is packed"),
     "pickles": (state(of_objects), "its state cannot be read"),
     "state longer than its file": (longer, "its state cannot be read .*has another length"),

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, available, get
-from sympflow.arrays import concatenate, per_state, to_numpy
+from sympflow.arrays import concatenate, like, per_state, to_numpy
 from sympflow.integrators.base import FixedStep, Outcome, OwnSteps
 from sympflow.integrators.steppers import Stepper
 from sympflow.integrators.tableaux import ADAPTIVE, MULTISTEP
@@ -40,17 +40,7 @@ def not_applicable(integrator):
     return skipped
 
 
-TAKE_LONG = ("adaptive_heun", "bosh3", "dopri8", "fehlberg2", "implicit_adams", "tao6")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(m, marks=pytest.mark.slow) if m in TAKE_LONG else m
-        for m in available()
-        if getattr(get(m), "splitting", "") != "kepler"
-    ],
-)
+@pytest.mark.parametrize("name", [m for m in available() if getattr(get(m), "splitting", "") != "kepler"])
 @pytest.mark.filterwarnings("ignore:Functional iteration did not converge")
 def test_built_in_methods_pass_and_skip_only_what_has_no_meaning(name):
     loose = 1e-3 if name == "adaptive_heun" else 1e-4  # of order 2: else it takes many times the others' steps
@@ -284,7 +274,7 @@ def hides_failures_of_batches(self, problem):
 
 
 def clock_in_the_step(self, system, t, y, h):
-    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * float(np.sin(t))))
+    return SoundVerlet.step(self, system, t, y, h * (1 + 1e-3 * like(np.sin(to_numpy(t)), y)))
 
 
 def first_event_only(self, problem):

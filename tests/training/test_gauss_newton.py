@@ -461,21 +461,25 @@ def test_a_checkpoint_is_there_before_the_first_search_ends(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(("symbolic", "starts"), [(True, 72), (False, 24)])
-def test_nothing_said_means_at_most_a_minute(monkeypatch, clock, symbolic, starts):
-    """A search that is out of time ends with what it has, says so in the recipe, and warns: it is another flow."""
-    clock.costs_seconds(TableRun, "next_minimum", 10.0)
+def test_nothing_said_means_the_same_flow_on_every_machine(monkeypatch, clock, symbolic, starts):
+    """However long its starts and labels take there, none is left out; only a budget that is given ends them."""
     monkeypatch.setattr(trainer.trials, "can_try", lambda system: symbolic)
-    with pytest.warns(RuntimeWarning, match=f"after 3 of {starts} starts because the time budget was used up"):
-        flow = train(PENDULUM, points=60, reference_states=20, progress=False)
-    stage = flow.recipe["stages"][-1]
-    assert (stage["restarts_taken"], stage["restarts"]) == (3, starts)
-    assert stage["ended_early"] == "the time budget was used up"
-    assert flow.figures["one_step_error"] < 1e-3
-    seen = {}
-    monkeypatch.setattr(TableRun, "go", lambda self, session: seen.update(budget=session.time_budget) or 1 / 0)
-    for options, budget in (({"restarts": 1}, None), ({"steps": 1}, None), ({"time_budget": 7.0}, 7.0)):
-        with pytest.raises(ZeroDivisionError):
-            train(PENDULUM, points=30, reference_states=5, **options)
-        assert seen["budget"] is None if budget is None else 0 < seen["budget"] <= budget  # labels are part of it
+    monkeypatch.setattr(trainer, "STARTS", 3)
+    monkeypatch.setattr(trainer, "SOME", 3)
+    few = {"points": 60, "reference_states": 20, "progress": False}
+    flows = [train(PENDULUM, **few)]
+    clock.costs_seconds(TableRun, "next_minimum", 1000.0)
+    clock.costs_seconds(Labels, "of", 1000.0)
+    flows.append(train(PENDULUM, **few))
+    one, other = (weights(flow) for flow in flows)
+    assert torch.equal(one, other)
+    assert flows[1].recipe["stages"] == flows[0].recipe["stages"]
+    assert clock.now > 3000.0
+    seen = []
     monkeypatch.undo()
-    assert trainer.BUDGET == 60.0
+    monkeypatch.setattr(trainer.trials, "can_try", lambda system: symbolic)
+    monkeypatch.setattr(TableRun, "go", lambda self, session: seen.append(self.planned) or 1 / 0)
+    for options in ({}, {"restarts": 5}, {"time_budget": 7.0}):
+        with pytest.raises(ZeroDivisionError):
+            train(PENDULUM, points=30, reference_states=5, dt=0.5, **options)
+    assert seen == [starts, 5, trainer.BOUGHT if symbolic else 24]

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
-from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -32,15 +31,14 @@ from sympflow.integrators import flows
 from sympflow.training import pretrained
 from sympflow.training.clock_fit import clock_errors
 from sympflow.training.fits import GaussNewton, PrimedFit
-from sympflow.training.shipped import rows
+from sympflow.training.shipped import recipe
 from sympflow.training.shipped.judges import ByCertificate, one_step_errors, primed_cost
-from sympflow.training.shipped.recipe import Recipe, file_of, made
+from sympflow.training.shipped.recipe import SCENES, Recipe, along_the_orbit, scene_named
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
 QUARTIC = HamiltonianSystem.from_sympy("p**2/2 + q**4/4", name="plain_quartic", domain=sympflow.Ball([0.0, 0.0], 1.0))
-QUICK = PrimedFit(0.5, stages=2, processor=0, points=40, reference_states=10)
-LADDERS = {scene: [r for r in rows.ladders() if r.scene == scene] for scene in {r.scene: 0 for r in rows.ladders()}}
 FILES = [f for f in shipped_flows() if f.stages is not None or f.shift is not None]
+LADDERS = sorted({f.name.partition("-")[0] for f in FILES})
 
 
 @pytest.fixture(scope="module")
@@ -203,31 +201,36 @@ def test_listing_loads_no_weights():
 # building ------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_builds_a_ladder(tmp_path, monkeypatch, capsys):
-    rungs = [rows.rung("pendulum", replace(QUICK, stages=s), 2, 20, judge=ByCertificate(50.0)) for s in (1, 2)]
-    monkeypatch.setattr(rows, "recipes", lambda: rungs)
-    pretrained.main(["pendulum", "--kind", "primed", "--out", str(tmp_path)])
+def test_a_file_is_the_recipe_of_its_flow(tmp_path, monkeypatch, capsys):
+    """The command makes flows again with the same weights, and measures them."""
+    monkeypatch.setattr(pretrained, "package_folder", lambda: tmp_path)
+    monkeypatch.setattr(Recipe, "judge", ByCertificate(50.0))
+    fit, solver = PrimedFit(0.5, processor=1, points=40, reference_states=10), GaussNewton(steps=20, restarts=2)
+    flows = [
+        sympflow.train(PENDULUM, replace(fit, stages=stages, first=first), solver=solver, progress=False)
+        for stages, first in ((1, "drift"), (2, "kick"))
+    ]
+    names = [f"pendulum-primed-{stages}-0.5" for stages in (1, 2)]
+    for name, flow in zip(names, flows, strict=True):
+        flow.save(tmp_path / f"{name}.safetensors")
+    (tmp_path / "again").mkdir()
+    pretrained.main(["pendulum", "--kind", "primed", "--out", str(tmp_path / "again")])
     assert capsys.readouterr().out.count("energy_error_95") == 2
-    one, two = (load(tmp_path / f"pendulum-primed-{s}-0.5.safetensors", system=PENDULUM) for s in (1, 2))
+    one, two = (load(tmp_path / "again" / f"{name}.safetensors", system=PENDULUM) for name in names)
+    for again, flow in zip((one, two), flows, strict=True):
+        assert all(torch.equal(w, flow.state_dict()[name]) for name, w in again.state_dict().items())
     assert one.certified.t_end == two.figures["t_end"] == 50.0
     assert two.figures["energy_error_95"] == two.certified.relative_limit < one.figures["energy_error_95"]
     assert two.certified.relative_limit >= two.certified.relative_energy_error.q95
-    assert two.certified.held_out == 1000
     assert two.figures["one_step_error_median"] <= two.figures["one_step_error_max"]
     assert two.figures["cost"] > one.figures["cost"] > 0
-    assert two.recipe["stages"][0]["restarts"] == 2
-    listed = ShippedFlow.of(tmp_path / "pendulum-primed-2-0.5.safetensors")
+    listed = ShippedFlow.of(tmp_path / "again" / f"{names[1]}.safetensors")
     assert (listed.stages, listed.dt, listed.cost) == (2, 0.5, two.figures["cost"])
-    pretrained.main(["pendulum", "--rung", "primed-2-0.5", "--out", str(tmp_path), "--measure"])
+    pretrained.main(["--rung", "primed-2-0.5", "--out", str(tmp_path / "again"), "--measure"])
     assert capsys.readouterr().out.startswith("pendulum-primed-2-0.5: one_step_error")
-
-
-def test_rebuilding_gives_the_same_weights():
-    recipe = rows.rung("pendulum", replace(QUICK, processor=1), 2, 20)
-    flows = [recipe.fitted(PENDULUM, progress=False) for _ in range(2)]
-    assert flows[0].figures["training_cpu_seconds"] > 0
-    one, two = (flow.state_dict() for flow in flows)
-    assert all(torch.equal(one[name], two[name]) for name in one)
+    for unknown in (["three_body"], ["--rung", "primed-9-9"]):
+        with pytest.raises(SystemExit):
+            pretrained.main(unknown)
 
 
 def test_the_figures_are_those_of_the_certificate():
@@ -244,45 +247,52 @@ def test_the_figures_are_those_of_the_certificate():
 def test_the_figure_is_met_by_95_per_cent_of_other_states(name):
     """1000 states of another seed to T = 1000: no more than one in twenty exceeds it."""
     listed = next(f for f in FILES if f.name == name)
-    system = next(s for s in SCENES if listed.is_of(s))
+    system = scene_named(listed.name.partition("-")[0])
     y0 = system.domain.sample(1000, 90_210)
     n = int(listed.t_end / listed.dt)
     sol = solve(system, listed.load(system), (0.0, n * listed.dt), y0, save_every=5, on_domain_exit="ignore")
     assert np.mean(max_energy_error(sol) > listed.energy_error) <= 0.05
 
 
-def test_a_rung_starts_from_the_one_with_a_longer_step():
+def test_a_rung_starts_from_the_one_with_a_longer_step(tmp_path, monkeypatch):
     """Up to its own Δt it begins as the same map; alone it needs the other."""
-    fit, solver = replace(QUICK, processor=1), GaussNewton(steps=20, restarts=1)
-    first = Recipe("pendulum", "first", lambda: PENDULUM, fit, ByCertificate(5.0), solver)
-    second = replace(first, name="second", fit=replace(fit, dt=0.25), after="first")
-    (_, longer), (_, shorter) = made([first, second], progress=False)
+    fit, solver = PrimedFit(0.5, stages=2, processor=1, points=40, reference_states=10), GaussNewton(20, 1)
+    longer = sympflow.train(PENDULUM, fit, solver=solver, progress=False)
     start = SympFlow.primed(PENDULUM, 2, dt=0.25, processor=1)
     start.take_over(longer)
     x = torch.from_numpy(PENDULUM.domain.sample(5, 0))
     torch.testing.assert_close(start.psi(0.2, x), longer.psi(0.2, x), rtol=1e-14, atol=1e-14)
+    longer.save(tmp_path / "pendulum-longer.safetensors")
+    shorter = sympflow.train(PENDULUM, replace(fit, dt=0.25), solver=solver, progress=False)
+    shorter.save(tmp_path / "pendulum-shorter.safetensors")
+    monkeypatch.setattr(recipe, "EARLIER", {"pendulum-shorter": "pendulum-longer"})
+    again = Recipe.of(tmp_path / "pendulum-shorter.safetensors").fitted(progress=False)
     both = lambda flow: flow.figures["one_step_error"] + flow.figures["fractional_error"]  # noqa: E731
-    assert both(shorter) < both(longer)
-    with pytest.raises(ValueError, match=r"^`rung` 'second' starts from 'first'"):
-        list(made([second]))
+    assert both(again) < both(longer)
+    assert any(not torch.equal(w, shorter.state_dict()[name]) for name, w in again.state_dict().items())
 
 
 # what ships ----------------------------------------------------------------------------------------------------
 
 
-def test_every_recipe_ships_with_its_record():
-    """With checksums, the identity of its system, and a certificate if its judge gives one."""
-    recipes = {file_of(recipe, Path()).stem: recipe for recipe in rows.recipes()}
-    assert sorted(recipes) == sorted(f.name for f in shipped_flows())
-    for listed in shipped_flows():
-        assert len(listed.identity.states) == 64
-        with safe_open(listed.path, "np") as file:
-            notes = file.metadata()
-        assert json.loads(notes[KEY])["format"] == FORMAT
-        assert notes[SUM] == text_checksum(notes[KEY])
-        recipe, flow = recipes[listed.name], load(listed.path)
-        assert recipe.kind == "mlp" or (flow.certified is not None) == recipe.judge.certifies, listed.name
-        assert flow.certified is None or flow.certified.delta.largest > 0
+@pytest.mark.parametrize("listed", shipped_flows(), ids=lambda f: f.name)
+def test_every_flow_ships_with_its_record(listed):
+    """With checksums, the identity of its system, its recipe, and a certificate if it keeps an energy."""
+    assert len(listed.identity.states) == 64
+    with safe_open(listed.path, "np") as file:
+        notes = file.metadata()
+    assert json.loads(notes[KEY])["format"] == FORMAT
+    assert notes[SUM] == text_checksum(notes[KEY])
+    recipe = Recipe.of(listed.path)
+    flow, system, (fit, _) = recipe.flow, recipe.system, recipe.stages[0]
+    assert listed.is_of(system)
+    if fit.kind in ("primed", "split"):
+        made = fit.flow(system)
+        shape = dict(made.architecture(), ndof=flow.ndof)
+        assert (shape, made.dt) == (flow.architecture(), pytest.approx(flow.dt, rel=1e-14))
+    certified = system.autonomous and listed.shift is None and listed.kind != "mlp"
+    assert (flow.certified is not None) == certified
+    assert flow.certified is None or flow.certified.delta.largest > 0
 
 
 @pytest.mark.parametrize("flow", FILES, ids=lambda f: f.name)
@@ -294,22 +304,10 @@ def test_shipped_flows_are_maps_for_all_times(flow):
     assert flow.energy_error < 0.1
 
 
-SCENES = [
-    *(make() for make in systems.SYSTEMS.values()),
-    systems.harmonic_oscillator(100.0),
-    systems.fput(1000.0),
-    systems.spring_pendulum(1e6, coordinates="polar"),
-    LADDERS["duffing"][0].system(),
-    LADDERS["sine_gordon"][0].system(),
-    LADDERS["phi4"][0].system(),
-    LADDERS["phi4_sheet"][0].system(),
-]
-
-
 @pytest.mark.parametrize("listed", shipped_flows(), ids=lambda f: f.name)
 def test_every_flow_is_a_map_for_all_times(listed):
     """Whatever its kind, networks and stiff ones included; measured on a few states, not read."""
-    system = next(s for s in SCENES if listed.is_of(s))
+    system = scene_named(listed.name.partition("-")[0])
     flow = listed.load(system)
     if listed.shift is not None:  # in its own time it is early or late: what it is right in is the physical time
         figures = clock_errors(flow, system, system.domain, 987, 6)
@@ -326,9 +324,9 @@ def test_every_flow_is_a_map_for_all_times(listed):
 @pytest.mark.parametrize("name", LADDERS)
 def test_shipped_figures_hold(name):
     """Measured again, on states of another seed, over a tenth of the time: no rung is worse than its file says."""
-    system = LADDERS[name][0].system()
-    t_end = LADDERS[name][0].judge.t_end / (100 if name == "outer_solar_system" else 10)
-    along = rows.along_the_orbit(system, 4, t_end, seed=1) if name == "outer_solar_system" else None
+    system = SCENES[name]()
+    t_end = max(f.t_end for f in shipped_flows(system) if f.stages) / (100 if name == "outer_solar_system" else 10)
+    along = along_the_orbit(system, 4, t_end, seed=1) if name == "outer_solar_system" else None
     for listed in shipped_flows(system):
         if listed.stages is None:
             continue
@@ -344,12 +342,12 @@ def test_shipped_figures_hold(name):
 
 @pytest.mark.parametrize("name", LADDERS)
 def test_what_costs_more_is_more_accurate(name):
-    rungs = [f for f in shipped_flows(LADDERS[name][0].system()) if f.stages]
+    rungs = [f for f in shipped_flows(SCENES[name]()) if f.stages]
     errors = [f.energy_error for f in rungs]  # the cheapest first
     cheap = {"outer_solar_system": 0.1}  # the cheapest rung is better than 1e-4 already
     assert errors[-1] < cheap.get(name, 1e-3) * errors[0]
     of_state = {  # polynomials that are fitted to the state alone, beside flows for the energy
-        f"{name}-{r.name}" for r in LADDERS[name] if r.name.startswith("polynomial") and r.fit.energy_weight == 0.0
+        f.name for f in rungs if f.polynomial and f.load().recipe["stages"][0]["energy_weight"] == 0.0
     }
     of_state.add("driven_pendulum-primed-8-0.5")  # a third of the state error of the rung before
     of_state.add(

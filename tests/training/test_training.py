@@ -289,14 +289,6 @@ def test_a_small_baseline():
     assert baseline.dtype == torch.float32
 
 
-def test_a_flow_of_another_system_is_refused():
-    flow = train(harmonic_oscillator(), steps=2, **QUICK)
-    with pytest.raises(ValueError, match="`system`"):
-        train(harmonic_oscillator(2.0), flow=flow)
-    with pytest.raises(ValueError, match="`dt`"):
-        train(harmonic_oscillator(), 0.5, flow=flow)
-
-
 # optimizers --------------------------------------------------------------------------------------------------------
 
 

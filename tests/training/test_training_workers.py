@@ -15,7 +15,6 @@ from sympflow import HamiltonianSystem, SympFlow, systems, train
 from sympflow.training import trials
 from sympflow.training.fits import GaussNewton, PrimedFit, SplitFit
 from sympflow.training.session import Session
-from sympflow.training.shipped.recipe import Recipe, made
 from sympflow.training.split_fit import SplitRun
 from sympflow.training.starts import scaling_of
 from sympflow.training.table_fit import TableFit, TableRun
@@ -117,23 +116,6 @@ def test_a_time_budget_does_not_wait_for_workers_that_start():
             assert list(session.each(in_main_thread, event, range(5), session.deadline)) == [*range(5)]
         finally:
             event.set()
-
-
-def test_rungs_come_after_those_that_they_start_from():
-    fit = PrimedFit(0.5, stages=2, processor=0, points=20, label_times=2, reference_states=5)
-    solver = GaussNewton(steps=2, restarts=1)
-
-    def rung(name, after=None):
-        return Recipe("pendulum", name, systems.pendulum, fit, lambda *_: None, solver, after=after)
-
-    recipes = [rung("c", "b"), rung("a"), rung("b", "a"), rung("d")]
-    with ThreadPoolExecutor(2) as threads:
-        flows = {recipe.name: flow for recipe, flow in made(recipes, progress=False, workers=threads)}
-    assert list(flows) == ["a", "d", "b", "c"]
-    alone = dict((recipe.name, flow) for recipe, flow in made(recipes, progress=False))
-    assert all(same(flows[name], alone[name]) for name in flows)
-    with pytest.raises(ValueError, match="`rung` 'b' starts from 'a'"):
-        list(made([rung("b", "a")], progress=False))
 
 
 def test_what_cannot_be_pickled_is_named(monkeypatch):

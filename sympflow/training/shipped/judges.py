@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
 from sympflow.flow.sympflow import SympFlow
-from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.metrics.energy import max_energy_error
@@ -116,6 +115,13 @@ def one_step_errors(
 # judges -------------------------------------------------------------------------------------------------------------
 
 
+class Judge(Protocol):
+    """A measurement of a trained flow."""
+
+    def __call__(self, flow: Any, system: HamiltonianSystem) -> None:
+        """Put the figures by which flows are chosen, and a certificate, into the flow."""
+
+
 @dataclass(frozen=True)
 class ByCertificate:
     """The certificate over T = t_end, and from it the figures by which flows are chosen."""
@@ -125,7 +131,6 @@ class ByCertificate:
     states: int = 2000
     times: int = 33
     held_out: int = HELD_OUT
-    certifies: ClassVar[bool] = True
 
     def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
         certificate = flow.certificate(
@@ -149,7 +154,6 @@ class ByRuns:
     t_end: float
     t_certified: float
     cost: Cost = primed_cost
-    certifies: ClassVar[bool] = True
 
     def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
         flow.certificate(system, t_end=self.t_certified)
@@ -163,7 +167,6 @@ class ByBalance:
 
     t_end: float = 1000.0
     cost: Cost = primed_cost
-    certifies: ClassVar[bool] = False
 
     def errors(self, flow: Any, system: HamiltonianSystem, y0: np.ndarray) -> np.ndarray:
         return energy_balance_error(_run(flow, system, y0, self.t_end), relative=True).max(-1)
@@ -204,7 +207,6 @@ class AsPublished:
     initial: Callable[[], np.ndarray]
     omega: float = 1.0
     cost: Cost = network_cost
-    certifies: ClassVar[bool] = True
 
     def measured(self, flow: FlowMap, system: HamiltonianSystem, steps: int = 1000) -> dict[str, Any]:
         """`measure` from the initial states."""
@@ -226,9 +228,7 @@ STIFF_STATES, STIFF_SEED = 20, 20_261_121  # of the energy figure, from a seed t
 class OfStiff:
     """Largest energy errors of y0 and of held-out states over the interval, and a certificate of few states."""
 
-    domain: Callable[[HamiltonianSystem], Domain]
     cost: Cost = split_cost
-    certifies: ClassVar[bool] = True
 
     def __call__(self, flow: SplitFlow, system: HamiltonianSystem) -> None:
         bound = flow.bound(system)
@@ -236,7 +236,9 @@ class OfStiff:
         n = round((system.t_span[1] - system.t_span[0]) / flow.dt) - 1
         t = np.unique(np.linspace(0, n, 500).round())[:, None] + np.array(PHASES)
         between = solve(system, bound, on_domain_exit="ignore", t_eval=t.ravel() * flow.dt + system.t_span[0])
-        x = self.domain(system).sample(STIFF_STATES, STIFF_SEED)
+        domain = bound.domain_for(system)
+        assert domain is not None
+        x = domain.sample(STIFF_STATES, STIFF_SEED)
         steps = np.arange(0.0, system.t_span[1] + flow.dt / 2, flow.dt)[::10]
         many = solve(system, bound, y0=x, t_eval=steps[steps <= system.t_span[1]], on_domain_exit="ignore")
         H = np.asarray(many.energy())

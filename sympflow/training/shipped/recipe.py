@@ -1,147 +1,261 @@
-"""Recipe: how a flow that ships is made and judged."""
+"""Recipes of flows: how one was made and judged, as its file tells; so each that ships can be made again from it."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
+import numpy as np
 import torch
 
+from sympflow.flow.clocked import ClockedFlow
+from sympflow.flow.files import load
 from sympflow.flow.flow_map import FlowMap
-from sympflow.hamiltonian.domain import Domain
+from sympflow.flow.mlp import MLPFlow
+from sympflow.flow.primed import PrimedFlow
+from sympflow.flow.split import SplitFlow
+from sympflow.hamiltonian.domain import Domain, EnergySublevel
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import time_transformed
+from sympflow.solver import solve
+from sympflow.systems import SYSTEMS, duffing, fput, harmonic_oscillator, phi4, sine_gordon, spring_pendulum
 from sympflow.training.clock_fit import train_clock
-from sympflow.training.fits import ClockedFit, Fit, GaussNewton, LossFit, NetworkFit, Solver
+from sympflow.training.fits import (
+    SOLVERS,
+    WEIGHTS,
+    ClockedFit,
+    Fit,
+    GaussNewton,
+    LossFit,
+    NetworkFit,
+    PrimedFit,
+    Solver,
+    SplitFit,
+)
 from sympflow.training.session import Session
+from sympflow.training.shipped.judges import AsPublished, ByBalance, ByCertificate, ByClock, ByRuns, Judge, OfStiff
 from sympflow.training.trainer import fit_flow
 from sympflow.workers import WorkerPool
 
+YEAR = 365.25  # days
+SITES = 256  # of lattices, on which flows that were fitted on a few are judged
 
-class Judge(Protocol):
-    """A measurement of a trained flow; `certifies` says if it gives those that are symplectic a certificate."""
+SCENES: dict[str, Callable[[], HamiltonianSystem]] = {
+    **{name.replace("-", "_"): make for name, make in SYSTEMS.items()},
+    "harmonic_oscillator_100": partial(harmonic_oscillator, 100.0),
+    # in one well, without friction and weakly driven: its orbits are regular
+    "duffing": partial(duffing, damping=0.0, force=0.1, frequency=2.7, alpha=1.0),
+    "toda_chain": partial(SYSTEMS["toda-chain"], n=SITES),
+    "fput_beta": partial(SYSTEMS["fput-beta"], n=SITES),
+    # the sine-Gordon equation on sites one apart: pendulums coupled by springs
+    "sine_gordon": partial(sine_gordon, n=SITES, length=float(SITES), accuracy=2),
+    # double wells that springs couple, in a row and in a plane
+    "phi4": partial(phi4, n=SITES, length=float(SITES), accuracy=2),
+    "phi4_sheet": partial(
+        HamiltonianSystem.lattice, onsite="(q**2 - 1)**2/4", bond="r**2/2", shape=(16, 16), name="phi4_sheet"
+    ),
+    "fput_50": partial(fput, omega=50.0),
+    "fput_1000": partial(fput, omega=1000.0),
+    "spring_pendulum_1e6": partial(spring_pendulum, 1e6, coordinates="polar"),
+}
+"""The systems of the flows that ship, by the first word of their files' names."""
 
-    certifies: ClassVar[bool]
+EARLIER = {
+    "quartic-polynomial-8-0.625": "quartic-polynomial-8-1",
+    "quartic-polynomial-8-0.5": "quartic-polynomial-8-0.625",
+}
+"""Flows that start from the numbers of another one, with a longer Δt."""
 
-    def __call__(self, flow: Any, system: HamiltonianSystem) -> None:
-        """Put the figures by which flows are chosen, and a certificate, into the flow."""
+
+@lru_cache(maxsize=1)
+def scene_named(scene: str) -> HamiltonianSystem:
+    """The system of a scene, which its flows share."""
+    return SCENES[scene]()
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A flow that ships."""
+    """The recipe in the file of a flow, which is named scene-name.safetensors."""
 
-    scene: str
-    name: str
-    system: Callable[[], HamiltonianSystem]
-    fit: Fit
-    judge: Judge
-    solver: Solver = field(default_factory=GaussNewton)
-    further: tuple[tuple[LossFit, Solver], ...] = ()
-    domain: Callable[[HamiltonianSystem], Domain] | None = None
-    after: str | None = None
+    path: Path
+    flow: Any
+
+    @classmethod
+    def of(cls, path: Path) -> Recipe:
+        """Read the recipe of a file."""
+        return cls(path, load(path))
+
+    @property
+    def name(self) -> str:
+        return self.path.stem
+
+    @property
+    def system(self) -> HamiltonianSystem:
+        return scene_named(self.name.partition("-")[0])
+
+    @property
+    def domain(self) -> Domain:
+        """The states that are trained on."""
+        domain = self.flow.domain_for(self.system)
+        assert domain is not None
+        return domain
 
     @property
     def kind(self) -> str:
         """The kind of flow, by which the command chooses."""
-        return "primed" if isinstance(self.fit, ClockedFit) else self.fit.kind  # it is one of a ladder
+        kinds: dict[Any, str] = {PrimedFlow: "primed", ClockedFlow: "primed", SplitFlow: "split"}
+        return kinds.get(type(self.flow), self.flow.kind)
 
-    def domain_of(self, system: HamiltonianSystem) -> Domain:
-        """The states that are trained on."""
-        domain = system.domain if self.domain is None else self.domain(system)
-        assert domain is not None
-        return domain
+    @property
+    def stages(self) -> list[tuple[Fit, Solver]]:
+        """The fit and the solver of each stage of its training."""
+        return [self._stage(told, k) for k, told in enumerate(self.flow.recipe["stages"])]
 
-    def fitted(
-        self, system: HamiltonianSystem, earlier: FlowMap | None = None, progress: bool | None = None
-    ) -> FlowMap:
-        """The trained flow, not judged yet; `earlier` is that of the recipe `after` which it comes."""
-        before = time.process_time()
-        domain = self.domain_of(system)
-        if isinstance(self.fit, ClockedFit):
-            return train_clock(system, self.fit, domain)
-        start = None if isinstance(self.fit, NetworkFit) else self.fit.flow(system, domain, earlier)
-        first = self.fit if start is None else self.fit.of_a_given_flow
-        flow = fit_flow(system, start, first, self.solver, domain, Session(progress=progress))
-        for fit, solver in self.further:
-            flow = fit_flow(system, flow, fit, solver, domain, Session(progress=progress))
+    def _stage(self, told: dict[str, Any], k: int) -> tuple[Fit, Solver]:
+        cls, shape = self._shape()
+        cls = LossFit if k and cls is NetworkFit else cls
+        left_out = {"data", "loss", *(WEIGHTS if cls is PrimedFit else ())}
+        options = {n: told[n] for n in cls.names() if told.get(n) is not None and n not in left_out}
+        if cls is PrimedFit:
+            options = {"energy_weight": 0.0, **options}  # as before there was one
+        if not k:
+            options |= shape
+        solver = SOLVERS.get(told["optimizer"], GaussNewton)
+        return cls(**options), solver(**{n: told[n] for n in solver.names() if told.get(n) is not None})
+
+    def _shape(self) -> tuple[type[Fit], dict[str, Any]]:
+        """The fit that makes such a flow, and the options that describe the flow."""
+        flow = self.flow
+        if isinstance(flow, PrimedFlow):
+            shape = flow.shape
+            return PrimedFit, {
+                "dt": flow.dt,
+                "stages": shape.maps // 2,
+                "processor": shape.processor,
+                "first": shape.first,
+                "curvature": shape.curvature if shape.curvature_kicks is None else shape.curvature_kicks,
+                "force_gradient": shape.gradient_kicks,
+                "polynomial": max(map(sum, shape.monomials), default=None),
+            }
+        if isinstance(flow, SplitFlow):
+            stages = flow.sequence.count(flow.sequence[0]) - 1
+            return SplitFit, {
+                "dt": flow.dt,
+                "stages": stages,
+                "terms": flow.terms,
+                "force_gradient": flow.gradient_kicks or False,
+            }
+        if isinstance(flow, ClockedFlow):
+            return ClockedFit, {
+                "dt": flow.figures["step"],
+                "scheme": flow.scheme.name,
+                "terms": len(flow.clock.numbers),
+            }
+        if isinstance(flow, MLPFlow):
+            return NetworkFit, {"dt": flow.dt, "baseline": True}
+        hidden = flow.layers[0].potential.hidden
+        return NetworkFit, {"dt": flow.dt, "pairs": len(flow.layers) // 2, "hidden": hidden}
+
+    @property
+    def judge(self) -> Judge:
+        """The measurement of the figures by which flows are chosen."""
+        flow, certificate = self.flow, self.flow.certified
+        scene = self.name.partition("-")[0]
+        if isinstance(flow, ClockedFlow):
+            return ByClock()
+        if isinstance(flow, SplitFlow):
+            return OfStiff()
+        if not isinstance(flow, PrimedFlow):
+            return AsPublished(*INITIAL[scene])
+        if scene == "outer_solar_system":
+            return ByRuns(along_the_orbit, 1e5 * YEAR, 100 * YEAR)
+        if flow.shape.timed:
+            return ByBalance()
+        if certificate is None:
+            return ByCertificate()
+        sizes = {name: getattr(certificate, name) for name in ("states", "times", "held_out")}
+        return ByCertificate(certificate.t_end, **sizes)
+
+    def fitted(self, progress: bool | None = None) -> FlowMap:
+        """The flow made again, not judged yet."""
+        before, system = time.process_time(), self.system
+        (fit, solver), *further = self.stages
+        if isinstance(fit, ClockedFit):
+            return train_clock(system, fit, self.domain)
+        flow = None
+        if not isinstance(fit, NetworkFit):
+            earlier = EARLIER.get(self.name)
+            found = None if earlier is None else load(self.path.with_name(f"{earlier}.safetensors"), system=system)
+            flow, fit = fit.flow(system, self.domain, found), fit.of_a_given_flow
+        for stage, by in [(fit, solver), *further]:
+            flow = fit_flow(system, flow, stage, by, self.domain, Session(progress=progress))
+        assert flow is not None
         flow.figures["training_cpu_seconds"] = round(time.process_time() - before, 3)
         return flow
 
-    def identify(self, flow: FlowMap) -> None:
+    def identify(self) -> None:
         """Put the identity of its system into the flow: H all over the domain."""
-        system = self.system()
+        flow, system = self.flow, self.system
         if flow.origin is None:
             flow.identify(system, flow.domain)
             return
         flow.identify(time_transformed(system, flow.origin.shift))
-        made = {**flow.recipe["transforms"], "identity": Identity.of(system, self.domain_of(system)).to_dict()}
+        made = {**flow.recipe["transforms"], "identity": Identity.of(system, self.domain).to_dict()}
         flow.recipe = {**flow.recipe, "transforms": made}
 
-    def measure(self, flow: FlowMap) -> dict[str, Any]:
-        """The figures by which flows are chosen, measured again."""
-        self.judge(flow, self.system())
-        return flow.figures
+    def measure(self) -> None:
+        """Measure again the figures by which flows are chosen."""
+        self.judge(self.flow, self.system)
 
 
-def made(
-    recipes: Sequence[Recipe],
-    earlier: Callable[[Recipe, str], FlowMap] | None = None,
-    progress: bool | None = None,
-    workers: Any = 1,
-) -> Iterator[tuple[Recipe, FlowMap]]:
-    """The recipes and their flows, trained and judged; those that come `after` others when these are made."""
-    flows: dict[tuple[str, str], FlowMap] = {}
-    left = list(recipes)
+def made(recipes: Iterable[Recipe], progress: bool | None = None, workers: Any = 1) -> Iterator[tuple[Recipe, FlowMap]]:
+    """The recipes and their flows, trained and judged."""
+    recipes = list(recipes)
     with WorkerPool(workers) as pool:
-        while left:
-            names = {(recipe.scene, recipe.name) for recipe in left}
-            ready = [recipe for recipe in left if (recipe.scene, recipe.after) not in names]
-            left = [recipe for recipe in left if recipe not in ready]
-            items = [(recipe, _before(recipe, flows, earlier)) for recipe in ready]
-            for recipe, flow in zip(ready, pool.map(_made, progress, items), strict=True):
-                flows[recipe.scene, recipe.name] = flow
-                yield recipe, flow
+        yield from zip(recipes, pool.map(_made, progress, [recipe.path for recipe in recipes]), strict=True)
 
 
-def _before(
-    recipe: Recipe, flows: Mapping[tuple[str, str], FlowMap], earlier: Callable[[Recipe, str], FlowMap] | None
-) -> FlowMap | None:
-    """The flow that a recipe starts from, if it comes after another one."""
-    if recipe.after is None:
-        return None
-    before = flows.get((recipe.scene, recipe.after))
-    if before is None and earlier is None:
-        raise ValueError(f"`rung` {recipe.name!r} starts from {recipe.after!r}: make that first, or all of them.")
-    return earlier(recipe, recipe.after) if before is None and earlier is not None else before
-
-
-def _made(progress: bool | None, item: tuple[Recipe, FlowMap | None]) -> FlowMap:
-    """The flow of a recipe, as a piece of work."""
+def _made(progress: bool | None, path: Path) -> FlowMap:
+    """The flow of a file made again, as a piece of work."""
     torch.set_num_threads(1)  # the arrays are small, and one thread is reproducible
-    recipe, before = item
-    system = _system(recipe.system)
-    flow = recipe.fitted(system, None if before is None else before.bound(system), progress)
-    recipe.judge(flow, system)
+    recipe = Recipe.of(path)
+    flow = recipe.fitted(progress)
+    recipe.judge(flow, recipe.system)
     return flow
 
 
-@lru_cache(maxsize=1)
-def _system(make: Callable[[], HamiltonianSystem]) -> HamiltonianSystem:
-    """The system of a scene, which its recipes share."""
-    return make()
+# states that flows are judged by --------------------------------------------------------------------------------
 
 
-def file_of(recipe: Recipe, folder: Path) -> Path:
-    """The file of a recipe's flow."""
-    return folder / f"{recipe.scene}-{recipe.name}.safetensors"
+def along_the_orbit(system: HamiltonianSystem, n: int = 10, span: float = 1e5 * YEAR, seed: int = 0) -> np.ndarray:
+    """States of the outer solar system at n random times in 1e5 years of its own orbit, which stays in Ω."""
+    t = np.sort(np.random.default_rng(seed).uniform(0, span, n))
+    return solve(system, "kahan_li8", (0.0, float(t[-1])), dt=200.0, t_eval=t).states
 
 
-def scenes(recipes: Iterable[Recipe]) -> list[str]:
-    """The names of the scenes."""
-    return list(dict.fromkeys(recipe.scene for recipe in recipes))
+def _square(omega: float = 1.0) -> np.ndarray:
+    """(q, p/ω) uniform in [−1.2, 1.2]²."""
+    return np.random.default_rng(0).uniform(-1.2, 1.2, (100, 2)) * np.array([1.0, omega])
+
+
+def _of_scene(scene: str, energy: float = math.inf) -> np.ndarray:
+    """States of a scene's own domain, with less than an energy."""
+    system = scene_named(scene)
+    own = system.domain
+    assert isinstance(own, EnergySublevel)
+    return EnergySublevel(min(energy, own.energy), own.box).attach(system.hamiltonian).sample(100, 0)
+
+
+INITIAL: dict[str, tuple[Any, ...]] = {
+    "harmonic_oscillator": (_square,),
+    "harmonic_oscillator_100": (partial(_square, 100.0), 100.0),
+    "henon_heiles": (partial(_of_scene, "henon_heiles", 1 / 8),),
+    "pendulum": (partial(_of_scene, "pendulum"),),
+}
+"""The initial states of the published checkpoints, and their ω."""

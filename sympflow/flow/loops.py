@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sympflow.compiler import NotCompiled
+from sympflow.flow.tables import Tables
 from sympflow.hamiltonian.collocation import Tableau
-from sympflow.hamiltonian.monomials import Monomials
-from sympflow.hamiltonian.parts import ExactParts, SubFlow
+from sympflow.hamiltonian.parts import ExactParts
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel, Run, RunCheckpoint, Steps, Task, both_ways, run_states
 from sympflow.kernels.splitting_loops import SplittingKernel, splitting_loops
@@ -22,42 +23,7 @@ from sympflow.schemes import CURVATURE, Scheme
 if TYPE_CHECKING:
     from sympflow.kernels.rollouts import SplittingRollouts
 
-__all__ = [
-    "ClockedFlowKernel",
-    "CollocatedFlowKernel",
-    "MapSource",
-    "PrimedFlowKernel",
-    "SplitFlowKernel",
-    "TableSource",
-]
-
-
-class TableSource(Protocol):
-    """The numbers of a primed flow ψ̄ = χ ∘ K ∘ χ⁻¹, which do not change; not `processed` if χ is the identity."""
-
-    level: int
-    monomials: Monomials
-    processed: bool
-
-    def scheme(self, part: str, t: float | None, back: bool = False) -> Scheme:
-        """The "primed kernel" K_t or the "primed processor" χ_t at t > 0; `back` its inverse."""
-        ...
-
-    def polynomials(self, back: bool) -> StageTable:
-        """ψ̄_t or its inverse for h = 1, as coefficients (m, K) of polynomials in `variable`, K at least 3."""
-        ...
-
-    def variable(self, t: np.ndarray) -> np.ndarray:
-        """The variable of the polynomials, of step lengths t (N,)."""
-        ...
-
-    def kept(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The result of `make`, made once for each key."""
-        ...
-
-    def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
-        """Count forces, force gradients and curvature terms of a run."""
-        ...
+__all__ = ["ClockedFlowKernel", "CollocatedFlowKernel", "PrimedFlowKernel", "SplitFlowKernel"]
 
 
 class PrimedFlowKernel(Kernel):
@@ -66,14 +32,14 @@ class PrimedFlowKernel(Kernel):
     A flow with a processor, ψ̄ = χ ∘ K ∘ χ⁻¹, starts a run by χ⁻¹, makes its steps by K, and applies χ to each output.
     """
 
-    def __init__(self, tables: TableSource, system: HamiltonianSystem, compensated: bool = False) -> None:
+    def __init__(self, tables: Tables, system: HamiltonianSystem, compensated: bool = False) -> None:
         if system.friction and compensated:
-            raise ValueError(
+            raise NotCompiled(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )
         known = system.form is not None or (tables.level == CURVATURE and system.local is not None)
         if tables.level >= CURVATURE and not known:
-            raise ValueError(
+            raise NotCompiled(
                 f"`system` {system.name!r} has no symbols, from which curvature terms and polynomials are compiled: "
                 "use backend='array'."
             )
@@ -171,22 +137,14 @@ def _stages(tables: Sequence[np.ndarray], task: Task) -> int:
     return tables[1].shape[1] + tables[2].shape[1] * -(-len(task.save) // max(task.n_steps, 1))
 
 
-class MapSource(Protocol):
-    """The maps of a split flow, which do not change."""
-
-    def maps(self, t: float) -> Sequence[SubFlow]:
-        """The maps of a step, for t < 0 those of the inverse; the same object for the same t."""
-        ...
-
-    def coefficients(self, back: bool) -> Sequence[SubFlow]:
-        """The maps of all steps, or of their inverses: see `PartsLoops.step_by_coefficients`."""
-        ...
-
-
 class SplitFlowKernel(Kernel):
-    """Compiled loops of a flow made of exact flows of parts, for Δt = `dt`; a step h < 0 is the inverse of ψ̄_|h|."""
+    """Compiled loops of a flow made of exact flows of parts, for Δt = `dt`; a step h < 0 is the inverse of ψ̄_|h|.
 
-    def __init__(self, maps: MapSource, parts: ExactParts, dt: float) -> None:
+    ``maps.maps(t)`` are those of a step, for t < 0 of the inverse, the same object for the same t, and
+    ``maps.coefficients(back)`` those of all steps: see `PartsLoops.step_by_coefficients`.
+    """
+
+    def __init__(self, maps: Any, parts: ExactParts, dt: float) -> None:
         from sympflow.kernels.parts_loops import parts_loops
 
         self.parts, self._maps, self._dt = parts, maps, dt
@@ -212,21 +170,14 @@ class ClockedFlowKernel(Kernel):
     """Compiled loops of a flow with a trained clock, a `Kernel`; states are [q, t, p, B], of the transformed system.
 
     B is constant and nothing depends on t, so n steps of the clock are n times one, added where a state is kept:
-    ``advance(s, B)`` of steps s. The `numbers` are those that the clock has now: see `reach_times`.
+    ``advance(s, B)`` of steps s.
     """
 
     saves_finite = False
 
-    def __init__(
-        self,
-        scheme: Scheme,
-        system: HamiltonianSystem,
-        advance: Callable[[Any, Any], Any],
-        numbers: Callable[[], tuple[float, ...]],
-    ) -> None:
-        self.system = system
-        self._scheme, self._kernel = scheme, splitting_loops(system).kernel(scheme)
-        self._advance, self._numbers, self._time = advance, numbers, system.ndof - 1
+    def __init__(self, scheme: Scheme, system: HamiltonianSystem, advance: Callable[[Any, Any], Any]) -> None:
+        self._kernel = splitting_loops(system).kernel(scheme)
+        self._advance, self._time = advance, system.ndof - 1
 
     def runs(self, task: Task) -> Run:
         """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
@@ -244,24 +195,6 @@ class ClockedFlowKernel(Kernel):
         else:
             out[:, self._time] += self._advance(np.asarray(h, dtype=np.float64), y[:, -1])
         return Steps(out)
-
-    def reach_times(
-        self,
-        h: float,
-        y0: np.ndarray,
-        times: np.ndarray,
-        stride: int,
-        expected: float,
-        numbers: tuple[float, ...] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The states of rows of `y0` (N, 2d) at elapsed times: see `elapsed_times.reach_times`.
-
-        `numbers` are those of the clock, if they have been asked for.
-        """
-        from sympflow.kernels.elapsed_times import reach_times
-
-        numbers = self._numbers() if numbers is None else numbers
-        return reach_times(self.system, self._scheme, h, y0, times, stride, expected, numbers)
 
 
 class CollocatedFlowKernel(Kernel):
