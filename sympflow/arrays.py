@@ -163,6 +163,8 @@ def values(x: Any) -> np.ndarray | None:
 
     None where there are none to be read, in a graph that `torch.compile` traces.
     """
+    if is_tensor(x) and _is_plain(x):
+        return x.detach().cpu().numpy()
     plain, order = _behind(x)
     if plain is None or isinstance(plain, np.ndarray):
         return plain
@@ -226,6 +228,8 @@ def lanes(x: Array) -> int:
 
 def readable(x: Array) -> bool:
     """Return True if the values of `x` are there, one for each entry: not under vmap, nor where a graph is traced."""
+    if is_tensor(x) and _is_plain(x):
+        return True
     plain, order = _behind(x)
     return plain is not None and len(order) == x.ndim
 
@@ -237,6 +241,14 @@ def untransformed() -> AbstractContextManager[Any]:
     return temporarily_clear_interpreter_stack()
 
 
+def _is_plain(x: Any) -> bool:
+    """True of a tensor that stands for itself alone, as nearly all do."""
+    import torch
+
+    is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
+    return type(x) is torch.Tensor and not is_wrapped(x) and not torch.compiler.is_dynamo_compiling()
+
+
 def _behind(x: Any) -> tuple[Any, Sequence[int]]:
     """The tensor with the values of x, in no graph, and the order of its axes: lanes first; None without values."""
     if not is_tensor(x):
@@ -246,8 +258,6 @@ def _behind(x: Any) -> tuple[Any, Sequence[int]]:
     if torch.compiler.is_dynamo_compiling():
         return None, []
     functorch, axes = torch._C._functorch, list(range(x.ndim))
-    if type(x) is torch.Tensor and not functorch.is_functorch_wrapped_tensor(x):
-        return x.detach(), axes  # nearly always
     with torch._C._DisableFuncTorch():
         while functorch.is_functorch_wrapped_tensor(x):
             if functorch.is_batchedtensor(x):
@@ -270,18 +280,21 @@ def _is_followed(x: Any) -> bool:
 
 def _is_transformed(x: Any) -> bool:
     import torch
-    from torch.autograd import forward_ad
 
     functorch = torch._C._functorch
     if torch.compiler.is_compiling() or functorch.is_functorch_wrapped_tensor(x) or _is_symbolic(x):
         return True
     if functorch.is_legacy_batchedtensor(x):  # cotangents side by side, of torch.autograd.grad(is_grads_batched=True)
         return True
-    return forward_ad.unpack_dual(x).tangent is not None
+    return torch.autograd.forward_ad.unpack_dual(x).tangent is not None
 
 
 def _is_symbolic(x: Any) -> bool:
     """True for the tensors without values with which `torch.compile` traces."""
+    import torch
+
+    if type(x) is torch.Tensor:
+        return False
     from torch._subclasses import FakeTensor
     from torch._subclasses.functional_tensor import FunctionalTensor
 

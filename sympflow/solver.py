@@ -124,7 +124,7 @@ def solve(
         ``system.with_params(...)``, up to rounding with compensated sums, force gradients, friction or a drive.
         Otherwise trajectories are grouped by parameter values, and the groups run in sequence. A trained flow holds for
         its own parameters alone. Gradients flow to tensors that require them, by splitting methods on the splitting
-        "kinetic".
+        "kinetic", and where H does not depend on t by Gauss methods and Runge–Kutta methods of fixed steps.
     t_eval : array_like of shape (n,), optional
         Times to report, ordered from start to end. The default is every step. No other state is stored.
     dense_output : bool
@@ -145,8 +145,8 @@ def solve(
         methods.
     backend : "auto", "compiled" or "array"
         "auto" runs symbolic systems, lattices, pairs and Numba functions compiled, for float64 NumPy states and, by
-        splitting methods, for tensors on the CPU; everything else with array operations, tensors on a GPU too. What ran
-        is in `stats["backend"]`.
+        methods of fixed steps, for tensors on the CPU; everything else with array operations, tensors on a GPU too.
+        What ran is in `stats["backend"]`.
     on_domain_exit : "warn", "stop" or "ignore", optional
         What to do when an output lies outside the domain Ω: "warn" puts the first exit into the message and the
         statistics, "stop" ends there with status −1 (in a batch for that trajectory alone, NaN from there on). The
@@ -361,9 +361,9 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
 
 def _solved_followed(integrator: Integrator, problem: Problem, action: str, rows: ParameterRows) -> Solution:
     """The solution of trajectories to whose parameters gradients flow: one run, whatever the values."""
-    columns = {name: np.ravel(value) for name, value in rows.values.items()}
-    followed = {name: rows.followed.get(name, as_tensor(column.copy())) for name, column in columns.items()}
-    parameter_values = np.stack([*columns.values()])
+    numbers = {name: as_tensor(value.copy()) for name, value in rows.values.items() if name not in rows.followed}
+    followed = {name: rows.followed[name] if name in rows.followed else numbers[name] for name in rows.values}
+    parameter_values = np.array([np.ravel(value) for value in rows.values.values()])
     together = replace(problem, parameter_values=parameter_values, followed=followed, diagnosed=False)
     if problem.system.between_impulses is not problem.system or problem.events is not None or action == "stop":
         raise ValueError(

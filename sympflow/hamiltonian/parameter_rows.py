@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import sympy as sp
 
-from sympflow.arrays import differentiable, expanded, is_tensor, transformed
+from sympflow.arrays import differentiable, expanded, is_tensor, to_numpy, transformed
 from sympflow.hamiltonian.symbolic import exact, generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -29,7 +29,7 @@ class Rows(NamedTuple):
 
 
 class ParameterRows:
-    """The parameters of each trajectory of a batch; `followed` are tensors (N,) of those whose gradients are wanted."""
+    """The parameters of each trajectory of a batch; `followed` are the tensors of those whose gradients are wanted."""
 
     def __init__(
         self,
@@ -211,7 +211,6 @@ def checked_rows(system: HamiltonianSystem, params: Any, batch: tuple[int, ...])
             f"value for each trajectory; got {shapes}."
         ) from None
     followed = {name: value for name, value in params.items() if differentiable(value)}
-    followed = {name: expanded(value.double().cpu(), shape).reshape(-1) for name, value in followed.items()}
     numbers = not followed and not any(array.ndim for array in arrays.values())
     values = {name: expanded(array, shape) for name, array in arrays.items()}
     return ParameterRows(system, values, numbers, followed)
@@ -224,7 +223,7 @@ def _checked_values(name: str, given: Any) -> np.ndarray:
                 f"`params` has {name} that torch.func, forward mode or torch.compile follows, which solve does not "
                 "take: use torch.autograd.grad, or detach it."
             )
-        given = given.detach().cpu().numpy()
+        given = to_numpy(given)
     try:
         array = np.asarray(given)
         if array.dtype.kind not in "iuf":
@@ -234,7 +233,7 @@ def _checked_values(name: str, given: Any) -> np.ndarray:
         raise TypeError(
             f"`params` has {name} = {reprlib.repr(given)}: give finite real numbers, one or an array."
         ) from None
-    if np.ma.is_masked(given):
+    if type(given) is not np.ndarray and np.ma.is_masked(given):
         raise ValueError(f"`params` has {name} with masked entries: fill them, or leave these trajectories out.")
     if not array.size:
         raise ValueError(f"`params` has no values of {name}: give one at least.")

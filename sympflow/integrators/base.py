@@ -53,11 +53,17 @@ class FixedStep(Integrator):
 
     finds_events: ClassVar[bool] = True
     on_grid: ClassVar[bool] = True
+    follows: ClassVar[bool] = False
+    """True if gradients flow to parameters through its compiled loops."""
     breakdown: ClassVar[Failure] = Failure.NON_FINITE
     """The meaning of a run that cannot go on."""
 
     def __post_init__(self) -> None:
         check_dt(self.dt)
+
+    def check_followed(self, problem: Problem) -> None:
+        if not self.follows or self.overrides("step"):
+            super().check_followed(problem)
 
     def check_store(self) -> None:
         if self.in_another_time:

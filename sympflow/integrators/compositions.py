@@ -258,14 +258,9 @@ class KineticPotential(Composition):
         return np.concatenate([q, p], axis=-1), np.concatenate([U, P], axis=-2)
 
     def kernel_by(self, compensated: bool, names: tuple[str, ...]) -> Kernel:
-        system = self.system
-        if system.symbols is None:
-            raise NotCompiled(f"`system` {system.name!r} is not symbolic.")
-        if system.kinetic_timed:
-            raise NotCompiled(f"`system` {system.name!r} has a kinetic energy that depends on t.")
-        kernel = _splitting_loops()(system, names).kernel(self.scheme, compensated)
-        kernel.check_reverse()
-        return kernel
+        if self.system.kinetic_timed:
+            raise NotCompiled(f"`system` {self.system.name!r} has a kinetic energy that depends on t.")
+        return _splitting_loops()(self.system, names).kernel(self.scheme, compensated)
 
     def kernel(self, compensated: bool) -> Kernel:
         return _splitting_loops()(self.system).kernel(self.scheme, compensated)

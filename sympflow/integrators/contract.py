@@ -139,7 +139,7 @@ class Problem:
     parameter_values: np.ndarray | None = None
     """For each trajectory the values (k, N) of the parameters of `system.symbols.parametric`; None: the system's."""
     followed: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters whose gradients are wanted, tensors (N,), by name: `parameter_values` then are their values."""
+    """Tensors that broadcast with the batch, by the names of parameters: `parameter_values` then are their values."""
     progress: Progress | None = None
     """Told how much of the time from t0 to t1 is done."""
     store: RunStore | None = None
@@ -230,7 +230,7 @@ class Integrator:
         """Raise a ValueError where gradients do not flow to parameters."""
         raise ValueError(
             f"`params` has {', '.join(problem.followed)}, to which no gradient flows through method {self.name!r}: use "
-            "a splitting method on the splitting 'kinetic', such as 'kahan_li8', or detach them."
+            "a splitting method on the splitting 'kinetic', such as 'kahan_li8', a Gauss method, or detach them."
         )
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:

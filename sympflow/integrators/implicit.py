@@ -15,7 +15,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Failure, Problem, method_class
-from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops
+from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, followed_loops
 
 _BUTCHER = "J. C. Butcher, Implicit Runge–Kutta processes, Math. Comp. 18 (1964) 50–64"
 _SYMPLECTIC = (
@@ -61,6 +61,7 @@ class Gauss(FixedStep):
     compiles: ClassVar[bool] = True
     takes_friction: ClassVar[bool] = True
     takes_driving: ClassVar[bool] = True
+    follows: ClassVar[bool] = True
     breakdown: ClassVar[Failure] = Failure.UNSOLVED
     tableau: ClassVar[Tableau]
 
@@ -95,16 +96,19 @@ class Gauss(FixedStep):
     def own_stepper(self, problem: Problem) -> Stepper:
         from sympflow.kernels.newton import implicit_kernel
 
-        told: list[str] = []
+        given, told = (problem.system, self.tableau, bool(self.compensated)), list[str]()
+        arrays = GaussSteps(problem.system, self.tableau)
+        if problem.followed:
+            return Stepper(self, problem, arrays, followed_loops(lambda names: implicit_kernel(*given, names), problem))
         kernel = compiled_loops(
-            lambda: implicit_kernel(problem.system, self.tableau, bool(self.compensated)),
+            lambda: implicit_kernel(*given),
             problem.y0,
             problem.backend,
             self.compensated,
             told=told,
             system=problem.system,
         )
-        return Stepper(self, problem, GaussSteps(problem.system, self.tableau), kernel, told)
+        return Stepper(self, problem, arrays, kernel, told)
 
 
 class GaussSteps(ArraySteps):

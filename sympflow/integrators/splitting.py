@@ -12,7 +12,6 @@ import numpy as np
 
 from sympflow.arguments import check_flag, check_one_of, check_positive
 from sympflow.arrays import Array, to_numpy
-from sympflow.compiler import NotCompiled
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
 from sympflow.integrators.base import FixedStep
@@ -30,7 +29,7 @@ from sympflow.integrators.contract import (
 )
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
-from sympflow.integrators.steppers import Stepper, compiled_loops
+from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
 from sympflow.schemes import CORRECTORS, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
@@ -174,6 +173,7 @@ class Splitting(FixedStep):
     arrays_only: ClassVar[Any] = Trait(lambda splitting, clock: clock.arrays_only)
     tangent_holds: ClassVar[Any] = Trait(lambda splitting, clock: clock.tangent_holds)
     breakdown: ClassVar[Any] = Trait(lambda splitting, clock: splitting.breakdown or clock.breakdown)
+    follows: ClassVar[Any] = Trait(lambda splitting, clock: clock.on is None)
     takes_friction: ClassVar[Any] = Trait(lambda splitting, clock: splitting.takes_friction and clock.on is None)
     takes_driving: ClassVar[Any] = Trait(lambda splitting, clock: splitting.takes_driving and clock.on is None)
 
@@ -257,17 +257,6 @@ class Splitting(FixedStep):
             lambda: composition.kernel(bool(self.compensated)), problem.y0, problem.backend, self.compensated
         )
         return kernel is not None and bool(kernel.loops.values)
-
-    def check_followed(self, problem: Problem) -> None:
-        if self.clock != "physical" or self.overrides("step"):
-            super().check_followed(problem)
-        try:
-            if problem.backend == "array":
-                raise NotCompiled("`backend` is 'array'.")
-            self.composed(problem.system).kernel_by(bool(self.compensated), tuple(problem.followed))
-        except NotCompiled as error:
-            names = ", ".join(problem.followed)
-            raise ValueError(f"`params` has {names}, to which no gradient flows: {error} Detach them.") from error
 
     def longest_step(self, system: HamiltonianSystem) -> float:
         return self.composed(system).longest_step() if self.clock == "physical" else super().longest_step(system)
@@ -363,12 +352,13 @@ class Splitting(FixedStep):
             yield differentiated(jacobian, times, states, lengths)
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        composition = self.composed(problem.system)
-        told: list[str] = []
+        composition, told = self.composed(problem.system), list[str]()
         compensated = bool(self.compensated)
-        names = tuple(problem.followed)
+        if problem.followed:
+            kernel = followed_loops(lambda names: composition.kernel_by(compensated, names), problem)
+            return Stepper(self, problem, composition, kernel)
         kernel = compiled_loops(
-            lambda: composition.kernel_by(compensated, names) if names else composition.kernel(compensated),
+            lambda: composition.kernel(compensated),
             problem.y0,
             problem.backend,
             compensated,

@@ -207,6 +207,23 @@ def compiled_loops(
     return None
 
 
+def followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
+    """The compiled loops, that `make` gives for names, of a run through which gradients flow to parameters."""
+    names, array = tuple(problem.followed), problem.backend == "array"
+    try:
+        if reason := "`backend` is 'array'." if array else _no_loops_for(problem.y0, problem.system):
+            raise NotCompiled(reason)
+        if problem.system.symbols is None:
+            raise NotCompiled(f"`system` {problem.system.name!r} is not symbolic.")
+        loops = make(names)
+        loops.check_reverse()
+        return loops.varied(problem.parameter_values)
+    except NotCompiled as error:
+        raise ValueError(
+            f"`params` has {', '.join(names)}, to which no gradient flows: {error} Detach them."
+        ) from error
+
+
 def _no_loops_for(y0: Array, system: Any) -> str | None:
     """Why a tensor needs array operations, if it does."""
     if system is None:

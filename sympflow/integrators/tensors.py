@@ -32,6 +32,7 @@ def rolled_out(
 
 def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
     """`Stepper.shorter` of tensors, differentiable by their lengths too."""
+    _check_steps(stepper)
     if transformed(y, h):
         return _by_arrays(stepper, y, h, t, *stepper.followed)
     if y.dtype != torch.float64:
@@ -54,18 +55,22 @@ class _Rolled:
         self.finite = self.recorded.n_finite.reshape(y0.shape[:-1])
         return torch.from_numpy(self.recorded.states.swapaxes(0, 1).reshape(len(self.save), *y0.shape))
 
-    def pulled(self, cotangents: Tensor, k: int) -> list[Tensor]:
-        """The cotangents of y0 and of k numbers of each trajectory."""
+    def pulled(self, cotangents: Tensor, followed: Sequence[Tensor]) -> list[Tensor]:
+        """The cotangents of y0 and of the tensors that are followed."""
         shape = cotangents.shape[1:]
         given = to_numpy(cotangents).reshape(len(self.save), -1, shape[-1]).swapaxes(0, 1)
-        of_states, of_values = self.recorded.pulled(given, k > 0)
-        numbers: Sequence[Tensor] = ()
-        if weights := self.stepper.kernel.tensors:
-            pieces = torch.from_numpy(of_values[:, 0]).split([x.numel() for x in weights])
-            numbers = [x.reshape(w.shape).to(w.dtype) for x, w in zip(pieces, weights, strict=True)]
-        elif k:
-            numbers = torch.from_numpy(of_values).unbind()
-        return [torch.from_numpy(of_states.reshape(shape)), *numbers]
+        of_states, of_values = self.recorded.pulled(given, bool(followed))
+        found = [torch.from_numpy(of_states.reshape(shape))]
+        if self.stepper.kernel.tensors:
+            ends = np.cumsum([w.numel() for w in followed])
+            pieces = [(x, w.shape) for x, w in zip(np.split(of_values[:, 0], ends), followed, strict=False)]
+        else:
+            pieces = [(x, shape[:-1]) for x in of_values]
+        for (x, of), w in zip(pieces, followed, strict=False):
+            number = torch.from_numpy(x.reshape(of))
+            number = number if w.shape == of else number.sum_to_size(w.shape)
+            found.append(number if w.dtype == number.dtype and w.device.type == "cpu" else number.to(w))
+        return found
 
     def by_arrays(self, y0: Tensor, *followed: Tensor) -> Tensor:
         y, states, wanted = y0, [], self.save.tolist()
@@ -90,7 +95,9 @@ class _Run(torch.autograd.Function):
         inputs, wanted = ctx.saved_tensors, ctx.needs_input_grad[1:]
         if torch.is_grad_enabled() or transformed(cotangents):
             return None, *_pulled(ctx.run.by_arrays, inputs, wanted, cotangents)
-        return None, *ctx.run.pulled(cotangents, len(inputs) - 1 if any(wanted[1:]) else 0)
+        if any(wanted[1:]):
+            return None, *ctx.run.pulled(cotangents, inputs[1:])
+        return None, *ctx.run.pulled(cotangents, ()), *[None for _ in wanted[1:]]
 
 
 class _Step(torch.autograd.Function):
@@ -111,13 +118,18 @@ def _by_arrays(stepper: Any, y: Tensor, h: Any, t: Any, *followed: Tensor) -> Te
     """A step by tensor operations, of which torch follows the parameters too."""
     if not stepper.problem.followed:  # weights are read by the functions themselves
         return stepper.arrays.step(y, h, t)
-    if stepper.system.friction:
-        raise ValueError(
-            "`params` with gradients of a system with friction have no second derivatives, and none at times between "
-            "two steps: choose times on the grid, or detach them."
-        )
+    _check_steps(stepper)
     batch = stepper.problem.y0.shape[:-1]
-    return stepper.kernel.stepped(y, h, t, [x.reshape(batch) for x in followed])
+    return stepper.kernel.stepped(y, h, t, [x.to(y).expand(batch) for x in followed])
+
+
+def _check_steps(stepper: Any) -> None:
+    """Refuse steps by tensor operations where gradients flow to parameters and there are none."""
+    if stepper.problem.followed and not stepper.kernel.steps_tensors:
+        raise ValueError(
+            "`params` with gradients have no second derivatives, and none at times between two steps, where a system "
+            "has friction or the method is no splitting method: choose times on the grid, or detach them."
+        )
 
 
 def _pulled(

@@ -10,7 +10,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -42,7 +42,7 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
-from sympflow.integrators.steppers import Stepper, compiled_loops
+from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
 Visit = Callable[[Interpolant], bool]
@@ -560,18 +560,22 @@ class FixedGrid(ExplicitStep, FixedStep):
     """
 
     compiles: ClassVar[bool] = True
+    follows: ClassVar[bool] = True
     tableau: ClassVar[Tableau]
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        told: list[str] = []
+        told, arrays = list[str](), OwnSteps(self, problem)
+        make = partial(self.compiled, problem.system, "explicit_kernel", self.tableau)
+        if problem.followed:
+            return Stepper(self, problem, arrays, followed_loops(make, problem))
         kernel = compiled_loops(
-            lambda: self.compiled(problem.system, "explicit_kernel", self.tableau),
+            make,
             problem.y0,
             problem.backend,
             told=told,
             system=problem.system,
         )
-        return Stepper(self, problem, OwnSteps(self, problem), kernel, told)
+        return Stepper(self, problem, arrays, kernel, told)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return {"force_evaluations": len(self.B) * (n_steps + n_extra), "hessian_evaluations": 0}

@@ -14,7 +14,7 @@ from sympflow.compiler.control import DOUBLE, POINTER, Code, Rows, Value
 from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, terms_of
+from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, parametric, terms_of
 from sympflow.kernels.runs import Numbers, Room, begun, finished
 from sympflow.lazy import kept
 
@@ -30,9 +30,12 @@ class Tableau(Protocol):
     B: Any
 
 
-def explicit_kernel(system: HamiltonianSystem, tableau: Tableau) -> OneStepKernel:
-    """The compiled loops of a method on a symbolic system; a ValueError says why there are none."""
-    field = field_of(system)
+def explicit_kernel(system: HamiltonianSystem, tableau: Tableau, names: tuple[str, ...] = ()) -> OneStepKernel:
+    """The compiled loops of a method on a symbolic system; a ValueError says why there are none.
+
+    With `names` these parameters are numbers of columns.
+    """
+    field = field_of(system, names)
     kind = _InMemory if field.large else _InRegisters
     A = tuple(tuple(map(float, row)) for row in tableau.A)
     code = kind(field, A, tuple(map(float, tableau.B)))
@@ -50,14 +53,16 @@ class Field:
     Terms of a kind are looped over if it is `large`; its code reads arrays `data`: those of the terms, and Γ.
     """
 
-    def __init__(self, system: HamiltonianSystem) -> None:
+    def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
         symbols, force = system.spelled, system.external_force
         assert symbols is not None
         forces = () if force is None else force.expressions
         if force is not None and not (forces and system.symbols):
             raise NotCompiled("`system` has a force by a function, which is not compiled: use backend='array'.")
         self.large = is_large(symbols) and force is None
-        symbols = symbols if is_large(symbols) else symbols.parametric
+        if force is not None and names:
+            raise NotCompiled("`system` has a force that is none of H.")
+        symbols = parametric(symbols, names)
         self.lettered = lettered(symbols, [symbols.H, *forces])
         self.ndof = system.ndof
         self._damping = system.friction.matrix(self.ndof) if system.friction else None
@@ -175,20 +180,29 @@ class _InRegisters(_Explicit):
 
     @cached_property
     def _reverse(self) -> Program:
-        """The cotangents of a state, from it, the numbers of a step, and the cotangents of the state after it."""
+        """The cotangents of what a step is made of, from that, and from the cotangents of the state after it."""
         count = self.n_out + 1 + self.parameters + len(self.lettered.letters) * len(self.A) + len(self.field.rates)
-        found = adjoint(traced(self._advanced, *(f"x_{i}" for i in range(count))))
-        return Program(found.inputs, found.outputs[: self.n_out])
+        return adjoint(traced(self._advanced, *(f"x_{i}" for i in range(count))))
 
     @property
     def reversible(self) -> bool:  # type: ignore[override]
         return len(self.field.program) * len(self.A) <= MOST_REVERSED
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
     ) -> tuple[list[Value], list[Value]]:
-        found = self._reverse(*values, *self._numbers(numbers, step.code, step), *cotangents)
-        return [step.code.operand(x, values[0].type) for x in found], []
+        n, program = self.n_out, self._reverse
+        program = Program(program.inputs, program.outputs[: n + (1 + self.parameters) * slopes])
+        found = program(*values, *self._numbers(numbers, step.code, step), *cotangents)
+        found = [step.code.operand(x, values[0].type) for x in found]
+        return found[:n], found[n + 1 :]
 
 
 class _InMemory(_Explicit):

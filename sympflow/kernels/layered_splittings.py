@@ -23,7 +23,7 @@ from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.kernels.rollouts import LINE, Columns, SplittingRollouts, zeros
-from sympflow.kernels.runs import Numbers, step_function
+from sympflow.kernels.runs import Numbers, Room, step_function
 
 __all__ = ["LayeredCode"]
 
@@ -77,7 +77,14 @@ class LayeredCode(SplittingRollouts):
         return [fma(a, dot(row, p), x) for row, x in zip(self._potential.inverse_mass.tolist(), q, strict=True)]
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
     ) -> tuple[list[Value], list[Value]]:
         """The reverse of `stage`, which adds up the derivatives by the weights with `slopes`."""
         d = self._potential.ndof

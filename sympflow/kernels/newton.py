@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property, reduce
 from itertools import pairwise
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from sympflow.compiler.program import Program, gradient, traced
 from sympflow.hamiltonian.collocation import MOST_ITERATIONS, Tableau, stage_nodes
 from sympflow.hamiltonian.formulas import recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, terms_of
+from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, parametric, terms_of
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
 from sympflow.kernels.runs import Numbers, Room
@@ -35,14 +36,17 @@ ROUNDING = 1e-9  # increments below this that no longer shrink are rounding
 SMALLEST = 1e-150  # of a size whose reciprocal is multiplied by other numbers
 MOST_IN_REGISTERS = 4  # unknowns
 ABREAST = 4  # numbers of a row of a matrix that are changed together
+MOST_REVERSED = 40  # numbers of a state whose cotangents are in registers
 LONG = 4e6  # operations between two looks for a stop
 
 
 @kept
-def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bool = False) -> OneStepKernel:
+def implicit_kernel(
+    system: HamiltonianSystem, tableau: Tableau, compensated: bool = False, names: tuple[str, ...] = ()
+) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
 
-    NotCompiled says why there are none.
+    With `names` these parameters are numbers of columns. NotCompiled says why there are none.
     """
     written = system.spelled
     if written is None:
@@ -55,7 +59,7 @@ def implicit_kernel(system: HamiltonianSystem, tableau: Tableau, compensated: bo
         raise NotCompiled("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
     if friction.kind == 2:
         raise NotCompiled("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
-    symbols = written if is_large(written) else written.parametric
+    symbols = parametric(written, names)
     of_time = with_letters(symbols, [symbols.H])
     code = newton_code(of_time, tableau, compensated, bool(friction))
     single = newton_code(of_time, tableau, False, False) if compensated else code
@@ -87,6 +91,10 @@ class NewtonCode(OneStep):
 
     counted = True
 
+    @property
+    def reversible(self) -> bool:  # type: ignore[override]
+        return self.n_out <= MOST_REVERSED and not self.data
+
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
         self._given = lettered, tableau, compensated, damped
         self._tableau, self._compensated, self._damped = tableau, compensated, damped
@@ -113,6 +121,27 @@ class NewtonCode(OneStep):
         rows = [gradient(x, y[i:]) for i, x in enumerate(slope)]
         return Program(program.inputs, [*slope, *(entry for row in rows for entry in row)])
 
+    @cached_property
+    def _field_reversed(self) -> Program:
+        """The derivatives of J∇H·μ by the parameters, from q, p, the parameters and the letters, and from μ."""
+        symbols, n, d = self.lettered.symbols, self.n_out, self.ndof
+        program = recorded(self.lettered.expressions, (*symbols.q, *symbols.p, *self.lettered.given))
+        recording, slope = program.inputs[0].recording, gradient(program.outputs[0], program.inputs[:n])
+        mu = [recording.input(f"mu_{m}") for m in range(n)]
+        total = _total([*map(mul, mu[:d], slope[d:]), *(-(x * y) for x, y in zip(mu[d:], slope[:d], strict=True))])
+        parameters = program.inputs[n : n + self.parameters]
+        return Program([*program.inputs, *mu], gradient(total, parameters))
+
+    @cached_property
+    def _leftover(self) -> list[float]:
+        """Numbers c with Σ_i c_i A_ij = 1."""
+        return [float(x) for x in np.linalg.solve(np.array(self._tableau[0], dtype=float), np.ones(self.stages))]
+
+    def _leftovers(self, end: Sequence[Any], mu: Sequence[Any]) -> list[Any]:
+        """The cotangents of the state before a step: those of its end, λ, and Σ_i v_i, of which Aᵀv = μ − Bλ."""
+        n, pairs = self.n_out, [*zip(self._leftover, self._tableau[1], strict=True)]
+        return [x + _total([c * (mu[i * n + m] - b * x) for i, (c, b) in enumerate(pairs)]) for m, x in enumerate(end)]
+
     def _square(self, outputs: list[Any]) -> tuple[list[Any], list[list[Any]]]:
         """∇H, and ∇²H of its upper triangle."""
         n = self.n_out
@@ -134,7 +163,7 @@ class _InRegisters(NewtonCode):
         code, n, d = values[0].code, self.n_out, self.ndof
         y, errors, count = values[:n], values[n:-1], values[-1]
         column = self.column(code, numbers, step)
-        K, taken, lost = self._iterated(code, y, column)
+        K, taken, lost, *_ = self._iterated(code, y, column)
         changes = [self._changes(K[m::n]) for m in range(n)]
         if self._compensated:
             sums = [added(old, change - error) for old, change, error in zip(y, changes, errors, strict=True)]
@@ -164,8 +193,8 @@ class _InRegisters(NewtonCode):
         g = [a * x for a, x in zip(row, g, strict=True)]
         return g, [[row[i] * S[i][j] * entry[j] for j in range(n)] for i in range(n)]
 
-    def _iteration(self, y: Sequence[Any], K: Sequence[Any], column: Sequence[Any], sizes: Sequence[Any]) -> list[Any]:
-        """One of Newton's iterations: the new K, the relative size of the change, and the sizes of the variables."""
+    def _equations(self, y: Sequence[Any], K: Sequence[Any], column: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+        """The residuals of the equations for K, and the rows of their derivatives by K."""
         A, _, scale = self._tableau
         n, d, h, rows, residual = self.n_out, self.ndof, column[0], [], []
         for i in range(self.stages):
@@ -177,6 +206,11 @@ class _InRegisters(NewtonCode):
                 row = [-(h * (scale[i] * A[i][j])) * J[m][k] for j in range(self.stages) for k in range(n)]
                 row[i * n + m] = 1.0 + row[i * n + m]
                 rows.append(row)
+        return residual, rows
+
+    def _iteration(self, y: Sequence[Any], K: Sequence[Any], column: Sequence[Any], sizes: Sequence[Any]) -> list[Any]:
+        """One of Newton's iterations: the new K, the relative size of the change, and the sizes of the variables."""
+        residual, rows = self._equations(y, K, column)
         sizes = sizes or self._sizes(y, residual)
         change = _eliminated(rows, residual, list(sizes) * self.stages)
         new = [k - x for k, x in zip(K, change, strict=True)]
@@ -219,8 +253,62 @@ class _InRegisters(NewtonCode):
         names = [f"{letter}_{i}" for letter, m in (("y", n), ("c", size), ("K", N), ("w", n)) for i in range(m)]
         return traced(first, *names[: n + size]), traced(other, *names)
 
-    def _iterated(self, code: Code, y: Sequence[Value], column: Sequence[Value]) -> tuple[list[Value], Value, Value]:
-        """The K of a step, the iterations taken, and where they were in vain."""
+    @cached_property
+    def _pull(self) -> Program:
+        """The cotangents of a state, and the μ, from it, the numbers, K, the sizes, and those of the state after it."""
+        n, N, size, s = self.n_out, self.unknowns, self.size + self.stages * len(self.lettered.letters), self.stages
+
+        def pulled(*numbers: Any) -> list[Any]:
+            y, column, K, sizes, end = (numbers[i:j] for i, j in pairwise([0, n, n + size, n + size + N, -n, None]))
+            if self._damped:
+                decay = column[self.size - self.ndof : self.size]
+                end = (*end[: n - self.ndof], *map(mul, end[n - self.ndof :], decay))
+            rows = self._equations(y, K, column)[1]
+            transposed = [[row[i] for row in rows] for i in range(N)]
+            mu = _eliminated(transposed, [b * x for b in self._tableau[1] for x in end], [1.0 / w for w in sizes] * s)
+            return [*self._leftovers(end, mu), *mu]
+
+        names = [
+            f"{letter}_{i}" for letter, m in (("y", n), ("c", size), ("K", N), ("w", n), ("e", n)) for i in range(m)
+        ]
+        return traced(pulled, *names)
+
+    def adjoint(
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
+    ) -> tuple[list[Value], list[Value]]:
+        code, type, n, y = step.code, values[0].type, self.n_out, values[: self.n_out]
+        K, *_, sizes, column = self._iterated(code, y, self.column(code, numbers, step))
+        found = [code.operand(x, type) for x in self._pull(*y, *column, *K, *sizes, *cotangents[:n])]
+        zero, of_stages = code.constant(0.0, type), []
+        for i in range(self.stages if slopes else 0):
+            Y = [y[m] + _total([a * K[j * n + m] for j, a in enumerate(self._tableau[0][i])]) for m in range(n)]
+            of_stages.append(self._pulled_field(Y, column, i, found[(1 + i) * n :][:n]))
+        of_numbers = [code.operand(_total(each), type) for each in zip(*of_stages, strict=True)]
+        return [*found[:n], *[zero] * (self.n_values - n)], of_numbers
+
+    def _pulled_field(self, Y: Sequence[Any], column: Sequence[Any], stage: int, mu: Sequence[Any]) -> list[Any]:
+        """The cotangents of the parameters for those, μ, of the residuals of a stage."""
+        d, letters = self.ndof, len(self.lettered.letters)
+        start = self.size + stage * letters
+        if self._damped:
+            growths = column[self.size - 2 * d * (self.stages + 1) :]
+            grown, shrunk = (growths[d * (i * (self.stages + 1) + stage) :][:d] for i in range(2))
+            Y, mu = [*Y[:d], *map(mul, Y[d:], shrunk)], [*mu[:d], *map(mul, mu[d:], grown)]
+        factor = column[0] * self._tableau[2][stage]
+        given = [*column[1 : 1 + self.parameters], *column[start : start + letters]]
+        return [factor * x for x in self._field_reversed(*Y, *given, *mu)]
+
+    def _iterated(
+        self, code: Code, y: Sequence[Value], column: list[Value]
+    ) -> tuple[list[Value], Value, Value, list[Value], list[Value]]:
+        """The K of a step, the iterations taken, where they were in vain, the sizes, and all numbers."""
         N, type = self.unknowns, y[0].type
         first, other = self._iterations
         if self.driven:
@@ -241,7 +329,7 @@ class _InRegisters(NewtonCode):
                 variable.value = x
             taken.value, small.value, size.value = count, done, found
             active.value = now & ~done & (found < np.inf) & (count < MOST_ITERATIONS)
-        return [x.value for x in K], taken.value, ~small.value
+        return [x.value for x in K], taken.value, ~small.value, sizes, column
 
 
 class _InMemory(NewtonCode):
@@ -266,6 +354,18 @@ class _InMemory(NewtonCode):
 
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
         """One step in place: y, the errors of compensated sums, and the count of iterations."""
+        code, n = room.code, self.n_out
+        taken, small, arguments = self._solved(room, numbers, step)
+        K, column = arguments[1:3]
+        with code.over(n) as m:
+            self._advance(room, K, m, small)
+        if self._damped:
+            with code.over(self.ndof) as m:
+                room.store(room.load(m + self.ndof) * code.load(column, m + (self.size - self.ndof)), m + self.ndof)
+        room.add(taken, room.size - 1)
+
+    def _solved(self, room: Room, numbers: Numbers, step: Value) -> tuple[Value, Value, list[Value]]:
+        """The iterations of a step, if they were not in vain, and the arguments of `_iterated`."""
         code, n, N = room.code, self.n_out, self.unknowns
         K, column, M, Y, g, S, sizes = (room.part(sum(self._sizes[:i]), room.work) for i in range(7))
         given = self.column(code, numbers, step)
@@ -286,12 +386,56 @@ class _InMemory(NewtonCode):
 
         start = [code.constant(np.inf), code.constant(0.0), code.constant(0, BOOL)]
         _, taken, small = code.repeat(start, iteration)
-        with code.over(n) as m:
-            self._advance(room, K, m, small)
+        return taken, small, arguments
+
+    def adjoint(
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
+    ) -> tuple[list[Value], list[Value]]:
+        code, n, d, N, wide, zero = step.code, self.n_out, self.ndof, self.unknowns, self._wide, step.code.constant(0.0)
+        for k, x in enumerate(values[:n]):
+            room[0].store(x, k)
+        *_, arguments = self._solved(room[0], numbers, step)
+        state, K, column, M, Y, _, _, sizes, *_ = arguments
+        end = cotangents[:n]
         if self._damped:
-            with code.over(self.ndof) as m:
-                room.store(room.load(m + self.ndof) * code.load(column, m + (self.size - self.ndof)), m + self.ndof)
-        room.add(taken, room.size - 1)
+            end = [*end[:d], *(x * code.load(column, self.size - d + k) for k, x in enumerate(end[d:]))]
+        code.outlined("filled", arguments, self._filled)
+        with code.over(N) as i:
+            code.store(1.0 / code.load(sizes, i), sizes, i)
+            with code.over(i) as j:
+                a, b = code.load(M, i * wide + j), code.load(M, j * wide + i)
+                code.store(b, M, i * wide + j)
+                code.store(a, M, j * wide + i)
+        for k, weight in enumerate(self._tableau[1]):
+            for r, x in enumerate(end):
+                code.store(weight * x, M, (k * n + r) * wide + N)
+        code.outlined("solve", [M, sizes], self._solve, rare=False)
+        mu = [code.load(M, k * wide + N) for k in range(N)]
+        totals = [code.variable(zero) for _ in range(self.parameters if slopes else 0)]
+        if slopes:
+            letters, A = len(self.lettered.letters), code.array("A", np.ravel(self._tableau[0]))
+            scale = code.array("scale", self._tableau[2])
+            with code.over(self.stages) as i:
+                self._fill_stage(code, state, K, column, Y, A, i)
+                weights = [code.load(M, (i * n + m) * wide + N) for m in range(n)]
+                if self._damped:
+                    grown = self._growths(code, column, i)[0]
+                    weights = [*weights[:d], *(x * code.load(grown, m) for m, x in enumerate(weights[d:]))]
+                given = [code.load(column, 1 + k) for k in range(self.parameters)]
+                given += [code.load(column, i * letters + (self.size + k)) for k in range(letters)]
+                found = self._field_reversed(*(code.load(Y, m) for m in range(n)), *given, *weights)
+                factor = code.load(column) * code.load(scale, i)
+                for total, x in zip(totals, found, strict=True):
+                    total.value = total.value + factor * x
+        found = self._leftovers(end, mu)
+        return [*found, *[zero] * (self.n_values - n)], [x.value for x in totals]
 
     def _store_letters(self, code: Code, given: Sequence[Value], column: Value) -> None:
         """The letters of all stages, behind the numbers of the column."""
@@ -315,20 +459,36 @@ class _InMemory(NewtonCode):
 
     def _iterated(self, *arguments: Value) -> Value:
         """One of Newton's iterations in memory; the relative size of the change."""
+        state, K, _, M, _, _, _, sizes, *_ = arguments
+        code, N, wide = K.code, self.unknowns, self._wide
+        self._filled(*arguments)
+        code.outlined("solve", [M, sizes], self._solve, rare=False)
+        with code.over(N) as i:
+            code.store(code.load(K, i) - code.load(M, i * wide + N), K, i)
+        return self._relative_size_in_memory(code, state, K, M)
+
+    def _fill_stage(self, code: Code, state: Value, K: Value, numbers: Value, Y: Value, A: Value, i: Value) -> None:
+        """The state of a stage into Y."""
+        n, d = self.n_out, self.ndof
+        with code.over(n) as m:
+            x = code.variable(code.load(state, m))
+            with code.over(self.stages) as j:
+                x.value = x.value + code.load(A, i * self.stages + j) * code.load(K, j * n + m)
+            code.store(x.value, Y, m)
+        if self._damped:
+            shrunk = self._growths(code, numbers, i)[1]
+            with code.over(d) as m:
+                code.store(code.load(Y, m + d) * code.load(shrunk, m), Y, m + d)
+
+    def _filled(self, *arguments: Value) -> None:
+        """The equations for K into M, and the sizes of the unknowns."""
         state, K, numbers, M, Y, g, S, sizes, *data = arguments
         code, n, d, N, wide = K.code, self.n_out, self.ndof, self.unknowns, self._wide
         A, scale = code.array("A", np.ravel(self._tableau[0])), code.array("scale", self._tableau[2])
         h = code.load(numbers)
         with code.over(self.stages) as i:
-            with code.over(n) as m:
-                x = code.variable(code.load(state, m))
-                with code.over(self.stages) as j:
-                    x.value = x.value + code.load(A, i * self.stages + j) * code.load(K, j * n + m)
-                code.store(x.value, Y, m)
-            if self._damped:
-                grown, shrunk = self._growths(code, numbers, i)
-                with code.over(d) as m:
-                    code.store(code.load(Y, m + d) * code.load(shrunk, m), Y, m + d)
+            self._fill_stage(code, state, K, numbers, Y, A, i)
+            grown, shrunk = self._growths(code, numbers, i) if self._damped else (Y, Y)
             self._fill_slopes(code, numbers, Y, g, S, i, data)
             if self._damped:
                 _scale_slopes(code, d, grown, shrunk, g, S)
@@ -350,10 +510,6 @@ class _InMemory(NewtonCode):
                         code.store(entries, row, j * n + k * type.width)
                 code.store(code.load(row, unknown) + 1.0, row, unknown)
         self._fill_sizes(code, state, K, M, sizes)
-        code.outlined("solve", [M, sizes], self._solve, rare=False)
-        with code.over(N) as i:
-            code.store(code.load(K, i) - code.load(M, i * wide + N), K, i)
-        return self._relative_size_in_memory(code, state, K, M)
 
     def _growths(self, code: Code, numbers: Value, i: Value) -> tuple[Value, Value]:
         """The places of e^{γτ} of a stage, and of their reciprocals."""

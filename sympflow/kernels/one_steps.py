@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sympflow.kernels.reverse import Recorded
     from sympflow.kernels.terms import Terms
 
-__all__ = ["Lettered", "OneStep", "OneStepKernel", "check_size", "is_large", "lettered", "terms_of"]
+__all__ = ["Lettered", "OneStep", "OneStepKernel", "check_size", "is_large", "lettered", "parametric", "terms_of"]
 
 MOST_COMPILED = 5000  # operations of a gradient
 
@@ -47,6 +47,15 @@ def is_large(form: Any) -> bool:
     from sympflow.kernels.terms import is_large
 
     return is_large(form)
+
+
+def parametric(form: Any, names: tuple[str, ...]) -> Any:
+    """A form whose parameters are numbers of columns: those with these names, whatever their values, or as they may."""
+    if names and form.time is not None:
+        raise NotCompiled("`system` depends on t: use a splitting method.")
+    if names:
+        return form.named(names)
+    return form if is_large(form) else form.parametric
 
 
 def terms_of(lettered: Lettered) -> Terms:
@@ -82,7 +91,14 @@ class OneStep(Rollouts):
         self.lettered, self.driven, self.ndof = lettered, symbols.time is not None, symbols.ndof
         self.parameters = len(symbols.parameters)
         self.size = 1 + self.parameters + self.driven + more
+        self.given = self.own = self.parameters
         super().__init__(n_values, 2 * symbols.ndof)
+
+    def own_entries(self, table: Columns, values: np.ndarray) -> Columns:
+        """The columns of trajectories with their own values of the parameters."""
+        entries = np.repeat(table[0][None], len(values), axis=0)
+        entries[:, :, 1 : 1 + self.parameters] = values[:, None]
+        return entries, table[1]
 
     def made(self, name: str, width: int) -> Callable[..., None]:
         if name != "step":
@@ -119,16 +135,27 @@ class OneStep(Rollouts):
 class OneStepKernel(Kernel):
     """Compiled loops of a method of one stage a step on one system: the code of runs, and that of single steps.
 
-    ``more(h)`` is what the method adds to the numbers of steps of lengths h (n,): (n, k).
+    ``more(h)`` is what the method adds to the numbers of steps of lengths h (n,): (n, k). Each trajectory may have its
+    `own` values of the parameters (N, m).
     """
 
-    def __init__(self, code: OneStep, single: OneStep, more: Callable[[np.ndarray], np.ndarray] | None = None) -> None:
-        self._code, self._single, self._more = code, single, more
+    def __init__(
+        self,
+        code: OneStep,
+        single: OneStep,
+        more: Callable[[np.ndarray], np.ndarray] | None = None,
+        own: np.ndarray | None = None,
+    ) -> None:
+        self._code, self._single, self._more, self._own = code, single, more, own
+
+    def varied(self, values: np.ndarray) -> OneStepKernel:
+        """The loops of batches whose trajectories have these values (m, N)."""
+        return OneStepKernel(self._code, self._single, self._more, np.ascontiguousarray(values.T, dtype=np.float64))
 
     def _numbers(self, h: np.ndarray, t: np.ndarray) -> np.ndarray:
         """The numbers (n, size) of steps of lengths h (n,), at the times t (n,) less those of whole steps before."""
-        values = self._code.lettered.symbols.values
-        numbers = [h[:, None], np.array([values]).repeat(len(h), axis=0)]
+        values = np.array([self._code.lettered.symbols.values]) if self._own is None else self._own
+        numbers = [h[:, None], values[np.arange(len(h)) % len(values)]]
         if self._code.driven:
             numbers.append(t[:, None])
         if self._more is not None:
@@ -147,7 +174,8 @@ class OneStepKernel(Kernel):
         """`runs`, as a run of which cotangents can be pulled back: after `check_reverse`."""
         from sympflow.kernels.reverse import Recorded
 
-        return Recorded(self._code, self._columns(task), task.y0, task.n_steps, task.save, self._code.work)
+        y0 = task.y0 if self._own is None else np.concatenate([task.y0, self._own], axis=1)
+        return Recorded(self._code, self._columns(task), y0, task.n_steps, task.save, self._code.work)
 
     def runs(self, task: Task) -> Run:
         code = self._code

@@ -254,6 +254,11 @@ class Kernel(ABC):
         """Raise a ValueError, with the reason, where runs cannot be differentiated: see `SplittingKernel.recorded`."""
         raise NotCompiled("`y0` requires gradients, and the loops of the method have no reverse: use backend='array'.")
 
+    @property
+    def steps_tensors(self) -> bool:
+        """True if `stepped` makes a step by tensor operations, of values of parameters too."""
+        return False
+
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The `step` from each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d); None where they are not compiled."""
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from sympflow.kernels.protocol import Batch
 from sympflow.kernels.rollouts import aligned, zeros
-from sympflow.kernels.threads import BLOCK, NEVER, given, run_rows
+from sympflow.kernels.threads import BLOCK, NEVER, given, run_one, run_rows
 
 __all__ = ["Recorded"]
 
@@ -31,12 +32,12 @@ class Recorded:
         self._n_steps, self._save = n_steps, given(save, np.int64)
         self._link = (len(table[1]) if isinstance(table, tuple) else table.shape[1]) - 2
         self._given, self._n_own = self._y0, (own := y0.shape[1] - code.n_out)
-        if own and len(y0) == 1:  # a table of all trajectories, which is prepared once
+        if own and len(y0) == 1 and not isinstance(table, tuple):  # one of all trajectories, which is prepared once
             self._table, self._y0 = table.copy(), self._y0[:, : code.n_out]
             self._table[len(table) - own :] = y0[0, code.n_out :, None]
         self._own = self._y0.shape[1] > code.n_out
         self.states = np.empty((len(y0), len(save), code.n_out))
-        self.n_finite = np.full(len(y0), n_steps)
+        self.n_finite = np.zeros(len(y0), dtype=np.int64)
         size = self._link * code.n_values
         self._whole = n_steps * size * len(y0) <= MOST_KEPT
         steps = n_steps if self._whole else max(1, SEGMENT // size // min(ROWS, len(y0)), int(n_steps**0.5) // ROWS)
@@ -46,13 +47,16 @@ class Recorded:
 
     def _each(self, call: Callable[[slice, np.ndarray], None]) -> None:
         """Call a function of slices of rows, which are the same whatever the threads."""
-        n = len(self._y0)
+        n, work = len(self._y0), self._n_steps * self._work
+        if n <= ROWS:
+            run_one(partial(call, slice(0, n)), n * work)
+            return
 
         def pieces(i: slice, stop: np.ndarray) -> None:
             for k in range(i.start // BLOCK, -(-i.stop // BLOCK)):
                 call(slice(k * ROWS, min((k + 1) * ROWS, n)), stop)
 
-        run_rows(pieces, -(-n // ROWS) * BLOCK, self._n_steps * self._work * min(n, ROWS) / BLOCK, None)
+        run_rows(pieces, -(-n // ROWS) * BLOCK, work * ROWS / BLOCK, None)
 
     def _width(self, n_rows: int) -> int:
         return self._code.lanes if n_rows >= self._code.fewest else 1
@@ -71,15 +75,18 @@ class Recorded:
         """Run some rows, segment by segment: each begins with what the one before leaves."""
         code, n = self._code, i.stop - i.start
         history = self._histories[i.start] = []
-        running = np.empty((n, 0 if self._whole else code.n_values))
-        alive, found = np.ones(n, dtype=bool), np.empty(n, dtype=np.int64)
+        running, finite = np.empty((n, 0 if self._whole else code.n_values - code.counted)), self.n_finite[i]
         for first, to in pairwise(self._ends):
             history.append(self._room(n, to) if self._whole else running.copy())
             chosen, kept = self._saved(first, to), history[-1] if self._whole else None
-            batch = Batch(self._y0[i], to, self._save[chosen], self.states[i, chosen], found, first, running)
-            code.run(self._table, batch._replace(stop=stop, kept=kept))
-            self.n_finite[i] = np.where(alive, found, self.n_finite[i])
-            alive &= found >= to
+            found = np.empty_like(finite) if first else finite
+            states = self.states[i, chosen]
+            code.run(
+                self._table,
+                Batch(self._y0[i], to, self._save[chosen], states, found, first, running, np.zeros(n), stop, kept),
+            )
+            if first:
+                finite[:] = np.where(finite < first, finite, found)
         if self._n_steps == 0:
             self.states[i] = self._y0[i, None, : code.n_out]
 
@@ -90,23 +97,20 @@ class Recorded:
         """
         if (self.n_finite < self._n_steps).any():
             return self._pulled_apart(cotangents, slopes)
-        code, N = self._code, len(self._y0)
-        of_states = np.zeros((N, code.n_values))
-        found = np.zeros((self._link + 2, code.size, N if slopes else 0))
-        sums: dict[int, np.ndarray] = {}
+        if not self._n_steps:
+            return cotangents.sum(1), self._nothing()
+        pieces: dict[int, tuple[np.ndarray, ...]] = {}
 
         def piece(i: slice, stop: np.ndarray) -> None:
-            of_states[i], lanes, sums[i.start] = self._pulled(i, cotangents[i], slopes, stop)
-            found[..., i] = lanes
+            pieces[i.start] = self._pulled(i, cotangents[i], slopes, stop)
 
-        if self._n_steps:
-            self._each(piece)
-        of_states = of_states[:, : code.n_out]
+        self._each(piece)
+        rows, values = zip(*(pieces[k] for k in sorted(pieces)), strict=True)
+        of_states = rows[0] if len(rows) == 1 else np.concatenate(rows)
+        of_states = of_states[:, : self._code.n_out]
         if n := int(self._save.searchsorted(0, "right")):
-            of_states += cotangents[:, :n].sum(1)
-        if slopes and self._n_own:
-            return of_states, code.pulled(self._full_table(), found)
-        return of_states, np.sum([sums[k] for k in sorted(sums)], axis=0) if sums else self._nothing()
+            of_states = of_states + cotangents[:, :n].sum(1)
+        return of_states, np.concatenate(values).T if self._n_own else np.sum(values, axis=0)
 
     def _nothing(self) -> np.ndarray:
         code = self._code
@@ -127,43 +131,34 @@ class Recorded:
             of_values[..., rows if self._n_own else slice(None)] += more
         return of_states, of_values
 
-    def _full_table(self) -> np.ndarray:
-        """The table, with the own values of all rows (n, m, N)."""
-        if not self._own:
-            return self._table[..., None]
-        values = self._y0[:, self._code.n_out :].T
-        table = np.repeat(self._table[..., None], len(self._y0), axis=2)
-        table[len(table) - len(values) :] = values[:, None]
-        return table
-
     def _pulled(self, i: slice, given: np.ndarray, slopes: bool, stop: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Pull cotangents of the outputs of some rows back to their first states, columns (m, size, n), and weights."""
+        """Pull cotangents of the outputs of some rows back to their first states, and to own values or weights."""
         code, table, n = self._code, self._table, i.stop - i.start
-        width, y0 = self._width(n), self._y0[i]
+        width, y0, starts = self._width(n), self._y0[i], self._given[i]
         own = " own" if self._own else ""
-        values = y0[:, code.n_out :]
-        entries, kinds = code.own_columns(table, values, width) if own else code.prepared(table)
+        entries, kinds = code.own_columns(table, y0[:, code.n_out :], width) if own else code.prepared(table)
         groups = -(-n // width)
-        found = zeros(groups * len(kinds) * code.size * width if slopes else 1)
+        found = zeros(groups * len(kinds) * code.size * width if slopes and self._n_own else 1)
+        numbers = found if isinstance(table, tuple) else table
         rows = np.zeros((groups * width, code.n_values))  # lanes without a trajectory have no cotangents
+        values = np.zeros((len(rows), self._n_own))
+        if n < len(rows):
+            starts = np.concatenate([starts, starts[-1:].repeat(len(rows) - n, axis=0)])
         name = ("slopes" if slopes else "reverse") + own
         for (first, to), before in reversed([*zip(pairwise(self._ends), self._histories[i.start], strict=True)]):
             kept = before
             if not self._whole:
                 kept = self._room(n, to - first)
                 nothing = np.empty((n, 0, code.n_out)), np.empty(n, dtype=np.int64)
-                batch = Batch(y0, to, self._save[:0], *nothing, first, before, stop=stop, kept=kept)
+                batch = Batch(y0, to, self._save[:0], *nothing, first, before, np.zeros(n), stop, kept)
                 code.run(table, batch, False)
             chosen = slice(*self._save.searchsorted((first, to), "right").tolist())
             later, count = self._save[chosen], chosen.stop - chosen.start
-            outputs = np.zeros((len(rows), count, given.shape[-1]))
-            outputs[:n] = given[:, chosen]
+            outputs = np.ascontiguousarray(given[:, chosen])
+            if n < len(rows):
+                outputs = np.concatenate([outputs, np.zeros((len(rows) - n, *outputs.shape[1:]))])
             if not count:
                 later = outputs = NEVER
-            arguments = entries, kinds, len(kinds) - 2, kept, rows, len(rows), first, to, later, count, outputs, found
-            code.call(name, width, *arguments)
-        if not slopes:
-            return rows[:n], np.zeros(0), code.summed(kinds)
-        lanes = found.reshape(groups, len(kinds), code.size, width)
-        of_columns = lanes.transpose(1, 2, 0, 3).reshape(len(kinds), code.size, groups * width)[..., :n]
-        return rows[:n], of_columns, code.summed(kinds)
+            sizes = len(rows), first, to, later, count, outputs
+            code.call(name, width, entries, kinds, len(kinds) - 2, kept, rows, *sizes, found, numbers, starts, values)
+        return rows[:n], values[:n] if self._n_own else code.summed(kinds)

@@ -14,7 +14,7 @@ from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.protocol import Batch
-from sympflow.kernels.runs import BLOCK, Memory, Numbers, map_function, reverse_function, run_function
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "zeros"]
@@ -85,6 +85,8 @@ class Rollouts(ABC):
         True if the last of `n_values` is a count, which is no part of the running state.
     closing : bool
         False if outputs are never closed, so that the code need not hold a stage for that.
+    given, own : int
+        Numbers of which a column is made, and how many of them, the last ones, each trajectory may have of its own.
     """
 
     size: Any
@@ -99,6 +101,7 @@ class Rollouts(ABC):
     block = BLOCK
     counted = False
     closing = True
+    given = own = 0
 
     _given: tuple[Any, ...]
     """The arguments of the class."""
@@ -116,10 +119,21 @@ class Rollouts(ABC):
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
     ) -> tuple[list[Value], list[Value]]:
         """The reverse of `stage`, where there is one: see `sympflow.kernels.runs.Adjoint`."""
         raise NotImplementedError
+
+    def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> Sequence[Value]:
+        """The cotangents of values that each trajectory has: see `sympflow.kernels.runs.OfValues`."""
+        return cotangents[: self.own]
 
     def over(self, each: Callable[..., None], numbers: Numbers, kind: Value, step: Value) -> None:
         """One column of many states: see `sympflow.kernels.runs.Over`."""
@@ -177,7 +191,8 @@ class Rollouts(ABC):
             return map_function(*sizes, self.stage, width, memory, self.timed)
         own, kept = bool(own_tables), what == "kept"
         if what in ("reverse", "slopes"):
-            return reverse_function(*sizes, self.adjoint, width, own, what == "slopes", self.closing)
+            asked = what == "slopes", self.closing, memory is not None
+            return reverse_function(*sizes, self.adjoint, width, own, *asked, self.of_values, self.given, self.own)
         look, every = (None, self.block) if self.every is None else (self.look, self.every)
         over = self.over if self.chunked and not kept else None
         return run_function(*sizes, self.stage, width, own, memory, look, every, self.closing, over, kept)

@@ -43,11 +43,14 @@ Numbers = Callable[..., Any]
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]
 """``stage(values, numbers, kind, step)``: the values after a stage; `kind` is an integer, which the column has, and
 `step` tells after how many whole steps the stage is executed."""
-Adjoint = Callable[[list[Value], list[Value], Numbers, Value, Value, bool], tuple[list[Value], list[Value]]]
-"""``adjoint(values, cotangents, numbers, kind, step, slopes)``: the cotangents of the values before a stage, and with
-`slopes` of its numbers, for those of the values after it."""
+Adjoint = Callable[..., tuple[list[Value], list[Value]]]
+"""``adjoint(values, cotangents, numbers, kind, step, slopes, *room)``: the cotangents of the values before a stage, and
+with `slopes` of its numbers, for those of the values after it; with the room, where states are in memory."""
 MemoryStage = Callable[["Room", Numbers, Value, Value], None]
 """The same of a state in memory, which it changes in place."""
+OfValues = Callable[[Sequence[Value], Sequence[Value], Value], Sequence[Value]]
+"""``of_values(given, cotangents, kind)``: the cotangents of the values of parameters that are the last numbers given,
+for those of the numbers that a stage reads."""
 Over = Callable[[Callable[..., None], Numbers, Value, Value], None]
 """``over(each, numbers, kind, step)``: a stage of many states, ``each(body)`` executes ``body(values)`` for each of
 them; what is the same for all is computed before."""
@@ -108,7 +111,7 @@ def run_function(
         state of the run. Ends soon if ``stop[0]`` becomes 1.
     """
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
-    types += MEMORY if memory else [POINTER] if kept else []
+    types += [POINTER] * kept + (MEMORY if memory else [])
     code = begun("run", types)
     table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite, running, keeps, stop = (
         code.arguments[:15]
@@ -118,7 +121,7 @@ def run_function(
     if width > 1 and memory is None and over is not None:
         state = _Chunks(code, n_values, n_out, width, own, over)
     else:
-        state = _state(code, n_values, n_out, width, memory, code.arguments[15:], before=width == 1)
+        state = _state(code, n_values, n_out, width, memory, code.arguments[15 + kept :], before=width == 1)
     chunks = state.chunks if isinstance(state, _Chunks) else 1
     with code.over(groups(code, n_rows, width * chunks)) as group:
         begin = group * (width * chunks)
@@ -144,13 +147,13 @@ def run_function(
             with code.over(k * link) as i:
                 at = j.value
                 if history is not None:
-                    history.keep(state.values(), made + i)
+                    state.record(history, made + i)
                 state.change(column, at, step.value)
                 j.value = code.select(code.apply("eq", (at, link)), one, at + 1)
                 step.value = code.select(code.apply("eq", (j.value, link)), step.value + 1, step.value)
             state.end()
             if history is not None:
-                history.keep(state.values(), made + k * link)
+                state.record(history, made + k * link)
             if closing:
                 with code.over(closes):
                     state.change(column, link + 1, step.value, end=True)
@@ -192,17 +195,28 @@ def reverse_function(
     own: bool = False,
     slopes: bool = False,
     closing: bool = True,
+    memory: bool = False,
+    of_values: OfValues | None = None,
+    n_given: int = 0,
+    n_own: int = 0,
 ) -> Callable[..., None]:
     """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
 
     Returns a function of addresses and integers (table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved,
-    out, slopes): `rows` (n_rows, n_values) are the cotangents of the running states after `n_steps` steps, and become
-    those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than `first`. With `slopes`, what a
-    table of its own for every `width` trajectories would hold is added to that array, in the same order.
+    out, slopes, columns, starts, values): `rows` (n_rows, n_values) are the cotangents of the running states after
+    `n_steps` steps, and become those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than
+    `first`. With `slopes`, what a table of its own for every `width` trajectories would hold is added to that array, in
+    the same order. The numbers of columns are made of others, `columns` (n_given, link + 2), of which the last ones
+    follow each state in `starts` (n_rows, n_out + n_own): `values` (n_rows, n_own) are the cotangents of these, by
+    `of_values`. Where states were in `memory`, `MEMORY` follows, and `adjoint` is given the room too.
     """
-    types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER]
+    types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, *[POINTER] * 5]
+    types += MEMORY if memory else []
     code = begun("reverse", types)
-    table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, derivatives = code.arguments
+    table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved, out, derivatives, columns, starts, values = (
+        code.arguments[:15]
+    )
+    more = Memory(code, width, code.arguments[15:], False).rooms[:1] if memory else []
     one, zero = code.constant(1, INT), code.constant(0, INT)
     lanes, outputs = Lanes(code, n_values, width), Lanes(code, n_out, width)
     with code.over(groups(code, n_rows, width)) as group:
@@ -215,7 +229,7 @@ def reverse_function(
         n, saved = code.variable(n_steps), code.variable(n_saved)
 
         def pulled(j: Value, step: Value, state: list[Value], given: list[Value]) -> list[Value]:
-            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step, slopes)
+            of_state, of_numbers = adjoint(state, given, column.numbers(j), column.kind(j), step, slopes, *more)
             for i, x in enumerate(of_numbers if slopes else ()):
                 at = j * (size * width) + i * width
                 code.store(code.load(found, at, x.type) + x, found, at)
@@ -233,8 +247,8 @@ def reverse_function(
                 given += [code.constant(0.0, given[0].type)] * (n_values - n_out)
                 if closing:
                     given = pulled(link + 1, n.value, history.state(s.value), given)
-                for x, more in zip(cotangents, given, strict=True):
-                    x.value = x.value + more
+                for x, change in zip(cotangents, given, strict=True):
+                    x.value = x.value + change
             to = code.apply("max", (last(), first))
             r, step = code.variable(link), code.variable(n.value)
             with code.over((n.value - to) * link):
@@ -247,6 +261,18 @@ def reverse_function(
                 r.value = code.select(opens, link, r.value)
             n.value = to
         lanes.store([x.value for x in cotangents], rows, begin, n_rows, one, zero)
+        if slopes and n_own:
+            assert of_values is not None
+            behind, stride = Lanes(code, n_own, width), code.constant(n_out + n_own, INT)
+            own_values = behind.loaded(starts, begin, n_rows, stride, code.constant(n_out, INT))
+            totals = [code.variable(code.constant(0.0, lanes.type)) for _ in range(n_own)]
+            with code.over(link + 2) as j:
+                shared = [code.load(columns, (link + 2) * r + j) for r in range(n_given - n_own)]
+                numbers = [*(code.splat(x, width) for x in shared), *own_values]
+                of_column = [code.load(found, (j * size + i) * width, lanes.type) for i in range(size)]
+                for total, slope in zip(totals, of_values(numbers, of_column, column.kind(j)), strict=True):
+                    total.value = total.value + slope
+            behind.store([x.value for x in totals], values, begin, n_rows, one, zero)
     return finished(code)
 
 
@@ -397,6 +423,12 @@ class _Registers:
     def values(self) -> list[Value]:
         return [x.value for x in self._state]
 
+    def record(self, history: _History, s: Value) -> None:
+        """Keep the state before stage s."""
+        start = history.place(s)
+        for i, x in enumerate(self._state):
+            self.code.store(x.value, start, i * self._lanes.width)
+
     def look(self, look: Callable[[Any], Any]) -> None:
         assign(self._state, look(self.values()))
 
@@ -433,13 +465,11 @@ class _History:
         self.code, self._n, self._width, self._size = code, n_values, width, n_values * width
         self._place = code.at(place, group * ((stages + 1) * self._size))
 
-    def keep(self, values: Sequence[Value], s: Value) -> None:
-        start = self.code.at(self._place, s * self._size)
-        for i, x in enumerate(values):
-            self.code.store(x, start, i * self._width)
+    def place(self, s: Value) -> Value:
+        return self.code.at(self._place, s * self._size)
 
     def state(self, s: Value) -> list[Value]:
-        start, type = self.code.at(self._place, s * self._size), Type("double", self._width)
+        start, type = self.place(s), Type("double", self._width)
         return [self.code.load(start, i * self._width, type) for i in range(self._n)]
 
 
@@ -456,10 +486,9 @@ class Memory:
         self.code, self.width, self._remembers = code, width, before
         self.n_values, self.n_out, work, data = arguments
         self.count = code.constant(width, INT)
-        rooms = [code.at(work, self.n_values * (i * width)) for i in range(4)]
-        self._running, self._end, self._before = (
-            Room(code, width, x, rooms[3], self.n_values, data) for x in rooms[:3]
-        )
+        places = [code.at(work, self.n_values * (i * width)) for i in range(4)]
+        self.rooms = [Room(code, width, x, places[3], self.n_values, data) for x in places[:3]]
+        self._running, self._end, self._before = self.rooms
 
     def place(self, room: Room, k: Value) -> Value:
         """The address of the first number of trajectory k."""
@@ -480,6 +509,11 @@ class Memory:
 
     def change(self, column: Callable[..., Any], j: Value, step: Value, end: bool = False) -> None:
         column(j, self._end if end else self._running, step)
+
+    def record(self, history: _History, s: Value) -> None:
+        start = history.place(s)
+        with self._blocks() as (i, type):
+            self.code.store(self.code.load(self._running.state, i, type), start, i)
 
     def look(self, look: Callable[[Any], Any]) -> None:
         look(self._running)

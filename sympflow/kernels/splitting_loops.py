@@ -396,6 +396,10 @@ class SplittingKernel(Kernel):
         code: Any = self._functions()
         return Recorded(code, table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
 
+    @property
+    def steps_tensors(self) -> bool:
+        return not self.loops.friction
+
     def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
         """A step of tensors, with `values` of the parameters, by tensor operations: after `check_reverse`."""
         rows = self.loops.rows(replace(step_table(self.scheme), more=None))[..., 0]
@@ -420,7 +424,9 @@ class SplittingKernel(Kernel):
         """States with the values of their trajectories behind them."""
         if self._values is None:
             return y
-        return np.concatenate([y, np.tile(self._values, (len(y) // len(self._values), 1))], axis=1, dtype=np.float64)
+        values, times = self._values, len(y) // len(self._values)
+        values = values if times == 1 else np.tile(values, (times, 1))
+        return np.concatenate([y, values], axis=1, dtype=np.float64)
 
     def _functions(self) -> SplittingRollouts:
         return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, **self._of_kind)

@@ -22,7 +22,7 @@ from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gra
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, step_function
+from sympflow.kernels.runs import Numbers, Room, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
@@ -387,7 +387,7 @@ class SplittingCode(SplittingRollouts):
         self.timed = splitting.timed
         self.chunked = self.timed or not splitting.polynomial if chunked is None else chunked
         self.lanes = 8 if self.chunked else 16  # chunks need not wait for each other, registers side by side do
-        self._own = splitting.own
+        self.given, self.own = len(splitting.numbers), splitting.own
 
     @cached_property
     def _kinds(self) -> Sequence[Any]:
@@ -397,7 +397,7 @@ class SplittingCode(SplittingRollouts):
     def size(self) -> int:
         """Numbers of a column that the code reads."""
         if self.timed:
-            letters = len(self._splitting.parameters) - self._own
+            letters = len(self._splitting.parameters) - self.own
             return len(self._splitting.numbers) - letters + CLOCK
         return max(len(kind.table.outputs) for kind in self._kinds)
 
@@ -439,7 +439,7 @@ class SplittingCode(SplittingRollouts):
     @cached_property
     def _clock(self) -> slice:
         """The places of the numbers of the time in a column: when the kick is, when step 0 begins, how long one is."""
-        end = self.size - self._own
+        end = self.size - self.own
         return slice(end - CLOCK, end)
 
     def _lettered(self, time: Any, given: Sequence[Any]) -> list[Any]:
@@ -469,7 +469,14 @@ class SplittingCode(SplittingRollouts):
         self._adjoints  # noqa: B018
 
     def adjoint(
-        self, values: list[Value], cotangents: list[Value], numbers: Numbers, kind: Value, step: Value, slopes: bool
+        self,
+        values: list[Value],
+        cotangents: list[Value],
+        numbers: Numbers,
+        kind: Value,
+        step: Value,
+        slopes: bool,
+        *room: Room,
     ) -> tuple[list[Value], list[Value]]:
         code, type = step.code, values[0].type
         zero = code.constant(0.0, type)
@@ -485,25 +492,23 @@ class SplittingCode(SplittingRollouts):
                     result.value = x
         return [x.value for x in found[: self.n_values]], [x.value for x in found[self.n_values :]]
 
-    def pulled(self, table: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-        """From cotangents (m, size, N) of the numbers of columns to those of the values (n, N) that end a table."""
+    def of_values(self, given: Sequence[Value], cotangents: Sequence[Value], kind: Value) -> list[Value]:
         if self.timed:
-            return np.asarray(slopes[:, self.size - self._own :].sum(0))
-        found = np.zeros((self._own, slopes.shape[2]))
-        for k, columns in self._columns_of_kinds(self._kinds_of(table[..., 0])):
-            program = self._of_tables[k]
-            n = len(program.inputs) - len(table)
-            with np.errstate(all="ignore"):
-                rows = program(*table[:, columns], *slopes[columns, :n].swapaxes(0, 1))
-            for i, row in enumerate(rows):
-                found[i] += np.sum(row, axis=0)
-        return found
+            return [*cotangents[self.size - self.own :]]
+        code, type = kind.code, cotangents[0].type
+        found = [code.variable(code.constant(0.0, type)) for _ in range(self.own)]
+        for k, program in enumerate(self._of_tables):
+            n = len(program.inputs) - len(given)
+            with code.given(code.apply("eq", (kind, k))) if len(self._of_tables) > 1 else nullcontext():
+                for result, x in zip(found, program(*given, *cotangents[:n]), strict=True):
+                    result.value = code.operand(x, type)
+        return [x.value for x in found]
 
     @cached_property
     def _of_tables(self) -> list[Program]:
         """From the numbers of a table, and cotangents of those of a column, to cotangents of the values."""
         programs = [adjoint(kind.table) for kind in self._kinds]
-        return [Program(each.inputs, each.outputs[len(each.outputs) - self._own :]) for each in programs]
+        return [Program(each.inputs, each.outputs[len(each.outputs) - self.own :]) for each in programs]
 
     def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
         """A step of length h at t from tensors (..., 2d), by tensor operations.
@@ -532,7 +537,7 @@ class SplittingCode(SplittingRollouts):
         if what != "step":
             return super().made(name, width)
         kick = kicks_of(self._splitting.level, len(self._splitting.monomials))[0]
-        powers = [1, *kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self._own]
+        powers = [1, *kick.powers, *((1, 0, 0) if self.timed else ()), *[0] * self.own]
         last, table = len(self._kinds) - 1, self._kinds[-1].table
 
         def column(time: Value, *given: Value) -> list[Any]:
@@ -544,7 +549,7 @@ class SplittingCode(SplittingRollouts):
         def stage(values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
             return self._executed(last, values, [numbers(i) for i in range(len(table.outputs))])
 
-        own_numbers = self._own if own else 0
+        own_numbers = self.own if own else 0
         return step_function(self.n_values, self.n_out, powers, own_numbers, column, stage, width, self.place)
 
     # tables -------------------------------------------------------------------------------------------------------
@@ -593,7 +598,7 @@ class SplittingCode(SplittingRollouts):
         """The numbers of the columns of trajectories with their own values of the parameters."""
         if isinstance(table, tuple):
             return super().own_entries(table, values)
-        kinds, n = self._kinds_of(table), len(table) - self._own
+        kinds, n = self._kinds_of(table), len(table) - self.own
         values = np.broadcast_to(values.T[:, None], (values.shape[1], len(kinds), len(values)))
         rows = [*table[:n, :, None], *values]
         return np.moveaxis(self._entries(rows, kinds, values.shape[2:]), -1, 0), kinds
