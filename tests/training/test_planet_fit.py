@@ -15,6 +15,7 @@ def flow():
     return train(OUTER, KeplerFit(222.0, **SMALL))
 
 
+@pytest.mark.filterwarnings("ignore:`dt` .* is long")
 def test_trained_coordinates_are_better_than_standard_ones(flow, tmp_path):
     """Over ten times as long as it was trained for; a step is the same, a kick and a drift."""
     given = {"t_span": (0, 3e7), "save_every": 100, "on_domain_exit": "ignore"}
