@@ -155,7 +155,17 @@ class KeplerFlow(SystemFlow):
     def frame(self) -> Frame:
         return self._binding.parts
 
+    def check_system(self, system: HamiltonianSystem) -> None:
+        super().check_system(system)
+        self._frame_of(system)
+
     def _take(self, system: HamiltonianSystem) -> None:
+        frame = self._frame_of(system)
+        self.periods = tuple(frame.periods.tolist()) if self.periods is None else self.periods
+        self._binding.bind(system, frame)
+
+    def _frame_of(self, system: HamiltonianSystem) -> Frame:
+        """The frame of a system, whose planets are on the orbits for which the numbers hold."""
         frame = frame_of(system.local, system.y0)
         if frame is None or not frame.jacobi:
             raise ValueError(
@@ -163,15 +173,15 @@ class KeplerFlow(SystemFlow):
                 "HamiltonianSystem.planets."
             )
         frame.check("sympflow")
-        self.periods = tuple(frame.periods.tolist()) if self.periods is None else self.periods
-        off = np.abs(np.array(self.periods) / frame.periods - 1)
+        periods = np.array(frame.periods if self.periods is None else self.periods)
+        off = np.abs(periods / frame.periods - 1)
         if off.max() > SAME_ORBITS:
             i = int(np.argmax(off))
             raise ValueError(
                 f"`system` {system.name!r} has body {i + 1} on another orbit, of period {frame.periods[i]:g}, than the "
-                f"flow was trained for, {self.periods[i]:g}: train one by sympflow.train(system)."
+                f"flow was trained for, {periods[i]:g}: train one by sympflow.train(system)."
             )
-        self._binding.bind(system, frame)
+        return frame
 
     def _number(self) -> Tensor:
         return self.kicks

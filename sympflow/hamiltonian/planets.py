@@ -7,7 +7,7 @@ which its motion is Kepler's with μ, and the rest of H, the interaction: a pote
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
 
@@ -18,11 +18,11 @@ from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, concatenate, like, masked, stack, to_numpy
 from sympflow.compiler.functions import apply
 from sympflow.compiler.program import Program, gradient, tangent, traced
-from sympflow.hamiltonian.bodies import Pairs, PairsHamiltonian, checked_column
+from sympflow.hamiltonian.bodies import MOST_SPELLED_PAIRS, Pairs, PairsHamiltonian, checked_column
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
-from sympflow.hamiltonian.local import checked_params, numbered, parsed
+from sympflow.hamiltonian.local import MOST_SPELLED, checked_params, numbered, parsed
 from sympflow.hamiltonian.recorded import NotRecorded
 from sympflow.schemes import Substeps
 
@@ -454,11 +454,35 @@ class PlanetsHamiltonian(PairsHamiltonian):
         """The reason why methods of other splittings have no compiled kicks; "" if they have."""
         if self.felt is not None:
             return "bodies without mass"
-        return "" if self.extra is None else "an `extra` potential"
+        few = self.ndof <= MOST_SPELLED and self.n_bodies * (self.n_bodies - 1) // 2 <= MOST_SPELLED_PAIRS
+        return "" if self.extra is None or few else "an `extra` potential of many bodies"
+
+    @property
+    def in_terms(self) -> bool:  # type: ignore[override]
+        return self.extra is not None
 
     @property
     def is_few(self) -> bool:
-        return not self.arrays_only and super().is_few
+        return self.felt is None and self.extra is None and super().is_few
+
+    def written_potential(
+        self,
+        q: Sequence[sp.Expr],
+        softening: sp.Expr,
+        columns: Sequence[Sequence[sp.Expr]],
+        c: Mapping[sp.Symbol, sp.Expr],
+        box: Sequence[sp.Expr] = (),
+    ) -> sp.Expr:
+        V = super().written_potential(q, softening, columns, c, box)
+        if self.extra is None:
+            return V
+        own = {letter: sp.Symbol(f"{name}_", real=True) for name, letter in self._letters.items()}
+        own |= {self._letters["G"]: c[self.c[0]], self._letters["m"]: columns[0][0]}
+        for i in range(1, self.n_bodies):
+            x = [q[3 * i + k] - q[k] for k in range(3)]
+            put = dict(zip(self._places, (*x, sp.sqrt(sp.Add(*(y**2 for y in x)))), strict=True))
+            V += columns[0][i] * self.extra.xreplace({**own, **put})
+        return V
 
     @property
     def _all_at_once(self) -> bool:

@@ -374,6 +374,14 @@ def test_other_methods_take_the_system_as_pairs(method):
     assert np.abs(runs[0].y[:, -1] - near)[:12].max() < (0.1 if method in ("verlet", "dop853") else 1e-6)
 
 
+@pytest.mark.parametrize("method", ["srkn11b", "takahashi_imada", "gauss_legendre6", "rk4", "log_kahan_li8"])
+def test_other_methods_have_compiled_steps_with_an_extra_potential(method):
+    """Whose parameters are values that `with_params` changes."""
+    for system in (EXTRA, EXTRA.with_params(k=2e-5)):
+        runs = [solve(system, method, (0, 1000.0), dt=50.0, backend=b) for b in ("compiled", "array")]
+        assert np.abs(runs[0].y - runs[1].y).max() < 40 * 20 * EPS * np.abs(system.y0).max()
+
+
 def test_any_star_and_bodies_in_pairs_are_planets():
     with pytest.warns(RuntimeWarning, match="orbits that cross"):
         sol = solve(systems.outer_solar_system(), "kepler_aba864", (0, 20_000.0), dt=100.0)
