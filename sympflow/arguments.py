@@ -129,6 +129,8 @@ def check_t_eval(t_eval: Any, t0: float, t1: float) -> np.ndarray:
     if times.size and _proper(times, t0, t1):
         return times
     low, high = min(t0, t1), max(t0, t1)
+    if not np.isfinite(times).all():
+        raise ValueError("`t_eval` must be finite: drop the times that are NaN or infinite.")
     if times.size and not (times.min() >= low and times.max() <= high):
         raise ValueError(f"`t_eval` must lie within `t_span`, [{low:g}, {high:g}]: extend `t_span` or drop times.")
     if (np.diff(times) * (1 if t1 >= t0 else -1) < 0).any():

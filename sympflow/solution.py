@@ -13,7 +13,7 @@ import numpy as np
 
 from sympflow.arguments import check_flag, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
-from sympflow.hamiltonian.scales import known_scale, weights
+from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
 from sympflow.show.cards import Card, Shown
 from sympflow.show.pictures import KINDS, trajectory_figure
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 LARGE = 2_000_000
 """Numbers of a solution beyond which its card has no energy error."""
+LOOKED_AT = 64  # outputs at which the terms of H are looked at
 
 
 @dataclass(repr=False)
@@ -183,7 +184,17 @@ class Solution(Shown):
 
     def energy_scale(self) -> np.ndarray:
         """The scale of the energy errors of each trajectory, (...); see `sympflow.metrics.energy.energy_scale`."""
-        return known_scale(self.system, to_numpy(self.y0), self.t_span[0], _energy(self, self.y0, self.t_span[0]))
+        few, y0 = slice(None, None, -(-max(1, len(self.t)) // LOOKED_AT)), to_numpy(self.y0)[..., None, :]
+        y, t = y0, np.array(self.t_span[:1])
+        if self.system.energy_scale is None:
+            y, t = np.concatenate([y0, to_numpy(self.states)[..., few, :]], axis=-2), np.append(t, self.t[few])
+        H, y, t = _energy(self, y, t), y.astype(float), np.broadcast_to(t, y.shape[:-1])
+        with np.errstate(all="ignore"):
+            if self.rows is None or self.rows.uniform:
+                sizes = size_of_terms(self.system, y, t)
+            else:
+                sizes = self.rows.sizes_of_terms(y, t)
+        return known_scale(self.system, np.moveaxis(H, -1, 0), np.moveaxis(sizes, -1, 0))
 
     def card(self) -> Card:
         t, stats = self.t, self.stats
@@ -201,7 +212,7 @@ class Solution(Shown):
     def _energy_text(self) -> str:
         """The largest relative energy error in words; empty where there is none, or it takes long."""
         large = isinstance(self, StoredSolution) or math.prod(self.y.shape) > LARGE or not len(self.t)
-        if large or not self.system.keeps_energy:
+        if large or not self.system.shows_energy:
             return ""
         with warnings.catch_warnings(action="ignore"), suppress(ArithmeticError, ValueError, TypeError, RuntimeError):
             return f"{np.abs(energy_change(self)).max():.1e}, relative"
@@ -223,7 +234,7 @@ class Solution(Shown):
         """
         y, kinds = to_numpy(self.y), (kinds,) if isinstance(kinds, str) else kinds
         error = None
-        if self.system.keeps_energy:
+        if self.system.shows_energy:
             with warnings.catch_warnings(action="ignore"):
                 error = energy_change(self).reshape(-1, len(self.t))
         heading = f"{self.system.title}, {method_text(self.integrator, self.stats.get('dt'))}"
@@ -438,7 +449,7 @@ def energy_change(sol: Solution, relative: bool = True) -> np.ndarray:
         scale = sol.energy_scale()
         if (absolute := np.isnan(scale)).any():
             warn(
-                "The energy error is absolute where H(y0) is 0 but for rounding: give the system an `energy_scale`.",
+                "The energy error is absolute where all terms of H are 0: give the system an `energy_scale`.",
                 RuntimeWarning,
             )
         compared = error / np.where(absolute, 1.0, scale)[..., None]

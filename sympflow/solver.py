@@ -35,7 +35,6 @@ from sympflow.arrays import (
     readable,
     to_numpy,
 )
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import run_and_search
 from sympflow.integrators.choosing import check_tolerance, choose_method, step_for, with_start, with_step
 from sympflow.integrators.contract import Failure, Integrator, Interrupted, Outcome, Problem
@@ -59,7 +58,7 @@ from sympflow.integrators.problems import (
 from sympflow.integrators.progress import Asked, Progress
 from sympflow.integrators.registry import build, check_applies, get, naming_plugin
 from sympflow.solution import Solution, StoredSolution, energy_change, joined
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -69,7 +68,7 @@ FIRST_WINDOW = 4096  # steps of the first of the ever longer runs to an infinite
 
 
 def solve(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | Array | None = None,
@@ -209,6 +208,12 @@ def solve(
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     system.check_times(t0, t1)
+    if type(t_span) is list and type(y0) is tuple and t0 and len(y0) == 2 and 0 == y0[0] < y0[1]:
+        warn(
+            f"`t_span` {t_span} and `y0` {y0} look interchanged: the order is solve(system, method, t_span, y0). If "
+            "this is meant, pass a tuple as `t_span`.",
+            RuntimeWarning,
+        )
     if integrator is None:
         simple = events is None and store is None and params is None and not dense_output
         integrator, chosen = choose_method(system, y_start, options, tol, simple, flows=params is None)
@@ -252,10 +257,12 @@ def solve(
     steps_chosen = tol is not None and "tol" not in integrator.options()
     if tol is not None and steps_chosen:
         integrator = replace(integrator, dt=step_for(integrator, problem, tol, tol_of))  # type: ignore[type-var]
+        if store is None and math.isfinite(t1):
+            _check_outputs(integrator, problem, tol)
     elif system.step_is_open and readable(y_start):
         integrator = with_step(integrator, system, to_numpy(y_start))
     sol = _shown(integrator, problem, action, rows, progress)
-    if tol is not None and steps_chosen and store is None and tol_of == "energy" and system.keeps_energy:
+    if tol is not None and steps_chosen and store is None and tol_of == "energy" and system.shows_energy:
         _check_tolerance_met(sol, tol)
     if chosen is not None:
         sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"
@@ -279,6 +286,18 @@ def _shown(
     finally:
         bar.end()
     return sol
+
+
+def _check_outputs(integrator: Integrator, problem: Problem, tol: float) -> None:
+    """Refuse a tolerance for which a method takes more steps than can be stored."""
+    try:
+        check_memory(integrator, problem)
+    except ValueError as error:
+        what = "of the states, as always on the logarithmic clock, " if integrator.in_another_time else ""
+        raise ValueError(
+            f"`tol` {tol:g} {what}needs very short steps of method {integrator.label!r}, of order {integrator.order}: "
+            f"take one of higher order, or a larger `tol`. {error}"
+        ) from error
 
 
 def _check_tolerance_met(sol: Solution, tol: float) -> None:

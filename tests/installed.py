@@ -36,7 +36,8 @@ system = sympflow.HamiltonianSystem.from_sympy("p**2/2 + q**4/4", y0=[1.0, 0.0])
 sol: sympflow.Solution = sympflow.solve(system, "verlet", (0.0, 1.0), dt=0.1)
 energies: np.ndarray = np.asarray(sol.energy())
 step: float = sympflow.choose_step(system, "srkn11b", 1e-6)
-report = sympflow.compare(system, ["verlet"], t_span=(0.0, 1.0))
+report = sympflow.compare("henon-heiles", ["verlet"], t_span=(0.0, 1.0))
+named = sympflow.solve("henon-heiles", t_span=(0.0, 1.0))
 print(report.table(), energies.max(), step, sol.q.shape)
 """
 """A script of a user that `mypy --strict` must accept."""

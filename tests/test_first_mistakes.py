@@ -103,6 +103,7 @@ ANSWERED = {
         TypeError,
         "`rtol` .*fixed steps: give",
     ),
+    "functions of t": (lambda: H(dynamicsymbols("x") ** 2), TypeError, r"`expression` holds x\(t\): .*q=\[x\]"),
     "tol": (lambda: solve(H(SPRING), "rk45", y0=[1, 0], tol=1e-9), TypeError, "`tol` .*`rtol` and `atol`"),
     "keyword": (lambda: H("p**2/2 + lambda*q"), ValueError, "lambda is a word of Python"),
     "2q": (lambda: H("p**2/2 + 2q"), ValueError, r"2q lacks a sign: write 2\*q"),
@@ -127,21 +128,49 @@ def test_the_answer_names_the_remedy(call, kind, answer):
         call()
 
 
+def test_states_in_the_place_of_times_are_told():
+    with pytest.warns(RuntimeWarning, match=r"`t_span` .* look interchanged: the order is solve\(system, method"):
+        solve(SPRING, "verlet", [1.0, 0.5], (0, 10))
+    solve(SPRING, "verlet", [0, 10], (1.0, 0.5))
+    solve(SPRING, "verlet", (1, 0), (0, 10))
+
+
+def test_a_tolerance_that_needs_too_many_steps_is_the_reason():
+    with pytest.raises(ValueError, match=r"^`tol` 1e-13 of the states, as always on .* of order 2: take one of higher"):
+        solve("p1**2/2 + p2**2/2 - 1/sqrt(q1**2 + q2**2)", "log_leapfrog", (0, 20), [1, 0, 0, 0.5], tol=1e-13)
+
+
+def test_no_energy_is_shown_of_a_doubled_system():
+    """It is 0 in the physical limit, whatever the step."""
+    system = systems.decaying_orbit()
+    assert "energy" not in repr(solve(system, t_span=(0, 1)))
+    assert sympflow.compare(system, ["gauss_legendre4"], t_span=(0, 1), repeats=1).metrics[:2] == ("error", "volume")
+    coarse, fine = (sympflow.choose_step(system, "gauss_legendre6", tol, t_span=(0, 5)) for tol in (1e-4, 1e-8))
+    assert 2 < coarse / fine < 10
+
+
 def test_rooms_are_attributes():
     assert sympflow.metrics.__name__ == "sympflow.metrics"
 
 
-STIFF = "p**2/2 + {k}*q**2/2"
+STIFF = {
+    "kept": lambda w: H(f"p**2/2 + {w**2}*q**2/2"),
+    "damped": lambda w: H(f"p**2/2 + {w**2}*q**2/2", damping=0.01 * w),
+    "driven": lambda w: H(f"p**2/2 + {w**2}*q**2/2 - {w**2}*q*cos({w}*t/3)/9", time="t"),
+}
+LONG = [("verlet", 0.3), ("kahan_li8", 2.0), ("euler", 5e-4), ("rk4", 0.4), ("implicit_midpoint", 1.0)]
+TOO_LONG = [("verlet", 0.7), ("euler", 0.1), ("rk4", 1.6)]
 
 
-@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
-@pytest.mark.parametrize(("method", "z", "told"), [("verlet", 0.2, False), ("verlet", 1.2, True), ("euler", 0.1, True)])
-def test_a_step_that_is_too_long_is_told_in_any_units(method, z, told, scale):
-    system = H(STIFF.format(k=scale**2))
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        solve(system, method, (0, 50 / scale), [[0, 0], [2, 0]], dt=z / scale)
-    assert [str(w.message).startswith("`dt`") for w in caught] == [True] * told
+@pytest.mark.parametrize("w", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize("make", STIFF.values(), ids=STIFF)
+def test_a_step_that_is_too_long_is_told_in_any_units(make, w):
+    for (method, z), told in [*((row, False) for row in LONG), *((row, True) for row in TOO_LONG)]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for _ in range(2):  # the second time from memory
+                solve(make(w), method, (0, 50 / w), [[0, 0], [2, 0]], dt=z / w)
+        assert [str(each.message).startswith("`dt`") for each in caught] == [True] * 2 * told, (method, z)
 
 
 @pytest.mark.parametrize(

@@ -138,8 +138,8 @@ ARGUMENTS = {
     "t_span denormal": ({"t_span": (0, 5e-324)}, ValueError, FEW),
     # the outputs
     "t_eval beyond the end": ({"t_eval": [0.0, 2.0]}, ValueError, "`t_eval` must lie within"),
-    "t_eval infinite": ({"t_eval": [0.0, math.inf]}, ValueError, "`t_eval` must lie within"),
-    "t_eval NaN": ({"t_eval": [math.nan]}, ValueError, "`t_eval` must lie within"),
+    "t_eval infinite": ({"t_eval": [0.0, math.inf]}, ValueError, "`t_eval` must be finite"),
+    "t_eval NaN": ({"t_eval": [math.nan]}, ValueError, "`t_eval` must be finite"),
     "t_eval unordered": ({"t_eval": [0.5, 0.2]}, ValueError, "`t_eval` must be ordered"),
     "t_eval a matrix": ({"t_eval": [[0.5]]}, ValueError, "`t_eval` must be one-dimensional"),
     "t_eval a number": ({"t_eval": 0.5}, ValueError, "`t_eval` must be one-dimensional"),

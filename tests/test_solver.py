@@ -24,7 +24,7 @@ EPS = np.finfo(float).eps
 
 
 def options(method):
-    return {"rtol": 1e-10, "atol": 1e-12} if method in ADAPTIVE else {"dt": 0.05}
+    return {"rtol": 1e-10, "atol": 1e-12} if method in ADAPTIVE else {"dt": 0.04 if method == "euler" else 0.05}
 
 
 @cache

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from sympflow._version import __version__
 from sympflow.commands import learning, listings, running, studying
@@ -13,18 +14,30 @@ from sympflow.commands.console import out
 PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Options that are unknown to a command may be parameters of a system: --omega 100."""
 
+
+class Command(TyperCommand):
+    """A command that refuses an option with two values, of which the last one would count."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        order: list[Any] = self.make_parser(ctx).parse_args(args=[*args])[2]
+        for param in [p for p in order if order.count(p) > 1 and not (p.multiple or p.is_flag)][:1]:
+            several = ", its values separated by commas" if param.name == "method_names" else ""
+            raise typer.BadParameter(f"it is given {order.count(param)} times: give it once{several}.", ctx, param)
+        return super().parse_args(ctx, args)
+
+
 app = typer.Typer(no_args_is_help=True, rich_markup_mode="rich", pretty_exceptions_enable=False)
-app.command()(listings.systems)
-app.command()(listings.methods)
-app.command(context_settings=PARAMETERS)(listings.flows)
-app.command(context_settings=PARAMETERS)(running.solve)
-app.command(context_settings=PARAMETERS)(studying.compare)
-app.command(context_settings=PARAMETERS)(studying.bench)
-app.command(context_settings=PARAMETERS)(studying.stability)
-app.command(context_settings=PARAMETERS)(studying.section)
-app.command(context_settings=PARAMETERS)(running.train)
-app.command(context_settings=PARAMETERS)(running.certificate)
-app.command()(learning.learn)
+app.command(cls=Command)(listings.systems)
+app.command(cls=Command)(listings.methods)
+app.command(cls=Command, context_settings=PARAMETERS)(listings.flows)
+app.command(cls=Command, context_settings=PARAMETERS)(running.solve)
+app.command(cls=Command, context_settings=PARAMETERS)(studying.compare)
+app.command(cls=Command, context_settings=PARAMETERS)(studying.bench)
+app.command(cls=Command, context_settings=PARAMETERS)(studying.stability)
+app.command(cls=Command, context_settings=PARAMETERS)(studying.section)
+app.command(cls=Command, context_settings=PARAMETERS)(running.train)
+app.command(cls=Command, context_settings=PARAMETERS)(running.certificate)
+app.command(cls=Command)(learning.learn)
 
 
 @app.callback(invoke_without_command=True)

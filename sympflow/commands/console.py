@@ -34,23 +34,31 @@ OPTIONS = {
     "dtype": ("dtypes",),
 }
 """Arguments of the library that commands have by other names: the first one counts that the command has."""
-PHRASES = {
-    "train one by flow = sympflow.train(system) and pass flow=flow": "train one by `sympflow train` and "
+COMMANDS = {"poincare_section": "section", "work_precision": "bench", "available": "methods", "shipped_flows": "flows"}
+"""Functions of the library that are commands by other names."""
+PHRASES: dict[str, str | Callable[[re.Match[str]], str]] = {
+    r"train one by flow = sympflow\.train\(system\) and pass flow=flow": "train one by `sympflow train` and "
     "name its file, or take a method that needs none, such as gauss_legendre6",
-    "train a flow and pass flow=flow": "train one by `sympflow train`, and name its file",
-    "pass the path of a flow saved with flow.save(path)": "name a file that `sympflow train` wrote",
-    "flows from other files are read by sympflow.load": "flows from other files are named by their path",
-    "pass the states to train on, as by domain=sympflow.Box(low, high), sympflow.Ball(center, radius) or "
-    "sympflow.EnergySublevel(energy, box)": "define the system with one, under [domain] of a .toml file for instance",
-    "Pass the states themselves": "Give --batch 0",
-    "sympflow.train(system)": "`sympflow train`",
-    "flow.certificate(system)": "`sympflow certificate`",
-    "poincare_section": "`sympflow section`",
-    'damping="quadratic"': "`--drag`",
-    "period=2*np.pi": "period=6.283185307179586",
-    "period=np.inf": "`--period inf`",
+    r"train a flow and pass flow=flow": "train one by `sympflow train`, and name its file",
+    r"pass the path of a flow saved with flow\.save\(path\)": "name a file that `sympflow train` wrote",
+    r"flows from other files are read by sympflow\.load": "flows from other files are named by their path",
+    r"pass the states to train on, as by domain=sympflow\.Box.*?\(energy, box\)": "define the system with one, under "
+    "[domain] of a .toml file for instance",
+    r"Pass the states themselves": "Give --batch 0",
+    r"flow\.certificate\(system\)": "`sympflow certificate`",
+    r'damping="quadratic"': "`--drag`",
+    r"period=2\*np\.pi": "period=6.283185307179586",
+    r"period=np\.inf": "`--period inf`",
+    r"sympflow\.systems\.available\(\)": "`sympflow systems`",
+    r"\bsympflow\.(solve|train|compare|stability|learn|poincare_section|work_precision|available|shipped_flows)\b"
+    r"(\([^)]*\))?|\b(poincare_section|work_precision)\b": lambda m: f"`sympflow {COMMANDS.get(m[1] or m[3], m[1])}`",
+    r"(by |with )?(sympflow\.)?HamiltonianSystem(\.\w+(\([^)]*\))?|\([^)]*\))": "as a formula",
+    r",? or (pass|use) a SymPy expression": "",
+    r"\[('[\w-]+'(?:, '[\w-]+')*)\]": lambda m: m[1].replace("'", "").replace(", ", ","),
 }
-"""Remedies in Python, and what they are on the command line."""
+"""Remedies in Python, as patterns, and what they are on the command line."""
+OF_METHODS = "rtol", "atol", "max_step", "max_steps", "splitting", "clock", "shift", "compensated", "corrector"
+"""Options of methods, which are written behind the name of one."""
 
 
 def in_options(message: str, context: typer.Context) -> str:
@@ -67,20 +75,24 @@ def in_options(message: str, context: typer.Context) -> str:
         option = next((options[other] for other in others if other in options), None)
         if option is not None:
             options.setdefault(name, option)
-    message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", in_words(message))
+    for name in OF_METHODS if "method" in options else ():
+        options.setdefault(name, f"NAME:{name}=")
+    message = re.sub(r"`(\w+)`", lambda m: f"`{options.get(m[1], m[1])}`", in_words(message)).replace("=`", "=…`")
     given = re.compile(r"`?(?<![\w:.-])(?P<name>\w+)=(?P<value>'[^']*'|\"[^\"]*\"|True|[\d.eE+-]*\d|(?=\W|$))`?")
 
     def as_option(found: re.Match[str]) -> str:
         option, value = options.get(found["name"]), found["value"].strip("'\"")
-        return found[0] if option is None else f"`{option}`" if value in ("", "True") else f"`{option} {value}`"
+        if option is None:
+            return found[0]
+        return f"`{option}`" if value in ("", "True") else f"`{option} {value}`".replace("= ", "=")
 
     return given.sub(as_option, message)
 
 
 def in_words(message: str) -> str:
     """A message with its remedies in Python as those on the command line."""
-    for phrase, here in PHRASES.items():
-        message = message.replace(phrase, here)
+    for pattern, here in PHRASES.items():
+        message = re.sub(pattern, here, message)
     return message
 
 

@@ -19,6 +19,7 @@ from sympflow.commands.words import (
     Step,
     Systems,
     TEnd,
+    TStart,
     configured,
     interval,
     one_scene,
@@ -32,6 +33,7 @@ def solve(
     system: Systems = None,
     own: Own = None,
     method_name: OneMethod = None,
+    t_start: TStart = None,
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
@@ -86,7 +88,7 @@ def solve(
             raise ValueError(f"`--out` must end in .csv or .npz; got {str(to)!r}.")
         scene = one_scene(system, own)
         chosen = None if method_name is None else configured(method_name)
-        span = interval(scene, t_end)
+        span = interval(scene, t_start, t_end)
         times = None if n_outputs is None else _instants(*span, n_outputs)
         if to is not None:
             ready_file(to)
@@ -106,7 +108,7 @@ def solve(
         if to is not None:
             write_solution(sol, to)
         worst = "" if store is None else f" in {store}"
-        if store is None and scene.system.keeps_energy:
+        if store is None and scene.system.shows_energy:
             worst = f", largest energy error {max_energy_error(sol) if len(sol.t) else np.nan:.2e}"
         out.print(in_options(sol.message, ctx), markup=False)
         out.print(f"{len(sol.t)} outputs{worst}")

@@ -20,6 +20,7 @@ from sympflow.commands.words import (
     Step,
     Systems,
     TEnd,
+    TStart,
     configured,
     interval,
     methods,
@@ -48,6 +49,7 @@ def compare(
     systems: Systems = None,
     own: Own = None,
     method_names: Methods = "sympflow, mlp, verlet, leapfrog, rk45",
+    t_start: TStart = None,
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
@@ -96,7 +98,7 @@ def compare(
                     scene.system,
                     chosen,
                     None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()],
-                    t_span=interval(scene, t_end),
+                    t_span=interval(scene, t_start, t_end),
                     y0=start,
                     dt=dt,
                     n_outputs=n_outputs,
@@ -121,6 +123,7 @@ def bench(
     systems: Systems = None,
     own: Own = None,
     method_names: Methods = "verlet, leapfrog, blanes_moan4, srkn11b, kahan_li8, rk45, dop853, sympflow, mlp",
+    t_start: TStart = None,
     t_end: TEnd = None,
     y0: State = None,
     batch: Annotated[
@@ -156,7 +159,7 @@ def bench(
                 report = work_precision(
                     scene.system,
                     chosen,
-                    t_span=interval(scene, t_end),
+                    t_span=interval(scene, t_start, t_end),
                     y0=start,
                     batch=(1000 if batch is None and scene.system.domain is not None else batch) or None,
                     n_outputs=n_outputs,
@@ -185,6 +188,7 @@ def stability(
     steps: Annotated[
         str | None, typer.Option(help="Steps, separated by commas. Default: from half the system's to 64 times it.")
     ] = None,
+    t_start: TStart = None,
     t_end: TEnd = None,
     y0: State = None,
     dtypes: Annotated[str, typer.Option(help="float64, float32 or both, separated by a comma.")] = "float64",
@@ -220,7 +224,7 @@ def stability(
             if vary is not None:
                 name, values = varied(scene, vary)
                 family = [scene.factory(**(scene.params | {name: value})) for value in values]
-            span = None if scene.t_end is None and t_end is None else interval(scene, t_end)
+            span = None if (scene.t_end, t_start, t_end) == (None, None, None) else interval(scene, t_start, t_end)
             with progress() as say:
                 report = find_stability(
                     family,
@@ -246,6 +250,7 @@ def section(
     system: Systems = None,
     own: Own = None,
     method_name: OneMethod = None,
+    t_start: TStart = None,
     t_end: TEnd = None,
     y0: Annotated[
         list[str] | None,
@@ -303,7 +308,7 @@ def section(
         from sympflow.studies.poincare import names, poincare_section
 
         scene, chosen = one_scene(system, own), None if method_name is None else configured(method_name)
-        span = interval(scene, t_end)
+        span = interval(scene, t_start, t_end)
         start = None if energy is not None and not y0 else _starts(scene, y0, orbits, seed)
         if direction is not None and direction not in DIRECTIONS:
             raise ValueError(f"`--direction` must be one of {', '.join(DIRECTIONS)}; got {direction!r}.")

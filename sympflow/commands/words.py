@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import keyword
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from sympflow.arguments import check_t_span, is_number_word
 from sympflow.commands import completion
 from sympflow.hamiltonian.expression import FUNCTIONS
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.registry import available as available_methods
 from sympflow.integrators.registry import build
 from sympflow.systems import SYSTEMS, harmonic_oscillator
 from sympflow.systems import available as available_systems
@@ -64,6 +66,7 @@ OneMethod = Annotated[
         autocompletion=completion.one_method,
     ),
 ]
+TStart = Annotated[float | None, typer.Option(help="Start of the interval. Default: the system's.")]
 TEnd = Annotated[float | None, typer.Option(help="End of the interval. Default: the system's.")]
 State = Annotated[str | None, typer.Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
 Step = Annotated[float | None, typer.Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
@@ -172,18 +175,19 @@ def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> lis
     names, shared = _split(words or ())
     names += own or ()
     if not names:
-        raise Usage(
-            f"`system` is missing: name one of {', '.join(scene_names())}, or an own one, file.py:name or file.toml."
-        )
+        raise Usage(f"`system` is missing: {SYSTEM}.")
     try:
         parted = [_parted(name) for name in names]
         known = {p for _, factory, _ in parted for p in _defaults(factory)}
         for name in shared:
             if name not in known:
                 takes = f"its parameters are {', '.join(sorted(known))}" if known else "it has no parameters"
-                option = name.replace("_", "-")
+                option, by_case = name.replace("_", "-"), {p.lower(): p for p in known}
+                meant = MEANT.get(name.lower()) or by_case.get(name.lower())
+                meant = meant or next(iter(difflib.get_close_matches(name, known, n=1)), "")
                 raise Usage(
-                    f"`--{option}` is neither an option nor a parameter of {', '.join(names)} ({takes}): see --help."
+                    f"`--{option}` is neither an option nor a parameter of {', '.join(names)} ({takes}): "
+                    + (f"did you mean --{meant}?" if meant else "see --help.")
                 )
         return _told_apart([_scene(name, factory, pairs, shared) for name, factory, pairs in parted])
     except (ValueError, TypeError) as error:  # of what the system is made of, which is no option of the command
@@ -212,10 +216,11 @@ def one_scene(words: Sequence[str] | None, own: Sequence[str] | None = None) -> 
     return found[0]
 
 
-def interval(scene: Scene, t_end: float | None) -> tuple[float, float]:
-    """From the scene's start to the end asked for: with the scene, by --t-end, or its own."""
+def interval(scene: Scene, t_start: float | None, t_end: float | None) -> tuple[float, float]:
+    """From the start that is asked for, or the scene's, to the end: with the scene, by --t-end, or its own."""
     start, end = scene.system.t_span
-    return check_t_span((start, scene.t_end if scene.t_end is not None else t_end if t_end is not None else end))
+    asked = [at for at in (scene.t_end, t_end, end) if at is not None]
+    return check_t_span((start if t_start is None else t_start, asked[0]))
 
 
 def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
@@ -230,7 +235,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
             continue
         name, equals, value = word.partition("=")
         if not name.startswith("--"):
-            raise ValueError(f"`{name}` is not an option: see --help.")
+            raise ValueError(f"`{name}` is not an option: see --help. A formula begins with another sign than -.")
         if not equals:
             if not rest:
                 raise ValueError(f"`{name}` is not an option, or lacks its value: see --help.")
@@ -242,20 +247,35 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     return names, shared
 
 
-FORMULA = re.compile(r"\*|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
+SYSTEM = "name a scene, of those that `sympflow systems` lists, an own one, file.py:name or file.toml, or write H"
+MEANT = {
+    **dict.fromkeys(("solver", "integrator", "scheme"), "method"),
+    **dict.fromkeys(("steps", "n_steps", "step", "h", "stepsize", "step_size"), "dt"),
+    **dict.fromkeys(("t", "tmax", "t_max", "tend", "t_span", "time", "duration", "end"), "t-end"),
+    **dict.fromkeys(("t0", "start"), "t-start"),
+    **dict.fromkeys(("q0", "p0", "x0", "q", "p", "initial", "ic"), "y0"),
+    **dict.fromkeys(("output", "save", "plot", "file", "csv", "o"), "out"),
+}
+"""Options by the names that users try."""
+FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
 """A word that is H, and not the name of a scene."""
 
 
 def _formula(text: str) -> Callable[..., HamiltonianSystem]:
     """The function that makes a system of H as text, by the values of its other symbols."""
+    if "=" in text:
+        left, _, _ = text.partition("=")
+        raise Usage(f"`system` {text!r} is an equation: write its right side alone, without {left}=.")
     known = {*FUNCTIONS, "pi"}
-    symbols = re.sub(r"(?<![\w.])(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", " ", text)
+    symbols = re.sub(r"(?<![\w.])(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[²³]", " ", text)
     words = dict.fromkeys(w for w in re.findall(r"[A-Za-z_]\w*", symbols) if w not in known)
 
     def make(**values: float) -> HamiltonianSystem:
-        if missing := [f"--{name}" for name in names if name not in values]:
+        if missing := [f"--{name}" for name in names if name not in (*values, "t")]:
+            HamiltonianSystem.from_sympy(text, params=dict.fromkeys(names, 1.0))  # which says what is not understood
             raise Usage(f"`{missing[0]}` is missing, the value of a symbol in {text!r}: give it, as in {missing[0]} 1.")
-        return HamiltonianSystem.from_sympy(text, params=values)
+        driven = "t" in names and "t" not in values
+        return HamiltonianSystem.from_sympy(text, params=values, time="t" if driven else None)
 
     names = [word for word in words if not re.fullmatch(r"[qp]\d*", word)]
     if len(names) == len(words) > 0:
@@ -263,6 +283,8 @@ def _formula(text: str) -> Callable[..., HamiltonianSystem]:
             f"`system` {text!r} has no coordinates: they are q and p, or q1 … qd and p1 … pd. Write it with these in "
             f"place of {', '.join(names)}."
         )
+    if reserved := [name for name in names if keyword.iskeyword(name)]:
+        raise Usage(f"`system` has a symbol {reserved[0]!r}, which is a word of Python: give it another name.")
     given = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=float) for name in names]
     make.__signature__ = inspect.Signature(given)  # type: ignore[attr-defined]
     return make
@@ -279,12 +301,16 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
     name, *pairs = word.split(":")
     name = name.replace("_", "-")
     if name not in scene_names():
-        close = difflib.get_close_matches(name, scene_names(), n=1, cutoff=0.5)
-        hint = f"Did you mean {close[0]!r}? " if close else ""
-        raise ValueError(
-            f"`system` {name!r} is unknown. {hint}Choose from {', '.join(scene_names())}, or name an own one, "
-            "file.py:name or file.toml."
-        )
+        key, equals, value = word.partition("=")
+        if equals:
+            raise Usage(f"`system` {word!r} is no system: give a parameter as --{key} {value}.")
+        if word in available_methods():
+            raise Usage(f"`system` {word!r} is a method: give it as --method {word}.")
+        files = [str(path) for path in map(Path, (f"{word}.py", f"{word}.toml")) if path.is_file()]
+        last = name.rpartition(".")[2].lower()
+        close = files or difflib.get_close_matches(last, scene_names(), n=1, cutoff=0.5)
+        hint = f"Did you mean {close[0]!r}? Else {SYSTEM}" if close else f"{SYSTEM[0].upper()}{SYSTEM[1:]}"
+        raise ValueError(f"`system` {name!r} is unknown. {hint}.")
     return name, _making(name), [pair for pair in pairs if pair]
 
 
@@ -400,7 +426,7 @@ def state(words: str | None) -> np.ndarray | None:
     """A state from ``0.3,-0.3,0.3,0.15``."""
     if words is None:
         return None
-    return np.array([_float("--y0", word) for word in words.split(",")])
+    return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])
 
 
 def widths(words: str) -> tuple[int, ...]:

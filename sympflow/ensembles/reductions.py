@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.ensembles.chunks import Chunk
-from sympflow.hamiltonian.scales import known_scale
+from sympflow.hamiltonian.scales import known_scale, size_of_terms
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 Fields = dict[str, tuple[tuple[int, ...], np.dtype]]
@@ -102,7 +102,7 @@ class Final(Reduction):
 class EnergyError(Reduction):
     """The largest relative energy error |H(y(t)) − H(y0)| / |H(y0)| along each orbit: `energy_error`.
 
-    It is absolute where H(y0) is 0 but for rounding, and relative to the system's `energy_scale` if it has one.
+    It is relative to the `energy_scale` of `sympflow.metrics.energy`, and absolute where that is missing.
     """
 
     def check(self, system: HamiltonianSystem) -> None:
@@ -116,11 +116,14 @@ class EnergyError(Reduction):
         system = chunk.system
         with np.errstate(all="ignore"):
             H0 = np.asarray(system.hamiltonian(chunk.y0))
-            scale = np.nan_to_num(known_scale(system, chunk.y0, chunk.t_span[0], H0), nan=1.0)
-            worst = np.zeros(len(chunk))
+            worst, last = np.zeros(len(chunk)), chunk.y0
             for _, y in chunk.windows():
                 H = np.asarray(system.hamiltonian(y.swapaxes(1, 2)))
                 worst = np.maximum(worst, np.abs(H - H0[:, None]).max(axis=1, initial=0.0))
+                last = y[..., -1] if y.shape[-1] else last
+            ends = np.stack([chunk.y0, last])
+            sizes = size_of_terms(system, ends, chunk.t_span[0])
+            scale = np.nan_to_num(known_scale(system, np.asarray(system.hamiltonian(ends)), sizes), nan=1.0)
         return {"energy_error": np.where(chunk.status < 0, np.nan, worst / scale)}
 
 

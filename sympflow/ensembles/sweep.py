@@ -27,7 +27,7 @@ from sympflow.integrators.problems import check_backend, check_own_parameters
 from sympflow.integrators.provenance import provenance
 from sympflow.integrators.registry import check_applies
 from sympflow.kernels.threads import at_most
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 from sympflow.workers import LostWorkers, PickledTask, Unpicklable, checked_workers, mapped
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ _preparing = threading.Lock()
 
 
 def ensemble(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: Any = None,

@@ -22,6 +22,7 @@ from sympflow.hamiltonian.fingerprint import Identity, recognised, without_frict
 if TYPE_CHECKING:
     from sympflow.flow.known import KnownFlow
     from sympflow.hamiltonian.system import HamiltonianSystem
+    from sympflow.systems.given import GivenSystem
 
 DEFAULT_TOL = 1e-6
 """The relative energy error that the default flow of a system meets, if one does."""
@@ -193,7 +194,7 @@ HEADINGS = (
 )
 
 
-def shipped_flows(system: HamiltonianSystem | None = None, kind: str | None = None) -> ShippedFlows:
+def shipped_flows(system: GivenSystem | None = None, kind: str | None = None) -> ShippedFlows:
     """The flows that ship, the cheapest first: all, or those of a system, which is recognised by its H.
 
     Parameters

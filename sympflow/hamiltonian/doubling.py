@@ -50,6 +50,7 @@ class DoubledSystem(HamiltonianSystem):
     """
 
     _continuous = False
+    shows_energy = False
     physical: HamiltonianSystem
 
     def as_doubled(self) -> DoubledSystem:

@@ -257,6 +257,11 @@ class Hamiltonian:
         """True if H is constant along solutions: without friction, an external force or a drive."""
         return self.conservative and self.autonomous
 
+    @property
+    def shows_energy(self) -> bool:
+        """True if runs are judged by an energy that is kept: that of a doubled system is 0 in the physical limit."""
+        return self.keeps_energy
+
     def check_conservative(self, what: str, remedy: str) -> None:
         """Refuse a system with friction, for what leaves it out or does not hold with it.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ import numpy as np
 import sympy as sp
 
 from sympflow.arrays import differentiable, expanded, is_tensor, to_numpy, transformed
+from sympflow.hamiltonian.scales import size_of_terms
 from sympflow.hamiltonian.symbolic import exact, generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -130,32 +131,43 @@ class ParameterRows:
 
     def hamiltonian(self, y: np.ndarray, t: Any) -> np.ndarray:
         """H of each trajectory at its states y (*shape, ..., 2d) at times that broadcast to these: (*shape, ...)."""
+        return self._evaluated(y, t, "_hamiltonian", lambda system, y, t: system.hamiltonian(y, t))
+
+    def sizes_of_terms(self, y: np.ndarray, t: Any) -> np.ndarray:
+        """½ Σ|y_i ∂H/∂y_i| of each trajectory, at states and times as those of `hamiltonian`."""
+        return self._evaluated(y, t, "_sizes", size_of_terms)
+
+    def _evaluated(self, y: np.ndarray, t: Any, name: str, of_system: Callable[..., Any]) -> np.ndarray:
+        """A function of symbols, or else that of the system of each value, at states."""
         symbols = self.system.symbols
         if symbols is None or symbols.samples or symbols.impulses:
-            return self._one_by_one(y, np.broadcast_to(t, y.shape[:-1]))
+            each = (y, np.broadcast_to(t, y.shape[:-1]))
+            states, at = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in each)
+            found = np.empty(states.shape[:-1])
+            for index, system, _ in self.distinct():
+                found[index] = of_system(system, states[index], at[index])
+            return found.reshape(y.shape[:-1])
         more = (1,) * (y.ndim - 1 - len(self.shape))
         columns = [value.reshape(*self.shape, *more) for value in self.values.values()]
-        d = self.system.ndof
         times = () if symbols.time is None else (t,)
-        (H,) = self._function(*(y[..., i] for i in range(2 * d)), *columns, *times)
-        return np.broadcast_to(H, y.shape[:-1])
-
-    def _one_by_one(self, y: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """`hamiltonian` by the system of each value."""
-        states, times = (x.reshape(math.prod(self.shape), *x.shape[len(self.shape) :]) for x in (y, t))
-        H = np.empty(states.shape[:-1])
-        for index, system, _ in self.distinct():
-            H[index] = system.hamiltonian(states[index], times[index])
-        return H.reshape(y.shape[:-1])
+        (values,) = getattr(self, name)(*(y[..., i] for i in range(2 * self.system.ndof)), *columns, *times)
+        return np.broadcast_to(values, y.shape[:-1])
 
     @cached_property
-    def _function(self) -> Any:
+    def _hamiltonian(self) -> Any:
+        return self._generated(lambda H, y: H)
+
+    @cached_property
+    def _sizes(self) -> Any:
+        return self._generated(lambda H, y: sp.Add(*[sp.Abs(s * sp.diff(H, s)) for s in y]) / 2)
+
+    def _generated(self, of: Callable[[sp.Expr, Sequence[sp.Symbol]], sp.Expr]) -> Any:
         symbols = self.system.symbols
         assert symbols is not None
         H, values = symbols.written
         H = H.xreplace({s: value for s, value in values.items() if s.name not in self.values})
-        parameters = [sp.Symbol(name, real=True) for name in self.values]
-        return generate([printable(H)], [*symbols.q, *symbols.p, *parameters, *filter(None, [symbols.time])], "numpy")
+        parameters, y = [sp.Symbol(name, real=True) for name in self.values], [*symbols.q, *symbols.p]
+        return generate([printable(of(H, y))], [*y, *parameters, *filter(None, [symbols.time])], "numpy")
 
     def __getstate__(self) -> dict[str, Any]:
         """The definition alone: functions cannot be pickled."""

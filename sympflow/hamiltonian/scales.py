@@ -20,8 +20,8 @@ STEP = 0.05
 """Radians of the fastest motion in a default step."""
 MOST_RATES = 16  # states of a batch at which rates are taken
 
-SMALLEST_SCALE = 1e-12
-"""|H(y0)| below which an energy error is absolute, in units of Σ|y_i ∂H/∂y_i| at y0, the size of its terms."""
+SMALLEST_SCALE = 1e-3
+"""The scale of energy errors, at least, in units of the size of the terms of H along an orbit."""
 
 
 _KNOWN = Found()
@@ -122,11 +122,15 @@ def _few(y: np.ndarray) -> np.ndarray:
 
 
 def _step_at(system: Any, y: np.ndarray | None) -> float:
-    rate = 0.0
-    if system.ndof <= MOST_DENSE:
-        with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
-            rate = max(float(_rates(system, t, y).max(initial=0.0)) for t in system.probe_times())
+    rate = max(fastest_at(system, t, y) for t in system.probe_times())
     return float(f"{STEP / rate:.2g}") if 0 < STEP / max(rate, 1e-300) < 1e100 and np.isfinite(rate) else STEP
+
+
+def fastest_at(system: Any, t: float, y: np.ndarray | None) -> float:
+    """The largest rate at states y (..., 2d) at t; 0 where it is not known."""
+    with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
+        return float(_rates(system, t, y).max(initial=0.0)) if system.ndof <= MOST_DENSE else 0.0
+    return 0.0
 
 
 def _rates(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
@@ -169,11 +173,21 @@ def started(system: Any, y0: np.ndarray) -> Any:
     return _STARTED.of(system, (dt, rows[highest].tobytes()), other)
 
 
-def known_scale(system: Any, y0: np.ndarray, t0: float, H0: np.ndarray) -> np.ndarray:
-    """The system's `energy_scale`, else |H0| of the states y0 (..., 2d); NaN where H0 is 0 but for rounding: (...)."""
-    if system.energy_scale is not None:
-        return np.full_like(H0, system.energy_scale)
+def size_of_terms(system: Any, y: np.ndarray, t: Any) -> np.ndarray:
+    """½ Σ|y_i ∂H/∂y_i| of states y (..., 2d) at times t: the energy of an oscillator, whatever constant H has."""
     with np.errstate(all="ignore"):
-        y = y0.astype(float)
-        terms = np.abs(y * np.asarray(system.gradient(y, t0))).sum(-1)
-        return np.where(np.isfinite(H0) & (np.abs(H0) <= SMALLEST_SCALE * terms), np.nan, np.abs(H0))
+        return 0.5 * np.abs(y * np.asarray(system.gradient(y, t))).sum(-1)
+
+
+def known_scale(system: Any, H: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The scale of energy errors, (...), of H and the sizes of its terms at the start and along an orbit, (n, ...).
+
+    It is the system's `energy_scale`, else |H| at the start or, where that is about 0, `SMALLEST_SCALE` of the largest
+    size of states that kept H. It is NaN where all are 0.
+    """
+    if system.energy_scale is not None:
+        return np.full_like(H[0], system.energy_scale)
+    with np.errstate(all="ignore"):
+        kept = np.isfinite(sizes) & (np.abs(H - H[0]) <= SMALLEST_SCALE * sizes)
+        scale = np.fmax(np.abs(H[0]), SMALLEST_SCALE * np.max(np.where(kept, sizes, 0.0), axis=0))
+    return np.where(scale == 0, np.nan, scale)

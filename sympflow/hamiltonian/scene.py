@@ -21,6 +21,9 @@ MEANT = {
     **dict.fromkeys(("q0", "p0", "x0"), "the initial state is `y0`, [q, p] in one array"),
     **dict.fromkeys(("h", "step"), "the step is `dt`"),
     **dict.fromkeys(("mass", "m"), "masses are in T(p), or `masses` of pairs"),
+    **dict.fromkeys(
+        ("site", "sites", "n_sites"), "the number of sites of a lattice is `shape`, their potential `onsite`"
+    ),
 }
 """Remedies for arguments that other packages have."""
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import sympy as sp
+from sympy.core.function import AppliedUndef
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from sympflow.arguments import check_kept, plain
@@ -569,6 +570,11 @@ def _valued(H: sp.Expr, values: Mapping[sp.Symbol, sp.Expr], time: sp.Symbol | N
     for symbol, value in values.items():
         H = H.xreplace({symbol: value})
     unknown = sorted(s.name for s in H.free_symbols if not _is_coordinate(s.name) and s != time)
+    if functions := sorted(map(str, H.atoms(AppliedUndef))):
+        raise TypeError(
+            f"`expression` holds {', '.join(functions)}: name what are coordinates, and which momentum belongs to "
+            "which, as in from_sympy(H, q=[x], p=[p_x]); give the others a value."
+        )
     if "t" in unknown:
         raise TypeError('`expression` depends on the time t: name it by time="t", for a system that is driven.')
     if unknown:

@@ -84,6 +84,10 @@ class FixedStep(Integrator):
         """Return a warning of the method with its step on a system, or nothing."""
         return ""
 
+    def multiplier(self, z: np.ndarray) -> np.ndarray:
+        """Return what stands for exp(iz), (n,), in a step of z radians of an oscillation; that where any z is borne."""
+        return np.exp(1j * z)
+
     def stepper(self, problem: Problem) -> Stepper:
         """Return the stepper of one run, for states such as the problem's y0."""
         self.check_library(problem.y0)

@@ -11,12 +11,20 @@ import numpy as np
 
 from sympflow.arguments import as_float, check_t_span
 from sympflow.arrays import Array, readable, to_numpy
-from sympflow.hamiltonian.scales import MOST_DENSE, default_step, known_scale, smallest_size, started, weights
+from sympflow.hamiltonian.scales import (
+    MOST_DENSE,
+    default_step,
+    known_scale,
+    size_of_terms,
+    smallest_size,
+    started,
+    weights,
+)
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.registry import build, check_applies, get
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
 """Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
@@ -26,14 +34,18 @@ KEPT = 1e-12
 """Errors of the energy that are round-off, whatever the step."""
 TRIALS = 12
 MOST_STATES = 16  # of a batch in trials
+LOOKED_AT = 64  # states of a trial at which the size of the terms of H is taken
 SAFETY = 0.5  # of the tolerance, at which a step is aimed
 ENOUGH, MOST = 0.2, 0.7  # of the tolerance: errors with which a step is taken
 NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
+LOGARITHMIC = 0.9  # ratio of differences of V at these distances from a pole, at least: of a logarithm 1
+NEWTON_STEPS = 8
 
 Candidate = tuple[str, str]
 """The name of a method, and why it is chosen."""
 CHOSEN_WITH = {"wisdom_holman": {"corrector": 17}}
 """Options of methods that are chosen."""
+RTOL = 1e-9  # of an adaptive method that is chosen
 
 
 def choose_method(
@@ -50,6 +62,8 @@ def choose_method(
     for name, reason in _candidates(between, y0, options, tol, plain, flows):
         try:
             given = {**CHOSEN_WITH.get(name, {}), **options}
+            if name == "dop853" and readable(y0) and not {"rtol", "atol"} & {*options}:
+                given |= {"rtol": RTOL, "atol": 1e-3 * RTOL * smallest_size(between, to_numpy(y0))}
             integrator = build(name, given if name != "sympflow" or tol is None else {**given, "tol": tol})
             check_applies(integrator, between, y0)
         except (ValueError, TypeError) as error:
@@ -67,8 +81,10 @@ def _candidates(
         return
     if flows and "dt" not in options and _flow_holds(system, y0, tol):
         yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
-    if plain and y0.dtype == np.float64 and _falls_to_the_origin(system, y0):
-        yield "log_kahan_li8", "V falls without bound at q = 0, where its steps become shorter"
+    place, steep = _attractive_pole(system, y0) if plain and y0.dtype == np.float64 else ("", False)
+    if place and (steep or tol is None):
+        name = "log_kahan_li8" if steep else "dop853"
+        yield name, f"V falls without bound at {place}, where its steps become shorter"
     if system.local is not None and system.local.frame is not None and system.local.frame.crossing() is None:
         yield "wisdom_holman", "planets move about a star"
     if system.separable and system.quadratic_kinetic:
@@ -95,16 +111,44 @@ def _flow_holds(system: HamiltonianSystem, y0: Array, tol: float | None) -> bool
     return domain is None or bool(np.all(np.asarray(domain.contains(y0))))
 
 
-def _falls_to_the_origin(system: HamiltonianSystem, y0: np.ndarray) -> bool:
-    """True if V < 0 along the rays of all positions, and −∞ at their end at q = 0."""
+def _attractive_pole(system: HamiltonianSystem, y0: np.ndarray) -> tuple[str, bool]:
+    """A place towards which V falls without bound from all positions, in words; True if like a power where V < 0.
+
+    Such places are q = 0 and those where an expression of H vanishes that is next to them.
+    """
     if not (system.definition.poles and system.separable and system.keeps_energy):
-        return False
+        return "", False
     q = y0.reshape(-1, y0.shape[-1])[:MOST_STATES, : system.ndof]
-    with np.errstate(all="ignore"):
-        V = np.stack([np.asarray(system.potential(scale * q)) for scale in (100.0, 10.0, 1.0, *NEAR_POLE)])
-    return bool(
-        np.isfinite(V).all() and (V < 0).all() and (np.diff(V, axis=0) < 0).all() and (V[-1] < 100 * V[2]).all()
-    )
+    scales = np.array([100.0, 10.0, 1.0, *NEAR_POLE])[:, None, None]
+    for name, center in _centers(system, q):
+        with np.errstate(all="ignore"):
+            V = np.asarray(system.potential(center + scales * (q - center)))
+            falls = -np.diff(V[2:], axis=0)
+        if np.isfinite(V).all() and (falls > 0).all() and (falls[1:] > LOGARITHMIC * falls[:-1]).all():
+            return name, bool((V < 0).all() and (np.diff(V, axis=0) < 0).all() and (V[-1] < 100 * V[2]).all())
+    return "", False
+
+
+def _centers(system: HamiltonianSystem, q: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and positions (n, d) of the zeros that are next to positions q of what vanishes where H is infinite."""
+    yield "q = 0", np.zeros_like(q)
+    poles, d = system.definition.poles, system.ndof
+    assert poles is not None
+
+    def sizes(x: np.ndarray) -> np.ndarray:
+        return poles.sizes(np.concatenate([x, 0 * x], axis=-1), np.zeros(x.shape[:-1]))
+
+    small = 1e-6 * np.abs(q).max(initial=0.0) * np.eye(d)
+    for column in range(sizes(q).shape[-1] if small.any() else 0):
+        x = q
+        with np.errstate(all="ignore"):
+            for _ in range(NEWTON_STEPS):  # for a double zero, as that of r²
+                g = sizes(x)[..., column, None]
+                ends = [sizes(x[:, None] + sign * small)[..., column] for sign in (1, -1)]
+                slope = (ends[0] - ends[1]) / (2 * small.max())
+                x = x - np.where(g == 0, 0.0, 2 * g * slope / (slope**2).sum(-1, keepdims=True))
+        if np.isfinite(x).all():
+            yield f"{poles.name(column)}", x
 
 
 def integrator_for(
@@ -152,7 +196,7 @@ def with_step(integrator: Integrator, system: HamiltonianSystem, y0: np.ndarray)
 
 
 def choose_step(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any,
     tol: float,
     *,
@@ -171,10 +215,10 @@ def choose_step(
     method : str or Integrator, or None
         A method of fixed steps, such as "srkn11b"; None for the one that suits the system, as for `solve`.
     tol : float
-        The largest error: |H − H₀| relative to `system.energy_scale`, else to |H₀|. Where H is not conserved, with
-        friction or a drive, the difference of H from that of a run with half of the step takes its place. Where H is
-        kept whatever the step, as by Gauss methods on a quadratic H, and for the methods on the logarithmic clock, the
-        error is that of the states.
+        The largest error: |H − H₀| relative to the `energy_scale` of `sympflow.metrics.energy`. Where H is not
+        conserved, with friction or a drive, the difference of H from that of a run with half of the step takes its
+        place. Where H is kept whatever the step, as by Gauss methods on a quadratic H, and for the methods on the
+        logarithmic clock, the error is that of the states.
     y0 : array_like of shape (..., 2d), optional
         Initial states, by default the system's.
     t_span : (float, float), optional
@@ -221,20 +265,22 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
     """The step of `choose_step` for a problem."""
     check_tolerance(tol, tol_of)
     if not isinstance(integrator, FixedStep) or integrator.trained:
-        raise TypeError(
-            f"`tol` chooses the step of a method with fixed steps, and {integrator.label!r} has none: give 'srkn11b', "
-            "for instance; or `rtol` and `atol` for an adaptive method, `flow` without `tol` for a flow of your own."
-        )
+        own = "a flow has its own: leave `tol` out"
+        if not integrator.trained:
+            own = f"{integrator.label!r} chooses its own: give it `rtol` and `atol`, as rtol={tol:g} and atol={tol:g}"
+        raise TypeError(f"`tol` chooses the step of a method with fixed steps, such as 'srkn11b', and {own}.")
     if integrator.dt is not None:
         raise ValueError(f"`tol` chooses the step, but `dt` is given, {integrator.dt:g}: leave out one of them.")
     states = to_numpy(problem.y0).astype(float)
     if states.ndim > 1:
         states = states.reshape(-1, states.shape[-1])[:MOST_STATES]
     system = with_start(integrator, problem.system.between_impulses, states)
-    length, error = abs(problem.t1 - problem.t0), _error(integrator, replace(problem, system=system, y0=states), tol_of)
+    length = abs(problem.t1 - problem.t0)
+    step = float(with_step(integrator, system, states).step_length(system) or system.dt)
+    error = _error(integrator, replace(problem, system=system, y0=states), tol_of, TRIAL_LENGTH * step)
     check_applies(integrator, system, states)
     most = min(length, integrator.longest_step(system))
-    h = min(integrator.step_length(system), most)
+    h = min(step, most)
     good, bad, least = 0.0, math.inf, math.inf
     kept = math.inf  # the shortest step with which H is kept to rounding
     for _ in range(TRIALS):
@@ -275,18 +321,14 @@ def _rounded(h: float, length: float) -> float:
     return math.floor(h * 10.0**digits * (1 + 1e-12)) / 10.0**digits
 
 
-def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[float], float]:
-    """The error of a trial run, as a function of the step."""
+def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -> Callable[[float], float]:
+    """The error of a trial run over a time, as a function of the step."""
     system, y0 = problem.system, problem.y0
     sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
-    conserved = system.keeps_energy
-    with np.errstate(all="ignore"):
-        H0 = np.asarray(system.hamiltonian(y0, problem.t0))
-    scale = known_scale(system, y0, problem.t0, H0)
-    scale = np.where(np.isnan(scale), 1.0, scale)
-    factors, size = weights(system), smallest_size(system, y0)
+    factors, smallest = weights(system), smallest_size(system, y0)
 
-    compiled, clock = False, integrator.in_another_time  # on a clock H is kept even where the time is not
+    compiled, idle = False, system.keeps_energy is not system.shows_energy
+    of_states = tol_of == "state" or idle or integrator.in_another_time  # on a clock H is kept where time is wrong
 
     def run(h: float, end: float, n: int) -> tuple[np.ndarray, np.ndarray]:
         t = problem.t0 + sign * np.linspace(0.0, end, n + 1)
@@ -299,21 +341,24 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str) -> Callable[[fl
         return t, full
 
     def error(h: float) -> float:
-        n = max(TRIAL_STEPS, min(math.ceil(TRIAL_LENGTH * system.dt / h), MOST_TRIAL_STEPS) if compiled else 0)
+        n = max(TRIAL_STEPS, min(math.ceil(trial / h), MOST_TRIAL_STEPS) if compiled else 0)
         n = max(1, min(n, math.ceil(length / h)))
         end, n = min(n * h, length), -(-n // -(-n // TRIAL_STEPS))
         t, y = run(h, end, n)
+        times = np.broadcast_to(t.reshape(-1, *[1] * (y0.ndim - 1)), y.shape[:-1])
+        few = slice(None, None, -(-n // LOOKED_AT))  # with the start
         with np.errstate(all="ignore"):
-            if tol_of == "energy" and conserved and not clock:
-                found = np.abs(np.asarray(system.hamiltonian(y)) - np.asarray(system.hamiltonian(y0))) / scale
+            H = np.asarray(system.hamiltonian(y, times))
+            scale = known_scale(system, H[few], size_of_terms(system, y[few], times[few]))
+            scale = np.where(np.isnan(scale), 1.0, scale)
+            if system.keeps_energy and not of_states:
+                found = np.abs(H - H[0]) / scale
             else:
                 _, finer = run(h / 2, end, n)
-                if tol_of == "state" or clock:
-                    found = np.abs(factors * (y - finer)).max(-1) / (factors.max() * size)
+                if of_states:
+                    found = np.abs(factors * (y - finer)).max(-1) / (factors.max() * smallest)
                 else:
-                    times = t.reshape(-1, *[1] * (y0.ndim - 1)) if y0.ndim > 1 else t
-                    times = np.broadcast_to(times, y.shape[:-1])
-                    found = np.abs(np.asarray(system.hamiltonian(y, times) - system.hamiltonian(finer, times))) / scale
+                    found = np.abs(H - np.asarray(system.hamiltonian(finer, times))) / scale
         worst = float(np.max(found))
         return worst if math.isfinite(worst) else math.inf
 

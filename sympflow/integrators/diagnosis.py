@@ -7,12 +7,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
-from weakref import WeakSet
+from weakref import WeakKeyDictionary, WeakSet
 
 import numpy as np
 
 from sympflow.arguments import warn
 from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
+from sympflow.hamiltonian.scales import fastest_at
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
@@ -41,8 +42,11 @@ H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
 
 
-TOO_LONG = 0.25
+TOO_LONG = 0.05
 """Energy error, over the size of the energy, of a run whose step is too long."""
+PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
+"""Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
+_FAST: WeakKeyDictionary[HamiltonianSystem, tuple[Any, str]] = WeakKeyDictionary()
 LARGE = 200  # degrees of freedom
 FEW_STEPS = 20
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
@@ -319,7 +323,13 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if doubt := integrator.doubt(system):
         warn(doubt, RuntimeWarning)
     seen = LOOKED_AT * (n_steps >= FEW_STEPS) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
-    if not n or not seen or integrator.trained or not system.keeps_energy or system.between_impulses is not system:
+    if integrator.trained:
+        return
+    known = integrator.dt is None or (not system.step_is_open and integrator.dt <= system.dt)
+    looked = n_steps >= FEW_STEPS and not (known or system.keeps_energy)
+    if looked and (told := _too_fast(integrator, problem)):
+        warn(told, RuntimeWarning)
+    if not n or not seen or not system.keeps_energy or system.between_impulses is not system:
         return
     width = 2 * system.ndof
     every = slice((n - 1) % (step := -(-n // seen)), None, step)  # the last among them
@@ -349,6 +359,26 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
             f"run is off by {100 * off:.2g} %. Take a shorter step, or tol=1e-6, for which it is chosen.",
             RuntimeWarning,
         )
+
+
+def _too_fast(integrator: FixedStep, problem: Problem) -> str:
+    """A warning of a step that is long for the fastest motion at y0, or nothing; kept for the next run from there."""
+    system, y0 = problem.system.between_impulses, to_numpy(problem.y0).reshape(-1, 2 * problem.system.ndof)
+    y0 = y0[:: max(1, len(y0) // MOST_DIAGNOSED)].astype(float)
+    key = integrator, y0.tobytes(), problem.t0
+    if system not in _FAST or _FAST[system][0] != key:
+        dt, rate, told = integrator.step_length(system), fastest_at(system, problem.t0, y0), ""
+        error = np.abs(integrator.multiplier(PHASES) - np.exp(1j * PHASES))
+        off = np.append(error[:-1] > PHASE_ERROR * PHASES[:-1], error[-1] > 0)
+        most = float(PHASES[off][0]) if off.any() else math.inf
+        if dt * rate > most:
+            told = (
+                f"`dt` {dt:g} is too long for method {integrator.label!r}: the rate of the fastest motion at `y0` is "
+                f"{rate:.3g}, and its product with the step should be at most {most:.2g}. Take {most / rate:.2g}, or "
+                "tol=1e-6, for which the step is chosen."
+            )
+        _FAST[system] = key, told
+    return _FAST[system][1]
 
 
 def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem, told: bool = False) -> None:

@@ -30,7 +30,7 @@ from sympflow.integrators.contract import (
 from sympflow.integrators.extended import extended_run
 from sympflow.integrators.methods import NAMES, TRIPLES
 from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
-from sympflow.schemes import CORRECTORS, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
+from sympflow.schemes import CORRECTORS, POLYNOMIAL, SCHEMES, Scheme, checked_scheme, scheme_evaluations, scheme_named
 
 if TYPE_CHECKING:
     from sympflow.kernels.tangents import TangentKernel
@@ -227,6 +227,20 @@ class Splitting(FixedStep):
     def kicks_and_drifts(self) -> Scheme | None:
         plain = self.splitting == "kinetic" and self.clock == "physical" and not self.overrides("step")
         return self.scheme if plain else None
+
+    def multiplier(self, z: np.ndarray) -> np.ndarray:
+        scheme = self.kicks_and_drifts
+        if scheme is None or scheme.level == POLYNOMIAL:
+            return super().multiplier(z)
+        q, p, x = np.array([1 + 0 * z, 0 * z]), np.array([0 * z, 1 + 0 * z]), z**2  # q and hp of two orbits
+        for kind, b, g, c, *_ in scheme.substeps:
+            if kind == "drift":
+                q = q + b * p
+            else:
+                p = p - (b * x - g * x**2 + c * x**3) * q
+        half_trace = (q[0] + p[1]) / 2
+        root = np.emath.sqrt(half_trace**2 - 1)
+        return half_trace + np.where(np.sin(z) < 0, -root, root)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         """Count those of a scheme of kicks and drifts; a stepper counts those of other parts too."""

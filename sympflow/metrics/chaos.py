@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import as_float, check_counts, check_one_of, check_t_eval, floats, warn
 from sympflow.hamiltonian.scales import weights
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.contract import FINISHED
 from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings
@@ -28,7 +27,7 @@ from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
 from sympflow.show.cards import Card, numbers
 from sympflow.show.pictures import curves_figure
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,7 +81,7 @@ class Indicator(OfOrbits):
 
 
 def lyapunov(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
@@ -150,7 +149,7 @@ def lyapunov(
 
 
 def sali(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,
@@ -203,7 +202,7 @@ def sali(
 
 
 def gali(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,

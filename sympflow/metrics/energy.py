@@ -44,7 +44,8 @@ def energy_error(sol: Solution, relative: bool = True) -> np.ndarray:
 def energy_scale(sol: Solution) -> np.ndarray:
     """Return the scale of the energy errors of each trajectory, (...): `system.energy_scale`, else |H(y0)|.
 
-    It is NaN where H(y0) is 0 but for rounding, |H| ≤ 1e-12 Σ|y_i ∂H/∂y_i|: there `energy_error` is absolute, and
+    Where H(y0) is about 0, as on a parabola or a separatrix, it is a thousandth of the size of the terms of H, the
+    largest ½ Σ|y_i ∂H/∂y_i| along the orbit. It is NaN where these are 0 too: there `energy_error` is absolute, and
     warns.
     """
     check_solution(sol)

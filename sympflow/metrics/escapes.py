@@ -18,7 +18,7 @@ from sympflow.integrators.impulses import landings, pieces_of
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
 from sympflow.show.cards import Card, numbers
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,7 +60,7 @@ class Escapes(OfOrbits):
 
 
 def escape_times(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,

@@ -26,7 +26,7 @@ from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import build, check_applies
 from sympflow.metrics.crossings import dividing_step
 from sympflow.solver import solve
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 GROWS = 1e-5
 """Excess of a multiplier over 1 that is more than the rounding of a double eigenvalue, √ε."""
@@ -74,7 +74,7 @@ class FloquetMultipliers:
 
 
 def floquet_multipliers(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     y0: ArrayLike | None = None,
     *,
     period: float | None = None,

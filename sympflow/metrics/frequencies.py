@@ -18,7 +18,7 @@ from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits
 from sympflow.show.cards import Card, numbers
 from sympflow.show.pictures import curves_figure
 from sympflow.solver import solve
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +69,7 @@ class Frequencies(OfOrbits):
 
 
 def frequencies(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,

@@ -19,7 +19,7 @@ from sympflow.integrators.registry import check_applies
 from sympflow.show.cards import Shown
 from sympflow.show.pictures import histogram_figure
 from sympflow.show.style import saved
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,7 +84,7 @@ class Orbits(NamedTuple):
 
 
 def checked_orbits(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any,
     t_span: tuple[float, float] | None,
     y0: ArrayLike | None,

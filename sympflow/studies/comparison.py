@@ -37,7 +37,7 @@ from sympflow.studies.attempts import (
     tolerance_of,
 )
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,7 +57,7 @@ PAPER = ("sympflow", "mlp", "verlet", "leapfrog", "rk45")
 
 
 def compare(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     methods: Sequence[Any] = PAPER,
     metrics: Sequence[str] | None = None,
     *,
@@ -172,7 +172,8 @@ def default_metrics(system: HamiltonianSystem) -> tuple[str, ...]:
     if system.between_impulses is not system:
         return ("error",)
     if system.conservative:
-        kept = {"energy": ("energy", "drift"), "balance": ("balance",)}.get(kept_by(system), ())
+        what = "energy" if system.shows_energy else kept_by(system).replace("energy", "")
+        kept = {"energy": ("energy", "drift"), "balance": ("balance",)}.get(what, ())
         return ("error", *kept, "volume", "symplecticity")
     shrinks_evenly = system.external_force is None and system.friction and system.friction.isotropic
     return ("error", "conformal") if shrinks_evenly else ("error",)

@@ -21,14 +21,14 @@ from sympflow.metrics.crossings import Crossings, Plane, crossings, stroboscopic
 from sympflow.metrics.orbits import Orbits, checked_orbits
 from sympflow.show.style import saved
 from sympflow.studies.reports import Column, Report, described, text_table
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def poincare_section(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     method: Any = None,
     t_span: tuple[float, float] | None = None,
     y0: ArrayLike | None = None,

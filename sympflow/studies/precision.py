@@ -29,7 +29,7 @@ from sympflow.solver import solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, shown_compile_time, tolerance_of
 from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,7 +45,7 @@ MARGIN = 100.0  # by which a reference must be better than an error
 
 
 def work_precision(
-    system: HamiltonianSystem,
+    system: GivenSystem,
     methods: Sequence[Any] = METHODS,
     *,
     t_span: tuple[float, float] | None = None,

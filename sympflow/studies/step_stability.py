@@ -36,7 +36,7 @@ from sympflow.solver import solve
 from sympflow.studies import attempts
 from sympflow.studies.attempts import Attempt, Candidate, Metric, Row, candidates
 from sympflow.studies.reports import Column, Report, described, number, plain, records, text_table
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -64,7 +64,7 @@ StabilityRow = Row  # the name that its rows had before those of all studies wer
 
 
 def stability(
-    system: HamiltonianSystem | Sequence[HamiltonianSystem],
+    system: GivenSystem | Sequence[GivenSystem],
     methods: Sequence[Any] = DEFAULT,
     *,
     steps: Sequence[float] | None = None,

@@ -6,10 +6,16 @@ import difflib
 import re
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
+
+if TYPE_CHECKING:
+    import sympy as sp
+
+GivenSystem: TypeAlias = "HamiltonianSystem | str | sp.Basic"
+"""What functions take as a system: one, the name of a scene, or H as a formula, in text or symbols."""
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
 

@@ -95,10 +95,10 @@ def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[.
         names = _candidates(module)
         if len(names) == 1:
             return factory(file, names[0])
-        has = f"it has {', '.join(names)}" if names else "it has none"
+        has = f"it has {', '.join(names or _functions(module)) or 'none'}"
         raise ValueError(f"`system` {str(file)!r} lacks the name of a system in it ({has}): write {file.name}:NAME.")
     if name not in vars(module):
-        candidates = _candidates(module)
+        candidates = _candidates(module) or _functions(module)
         close = difflib.get_close_matches(name, candidates, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         has = f"It has {', '.join(candidates)}." if candidates else "It has no system."
@@ -280,13 +280,17 @@ def _candidates(module: ModuleType) -> list[str]:
     """The names in a module that are systems, or that are functions of its own without needed arguments."""
     public = {name: value for name, value in vars(module).items() if not name.startswith("_")}
     found = [name for name, value in public.items() if isinstance(value, HamiltonianSystem)]
-    return found or [name for name, value in public.items() if _returns_a_system(value, module)]
+    return found or [name for name in _functions(module) if _returns_a_system(public[name])]
 
 
-def _returns_a_system(value: Any, module: ModuleType) -> bool:
-    if not (inspect.isfunction(value) and value.__module__ == module.__name__):
-        return False
-    returns = value.__annotations__.get("return")
+def _functions(module: ModuleType) -> list[str]:
+    """The names of the functions that a module defines."""
+    found = {name: value for name, value in vars(module).items() if not name.startswith("_")}
+    return [name for name, f in found.items() if inspect.isfunction(f) and f.__module__ == module.__name__]
+
+
+def _returns_a_system(function: Any) -> bool:
+    returns = function.__annotations__.get("return")
     return returns is HamiltonianSystem or (isinstance(returns, str) and returns.endswith("HamiltonianSystem"))
 
 

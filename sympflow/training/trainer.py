@@ -22,7 +22,7 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Domain, domain_of, remedy_for
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.systems.given import given_system
+from sympflow.systems.given import GivenSystem, given_system
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.clock_fit import train_clock
@@ -67,7 +67,7 @@ BOUGHT = 1000  # starts that a budget buys at most
 
 
 def train(
-    system: HamiltonianSystem | None = None,
+    system: GivenSystem | None = None,
     fit: Fit | float | None = None,
     *,
     flow: FlowMap | None = None,

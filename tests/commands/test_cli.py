@@ -463,3 +463,38 @@ def test_the_command_line_writes_utf_8(locale, tmp_path):
         text = ended.stdout.decode("utf-8")
         assert not text.isascii() or call[0] == "methods"
     assert (tmp_path / "pendulum.csv").read_text(encoding="utf-8").startswith("system,")
+
+
+ANSWERED = {
+    "an option twice": (["solve", "pendulum", "--dt", "1", "--dt", "2"], "given 2 times: give it once"),
+    "methods twice": (["compare", "pendulum", "--method", "rk4", "--method", "rk45"], "its values separated by"),
+    "tolerance of rk45": (["solve", "pendulum", "--method", "rk45", "--tol", "1e-6"], "`NAME:rtol=1e-06`"),
+    "a method as a system": (["solve", "pendulum", "verlet"], "give it as --method verlet"),
+    "a parameter without --": (["solve", "harmonic-oscillator", "omega=3"], "as --omega 3"),
+    "an equation": (["solve", "H = p**2/2"], "right side alone, without H ="),
+    "a missing sign": (["solve", "p^2/2m"], r"write 2\*m"),
+    "a keyword": (["solve", "p^2/2 + lambda*q"], "'lambda', which is a word of Python"),
+    "a foreign option": (["solve", "pendulum", "--solver", "verlet"], "did you mean --method"),
+    "a capital": (["solve", "kepler", "--E", "0.3"], "did you mean --e"),
+    "a path of Python": (["solve", "sympflow.systems.pendulum"], "Did you mean 'pendulum'"),
+    "no Python": (["solve", "pendulum", "--method", "x"], "All are listed by `sympflow methods`"),
+    "no lists": (["compare", "damped-pendulum", "--metrics", "energy"], "or pass error,conformal"),
+}
+
+
+@pytest.mark.parametrize(("words", "answer"), ANSWERED.values(), ids=ANSWERED)
+def test_first_mistakes_are_answered_in_words_of_the_command_line(words, answer):
+    result = run(*words)
+    said = " ".join(result.output.replace("│", " ").split())
+    assert result.exit_code == 2
+    assert re.search(answer, said), said
+    assert not re.search(r"sympflow\.[a-z]+\(|HamiltonianSystem|SymPy", said), said
+
+
+@pytest.mark.parametrize("y0", ["1,0", "[1, 0]", "1 0"])
+def test_a_start_time_and_a_driven_formula(y0):
+    words = ["solve", "p**2/2 + q**2/2 - t*q", "--y0", y0, "--t-start", "2", "--t-end", "5", "--tol", "1e-9"]
+    said = run(*words).output
+    q, p = 5 - np.cos(3.0) - np.sin(3.0), 1 + np.sin(3.0) - np.cos(3.0)  # q = t − cos(t − 2) − sin(t − 2)
+    found = re.search(r"y\(5\) = \[(.*), (.*)\]", said)
+    np.testing.assert_allclose([float(x) for x in found.groups()], [q, p], atol=1e-7)

@@ -18,6 +18,10 @@ CHOSEN = {
     "separable": (lambda: text("sqrt(1 + p**2) + q**4/4"), [1, 0], {}, "kahan_li8"),
     "not separable": (lambda: text("(1 + p**2)*(1 + q**2)/2"), [1, 0], {}, "gauss_legendre6"),
     "attraction at 0": (lambda: text(KEPLER), [1, 0, 0, 0.8], {}, "log_kahan_li8"),
+    "elsewhere": (lambda: text(KEPLER.replace("q1*", "(q1 - 1)*")), [2, 0, 0, 0.3], {}, "log_kahan_li8"),
+    "two": (lambda: text(f"{KEPLER} - 1/sqrt((q1 - 1)**2 + q2**2)"), [2, 0, 0, 0.3], {}, "log_kahan_li8"),
+    "a logarithm": (lambda: text("p1**2/2 + p2**2/2 + log(q1**2 + q2**2)"), [1, 0, 0, 0.01], {}, "dop853"),
+    "softened": (lambda: text("p1**2/2 + p2**2/2 + log(q1**2 + q2**2 + 1)"), [1, 0, 0, 0.01], {}, "srkn11b"),
     "repulsion at 0": (lambda: text("p**2/2 + 1/q**2 + q**2"), [1, 0], {}, "srkn11b"),
     "events": (lambda: text(KEPLER), [1, 0, 0, 0.8], {"events": lambda t, y: y[0]}, "srkn11b"),
     "tolerances": (lambda: text("p**2/2 + q**4/4"), [1, 0], {"rtol": 1e-8}, "dop853"),
@@ -38,6 +42,31 @@ def test_the_method_suits_the_system(make, y0, options, name):
 def test_an_option_that_no_method_takes_is_refused():
     with pytest.raises(TypeError, match=r"^`tolerance` is not an option"):
         solve(text("p**2/2 + q**4/4"), t_span=(0, 1), y0=[1, 0], tolerance=1)
+
+
+WELL = "p**2/2 - q**2/2 + q**4/4"
+AT_ZERO = {
+    "parabola": (KEPLER, [1, 0, 0, 2.2**0.5], 20),
+    "typed": (KEPLER, [1, 0, 0, 1.4832], 20),
+    "slow": (KEPLER.replace("1.1", "1e-8"), [1, 0, 0, 2e-8**0.5], 2e5),
+    "separatrix": (WELL, [2**0.5, 0], 20),
+    "beside a saddle": (WELL, [1e-3, 0], 20),
+    "towards it": (WELL, [-1e-3, 1e-3], 20),
+}
+
+
+@pytest.mark.parametrize(("expression", "y0", "length"), AT_ZERO.values(), ids=AT_ZERO)
+def test_energies_about_zero_are_compared_with_their_terms(expression, y0, length):
+    """The step is as that of a like orbit of another energy: no error in units of an energy that is about 0."""
+    sol = solve(expression, "srkn11b", (0, length), y0, tol=1e-9)
+    assert sympflow.max_energy_error(sol) <= 1e-9
+    assert 0.01 < sol.stats["dt"] * 20 / length < 0.2
+
+
+def test_the_scale_of_a_run_that_is_lost_is_that_of_its_start():
+    sol = solve("p**2/2 + q**2/2", "verlet", (0, 200), [1.0, 0.0], dt=2.05, diagnose=False)
+    assert sol.energy_scale() == 0.5
+    assert sympflow.max_energy_error(sol) > 1e6
 
 
 METHODS = "verlet", "srkn11b", "kahan_li8", "omelyan4", "gauss_legendre6", "implicit_midpoint"
@@ -124,7 +153,7 @@ REFUSED = {
         r"^`tol` must be a positive number below 1, .*; got 0\.0",
     ),
     "of what": ("verlet", {"tol": 1e-6, "tol_of": "q"}, ValueError, r"^`tol_of` must be 'energy' or 'state'; got 'q'"),
-    "adaptive": ("rk45", {"tol": 1e-6}, TypeError, r"^`tol` .* 'rk45' has none: .*`rtol` and `atol`"),
+    "adaptive": ("rk45", {"tol": 1e-6}, TypeError, r"^`tol` .* 'rk45' chooses its own: .*`rtol` and `atol`"),
     "step too": ("verlet", {"tol": 1e-6, "dt": 0.1}, ValueError, r"^`tol` chooses the step, but `dt` is given, 0\.1"),
     "below rounding": ("srkn11b", {"tol": 1e-18}, ValueError, r"^`tol` 1e-18 is not met .* rounding"),
 }
