@@ -101,7 +101,8 @@ class KeplerCode(Rollouts):
         table, limits = constants(frame, self.groups)
         self.report = zeros(AXES * (planets + LANES) + 1)
         inside = np.array([frame.inside[group[0]] for group in self.light])
-        of_light = np.stack([frame.G * frame.sums[inside], 1 / frame.sums[inside], inside]) if len(inside) else zeros(1)
+        heavy = frame.sums[inside if frame.jacobi else 0 * inside] if len(inside) else zeros(0)
+        of_light = np.stack([frame.G * heavy, 1 / heavy, inside]) if len(inside) else zeros(1)
         near = np.zeros(planets)
         near[: len(frame.order)] = ((frame.encounter or 0.0) * frame.hill_radii(frame.order, frame.order, 0.0)) ** 2
         self.extra = frame.extra
@@ -139,7 +140,7 @@ class KeplerCode(Rollouts):
         (kick, drift, *third) = lengths
         state = [self._read(room, code.at(room.state, NUMBERS * g), vector, NUMBERS * g) for g in groups]
         if not self.jacobi:
-            self._jump(state, c, 0.5 * kick)
+            self._jump(room, state, c, 0.5 * kick, 1)
         x = [values(group[:AXES]) for group in state]
         roots = [sqrt(dot(each, each)) for each in x]
         inverses = [1.0 / r for r in roots]
@@ -160,7 +161,7 @@ class KeplerCode(Rollouts):
         for k, change in enumerate(changes):
             state[k // AXES][AXES + k % AXES].add(change)
         if not self.jacobi:
-            self._jump(state, c, 0.5 * kick)
+            self._jump(room, state, c, 0.5 * kick, 2)
             x = [values(group[:AXES]) for group in state]
             roots = [sqrt(dot(each, each)) for each in x]
             inverses = [1.0 / r for r in roots]
@@ -205,11 +206,19 @@ class KeplerCode(Rollouts):
             start = AXES * planets * which
             return [code.splat(code.load(room.work, j + (start + planets * i)), LANES) for i in range(AXES)]
 
-        h = [y + p for y, p in zip(x, vector(1, inside), strict=True)]
-        square, own = dot(h, h), dot(x, x)
-        pull, r = star / (square * sqrt(square)), sqrt(own)
-        inverse = 1.0 / r
-        a = [over * p - pull * y for p, y in zip(vector(2, inside), h, strict=True)]
+        def jumped(which: int) -> None:
+            for y, change in zip(state, vector(which, code.constant(0, INT)), strict=False):
+                y.add(change)
+
+        if self.jacobi:
+            h = [y + p for y, p in zip(x, vector(1, inside), strict=True)]
+            square, over_r = dot(h, h), 1.0 / sqrt(dot(x, x))
+            pull, own = star / (square * sqrt(square)), mu * over_r * over_r * over_r
+            a = [over * p - pull * y + own * z for p, y, z in zip(vector(2, inside), h, x, strict=True)]
+        else:
+            jumped(1)
+            h = values(state[:AXES])
+            a = [code.constant(0.0, REGISTER)] * AXES
         a = self._with_extra(room, a, h)
 
         def added(j: Value, total: list[Value]) -> list[Value]:
@@ -226,10 +235,13 @@ class KeplerCode(Rollouts):
         near, *a = code.loop(self.planets, [start, *a], added)
         if self.watches:
             kick = kick + self._met(room, code.any(near < 0.0), [h], kick, g)
-        own = mu * inverse * inverse * inverse
         for i in range(AXES):
-            state[AXES + i].add(kick * (a[i] + own * x[i]))
-        for y, change in zip(state, drifted(x, values(state[AXES:]), mu, drift, r, inverse), strict=True):
+            state[AXES + i].add(kick * a[i])
+        if not self.jacobi:
+            jumped(2)
+        x = values(state[:AXES])
+        r = sqrt(dot(x, x))
+        for y, change in zip(state, drifted(x, values(state[AXES:]), mu, drift, r, 1.0 / r), strict=True):
             y.add(change)
         self._write(room, place, state)
 
@@ -284,6 +296,8 @@ class KeplerCode(Rollouts):
             kick = watch(close, h)
         a = [self._with_extra(room, each, y) for each, y in zip(a, h, strict=True)]
         if not self.jacobi:
+            for g in groups if len(self.light) else ():
+                self._tell(room, h[g], 0, g)
             return a, kick
         new: list[Vectors] = []
         behind: Vectors = [zero] * AXES
@@ -303,10 +317,13 @@ class KeplerCode(Rollouts):
                 before = [y - z for y, z in zip(h[g], x[g], strict=True)]
                 all_behind = [p + q for p, q in zip(weighted, outer, strict=True)]
                 for which, vector in enumerate((h[g], before, all_behind)):
-                    for i, value in enumerate(vector):
-                        start = LANES * (self.groups * (AXES * which + i) + g)
-                        code.store(value, room.work, start)
+                    self._tell(room, vector, which, g)
         return new[::-1], kick
+
+    def _tell(self, room: Room, vector: Vectors, which: int, g: int) -> None:
+        """Write down one of three vectors of a group of planets, for the bodies without mass."""
+        for i, value in enumerate(vector):
+            room.code.store(value, room.work, LANES * (self.groups * (AXES * which + i) + g))
 
     def _heliocentric(self, x: list[Vectors], c: list[dict[str, Value]]) -> list[Vectors]:
         """Places as seen from the star, of those from the centre of all inside."""
@@ -323,13 +340,16 @@ class KeplerCode(Rollouts):
                 before = [b + t for b, t in zip(before, total, strict=True)] if g else total
         return h
 
-    def _jump(self, state: list[list[Sum]], c: list[dict[str, Value]], t: Value) -> None:
+    def _jump(self, room: Room, state: list[list[Sum]], c: list[dict[str, Value]], t: Value, which: int) -> None:
         """Move places with the star, whose momentum is that of the planets reversed."""
+        jumps = []
         for k in range(AXES):
             parts = [of_lanes(_whole, c[g]["share"] * group[AXES + k].value) for g, group in enumerate(state)]
-            jump = t * sum(parts[1:], parts[0])
+            jumps.append(t * sum(parts[1:], parts[0]))
             for group in state:
-                group[k].add(jump)
+                group[k].add(jumps[k])
+        if len(self.light):
+            self._tell(room, jumps, which, 0)
 
     def look(self, room: Room) -> None:
         """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
@@ -498,10 +518,10 @@ class KeplerLoops:
 
     def __init__(self, frame: Frame) -> None:
         n, light = len(frame.order), places_of_light(frame)
-        if not n or n > MOST_GROUPS * LANES - 1 or (light and not frame.jacobi):
+        if not n or n > MOST_GROUPS * LANES - 1:
             raise NotCompiled(
-                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, with "
-                "bodies without mass in Jacobi's coordinates only: use backend='array'."
+                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}: use "
+                "backend='array'."
             )
         self.frame, self._light, self._codes = frame, bool(light), dict[Form, KeplerCode]()
         groups = self.code(Form()).groups

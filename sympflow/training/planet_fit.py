@@ -18,7 +18,7 @@ import torch
 
 from sympflow.flow.planetary import STEP, KeplerFlow, processor_of
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.planets import Frame, PlanetsHamiltonian, frame_of
+from sympflow.hamiltonian.planets import Frame, PlanetsHamiltonian
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.kepler import KeplerKernel, KeplerLoops, kepler_loops
 from sympflow.kernels.protocol import Task
@@ -45,9 +45,7 @@ class Orbit(NamedTuple):
     energy: float
 
     @classmethod
-    def of(cls, system: HamiltonianSystem) -> Orbit:
-        frame = frame_of(system.local, system.y0)
-        assert frame is not None
+    def of(cls, system: HamiltonianSystem, frame: Frame) -> Orbit:
         start = np.asarray(system.y0, dtype=float)
         return cls(system, frame, kepler_loops(frame), start, float(system.hamiltonian(start)))
 
@@ -68,11 +66,16 @@ def can_train(system: HamiltonianSystem) -> bool:
     return isinstance(local, PlanetsHamiltonian) and local.frame.jacobi and not len(local.frame.test)
 
 
-def train_planets(system: HamiltonianSystem, fit: KeplerFit, domain: Domain, deadline: Deadline) -> KeplerFlow:
+def train_planets(system: HamiltonianSystem, fit: KeplerFit, domain: Domain | None, deadline: Deadline) -> KeplerFlow:
     """A flow of planets about a star, with its record."""
     started, cpu = time.perf_counter(), time.process_time()
-    orbit = Orbit.of(system)
     flow = KeplerFlow(system.ndof, fit.reach, fit.gradients, 1.0, system=system)
+    if len(flow.frame.test):
+        raise ValueError(
+            f"`system` {system.name!r} has bodies without mass, which no step is fitted to: train a flow of the "
+            "planets alone."
+        )
+    orbit = Orbit.of(system, flow.frame)
     dt = _longest(orbit, fit, deadline) if fit.dt is None else fit.dt
     flow.dt = float(dt)
     numbers, residual = fitted(orbit, flow.dt, fit)

@@ -194,6 +194,9 @@ def fit_flow(
     start: PrimedFit | None = None,
 ) -> Any:
     """`train`, its arguments sorted: a new flow, one to `start` with or a given one, and its fit."""
+    if isinstance(fit, KeplerFit):  # along an orbit, which needs no domain
+        _checked_kind(system, flow, fit)
+        return train_planets(system, fit, domain or system.domain, session.deadline)
     domain = _domain_for(system, domain)
     solver = _solver_for(fit, solver)
     if start is not None:
@@ -205,8 +208,6 @@ def fit_flow(
     check_for_flows(system, takes_friction=kind == "primed", takes_driving=kind in DRIVEN)
     if isinstance(fit, ClockedFit):
         return train_clock(system, fit, domain)
-    if isinstance(fit, KeplerFit):
-        return train_planets(system, fit, domain, session.deadline)
     if isinstance(fit, PrimedFit):
         if fit.runs is not None:
             check_runs(system, fit)

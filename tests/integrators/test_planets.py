@@ -581,16 +581,18 @@ def test_bodies_without_mass_move_as_those_of_hardly_any(method):
     assert np.abs(sols[0].energy_error()).max() < 1e-6
 
 
+@pytest.mark.parametrize("coordinates", ["jacobi", "democratic"])
 @pytest.mark.parametrize("planets", [2, 8])
-def test_bodies_without_mass_are_compiled(planets):
+def test_bodies_without_mass_are_compiled(planets, coordinates):
     rng = np.random.default_rng(0)
     a = np.concatenate([2.0 * 1.5 ** np.arange(planets), rng.uniform(1.0, 40.0, 30)])
     orbits = {"a": a, "e": 0.02, "inc": rng.uniform(0, 0.1, len(a)), "M": rng.uniform(0, 6, len(a))}
-    system = HamiltonianSystem.planets([1.0, *[1e-5] * planets, *[0.0] * 30], elements=orbits, encounter=None)
+    given = {"coordinates": coordinates, "encounter": None, "extra": "1e-4/r**3"}
+    system = HamiltonianSystem.planets([1.0, *[1e-5] * planets, *[0.0] * 30], elements=orbits, **given)
     runs = [solve(system, "wisdom_holman", (0, 12.0), dt=0.3, backend=b).y for b in ("compiled", "array")]
     assert np.abs(runs[0] - runs[1]).max() < 1e-11
     few = {name: x if name == "e" else x[:planets] for name, x in orbits.items()}
-    alone = HamiltonianSystem.planets([1.0, *[1e-5] * planets], elements=few, encounter=None)
+    alone = HamiltonianSystem.planets([1.0, *[1e-5] * planets], elements=few, **given)
     d = 3 * (1 + planets)
     assert np.abs(solve(alone, "wisdom_holman", (0, 12.0), dt=0.3).y[:d] - runs[0][:d]).max() < 1e-11
 
