@@ -9,7 +9,7 @@ Bayesian criterion decides, which counts how many terms there were to choose fro
 from __future__ import annotations
 
 import math
-import warnings
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -18,7 +18,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import check_positive, checked_count, checked_number, plain, warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -27,9 +27,8 @@ from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.orbits import Method
 from sympflow.learning.reading import Run
-from sympflow.learning.regression import Regression
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
-from sympflow.learning.smoothing import smoothed
+from sympflow.learning.smoothing import Smooth
 from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
 from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
@@ -39,46 +38,116 @@ from sympflow.training.session import Session
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-RADIANS = 6.0
-"""Length of the pieces that are shot through, in the mean angular rate of the data: about one period."""
+RADIANS = 6.0  # Length of the pieces that are shot through, in the mean angular rate of the data: about one period
 FLOOR = 1e-6
 """Least noise, over the spread of a coordinate: below it a formula would explain the errors of the scheme."""
-STEP = 0.1
-"""Step of the system that is made, in the mean angular rate of the data."""
-STEP_SHARE = 0.02
-"""Error of the scheme from one point to the next, over the noise."""
-STEPS = 40
-"""Most steps of a fit."""
-SETTLED = 0.05
-"""Change of the noise, relative, that ends its estimation."""
-CONVERGED = 1e-7
-"""Decrease of the squares, relative, at which a fit ends."""
-UNEXPLAINED = 1.3
-"""Residual over the noise from which a model does not explain the data."""
-QUIET = 0.5
-"""Residual over the noise that was given, below which that is too large."""
-LOUD = 1.5
-"""Residual over the noise that is seen without a model, up to which that may be all."""
-BEYOND = 2
-"""Terms by which the path goes on beyond the model that is chosen."""
-WORTH = 0.5
-"""Gain of a term by the linear model, over its penalty, from which it is tried."""
-DOUBTED = 8
-"""Most terms of the only model that is fitted where no H explains the data."""
-SKETCHED = 8
-"""Steps of the fits of models on the path with fewer terms than the one that was chosen."""
+STEP = 0.1  # Step of the system that is made, in the mean angular rate of the data
+STEP_SHARE = 0.02  # Error of the scheme from one point to the next, over the noise
+STEPS = 40  # Most steps of a fit
+SETTLED = 0.05  # Change of the noise, relative, that ends its estimation
+CONVERGED = 1e-7  # Decrease of the squares, relative, at which a fit ends
+UNEXPLAINED = 1.3  # Residual over the noise from which a model does not explain the data
+QUIET = 0.5  # Residual over the noise that was given, below which that is too large
+LOUD = 1.5  # Residual over the noise that is seen without a model, up to which that may be all
+BEYOND = 2  # Terms by which the path goes on beyond the model that is chosen
+WORTH = 0.5  # Gain of a term by the linear model, over its penalty, from which it is tried
+DOUBTED = 8  # Most terms of the only model that is fitted where no H explains the data
+SKETCHED = 8  # Steps of the fits of models on the path with fewer terms than the one that was chosen
 HOPELESS = 10.0
 """Criterion for each value, above that of the chosen model, at which the path ends: a residual 150 times as large."""
-MOST_VALUES = 20_000
-"""Values to which models are fitted on the way; the one that is chosen is fitted to all."""
-COMPARED = 2000
-"""States over which terms are compared, and of a flow's Hamiltonian."""
-STARTS = 4
-"""Regressions from which the search begins at most."""
-HIGHEST = 30
-"""Degree of polynomials, at most."""
+MOST_VALUES = 20_000  # Values to which models are fitted on the way; the one that is chosen is fitted to all
+COMPARED = 2000  # States over which terms are compared, and of a flow's Hamiltonian
+STARTS = 4  # Regressions from which the search begins at most
+HIGHEST = 30  # Degree of polynomials, at most
+CORRELATED = 4  # Smoothed slopes that count as one, for their errors are correlated
 OF_A_FLOW = 5.0
 """Factor by which the last term of a flow's Hamiltonian lowers the residual at least: a flow's errors are no noise."""
+
+
+class Regression:
+    """y ≈ X θ for few of the columns of X (n, K), of whose n errors some count as independent."""
+
+    def __init__(self, X: np.ndarray, y: np.ndarray, independent: float) -> None:
+        self.lengths = np.linalg.norm(X, axis=0)
+        self.lengths[self.lengths == 0] = 1.0
+        X = X / self.lengths
+        self.G, self.b, self.yy = X.T @ X, X.T @ y, float(y @ y)
+        self.n = independent
+        self.count = len(y)
+
+    @classmethod
+    def of_slopes(cls, library: Library, smooth: Smooth, scales: np.ndarray) -> Regression:
+        """ẋ ≈ Σ θ_k J∇f_k(x) at smoothed states, each coordinate in its spread."""
+        X = library.fields(smooth.points) / scales[:, None]
+        y = (smooth.slopes / scales).ravel()
+        return cls(X.reshape(len(y), -1), y, len(y) / CORRELATED)
+
+    @classmethod
+    def of_values(cls, library: Library, x: np.ndarray, values: np.ndarray) -> Regression:
+        """H ≈ Σ θ_k f_k + const at states x."""
+        X = library.values(x)
+        return cls(X - X.mean(0), values - values.mean(), len(values))
+
+    def _solve(self, active: list[int]) -> tuple[np.ndarray, float]:
+        theta = np.linalg.lstsq(self.G[np.ix_(active, active)], self.b[active], rcond=1e-13)[0]
+        left = self.yy - 2 * theta @ self.b[active] + theta @ self.G[np.ix_(active, active)] @ theta
+        return theta, max(float(left), 1e-16 * self.yy)
+
+    def coefficients(self, active: list[int]) -> np.ndarray:
+        return self._solve(active)[0] / self.lengths[active]
+
+    def errors(self, active: list[int]) -> np.ndarray:
+        """Standard errors of the coefficients."""
+        variance = self._solve(active)[1] / max(self.n - len(active), 1)
+        return np.sqrt(variance * np.diag(np.linalg.pinv(self.G[np.ix_(active, active)]))) / self.lengths[active]
+
+    def misfit(self, active: list[int]) -> float:
+        """Root mean square of what is left."""
+        return math.sqrt(self._solve(active)[1] / self.count)
+
+    def criterion(self, active: list[int]) -> float:
+        penalty = math.log(max(self.n, 3)) + 2 * math.log(len(self.b))
+        return self.n * math.log(self._solve(active)[1] / self.yy) + len(active) * penalty
+
+    def forward(self, most: int, among: Sequence[int] | None = None) -> list[int]:
+        """Terms added one at a time, each the one that leaves least, and dropped again while the criterion falls."""
+        active: list[int] = []
+        usable = range(len(self.b)) if among is None else among
+        for _ in range(min(most, len(usable))):
+            wider = min(([*active, k] for k in usable if k not in active), key=lambda a: self._solve(a)[1])
+            if active and self.criterion(wider) >= self.criterion(active):
+                break
+            active = wider
+            while len(active) > 1:
+                fewer = self._fewer(active)
+                if self.criterion(fewer) >= self.criterion(active):
+                    break
+                active = fewer
+        return active
+
+    def backward(self, most: int, among: Sequence[int] | None = None) -> list[int]:
+        """Terms dropped one at a time from all of them, while the criterion falls or there are more than `most`."""
+        active = [*range(len(self.b))] if among is None else [*among]
+        while len(active) > 1:
+            theta, _ = self._solve(active)
+            inverse = np.linalg.pinv(self.G[np.ix_(active, active)], rcond=1e-13)
+            least = int(np.argmin(theta**2 / np.maximum(np.diag(inverse), 1e-300)))
+            fewer = active[:least] + active[least + 1 :]
+            if len(active) <= most and self.criterion(fewer) >= self.criterion(active):
+                break
+            active = fewer
+        return active
+
+    def _fewer(self, active: list[int]) -> list[int]:
+        """The model without the term that is missed least."""
+        return min(([j for j in active if j != k] for k in active), key=lambda a: self._solve(a)[1])
+
+    def nested(self, active: list[int]) -> list[list[int]]:
+        """Models of one term to all, each with one dropped from the next."""
+        path = [active]
+        while len(path[0]) > 1:
+            path.insert(0, self._fewer(path[0]))
+        return path
 
 
 @dataclass(frozen=True)
@@ -295,18 +364,14 @@ def discover(
     trajectories.check_moving()
     period = reading.get("period")
     trajectories.check_angles(None if period is None else np.isinf(periods_of(period, trajectories.ndof)))
-    if not (real_number(held_out) and 0 <= held_out < 1):
-        raise ValueError(f"`held_out` must be at least 0 and less than 1; got {held_out!r}: 0.2 keeps a fifth.")
-    if piece is not None and not (real_number(piece) and piece > 0):
-        raise ValueError(f"`piece` must be a positive time; got {piece!r}: leave it out for about one period.")
+    checked_number("held_out", held_out, "at least 0 and less than 1, as 0.2", lambda share: 0 <= share < 1)
+    if piece is not None:
+        check_positive("piece", piece)
     if progress is not None and not callable(progress):
         raise TypeError(f"`progress` must be a function of a line of text; got {progress!r}: leave it out.")
-    degree, most_terms, seed = plain(degree), plain(most_terms), plain(seed)
-    for argument, value, least in (("degree", degree, 1), ("most_terms", most_terms, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(f"`{argument}` must be an integer, {least} or more; got {value!r}.")
-    if degree > HIGHEST:
-        raise ValueError(f"`degree` must be at most {HIGHEST}; got {degree!r}: give other `terms`.")
+    degree = checked_count("degree", plain(degree), 1, HIGHEST, f"an integer from 1 to {HIGHEST}")
+    most_terms = checked_count("most_terms", plain(most_terms), 1, sys.maxsize, "an integer, 1 or more")
+    seed = checked_count("seed", plain(seed), 0, sys.maxsize, "an integer, 0 or more")
     huber = limit_of(loss)
     say = progress or (lambda _: None)
     search = _Search(trajectories, terms, degree, noise, held_out, piece, huber, most_terms, seed, say, session)
@@ -318,7 +383,7 @@ def discover(
     scene = {"domain": domain or around, "y0": trajectories.states[0]}
     system = _system(discovery, trajectories.ndof, name=name, t_span=(0.0, first.span), dt=STEP / search.rate, **scene)
     if discovery.remark:
-        warnings.warn(discovery.remark, stacklevel=3)
+        warn(discovery.remark)
     return system
 
 
@@ -360,7 +425,7 @@ class _Search:
         self.held, rest = sorted(drawn[:count]), drawn[count:]
         values = np.cumsum([data.runs[i].y.size for i in rest])
         self.fitted = sorted(rest[: max(int(np.searchsorted(values, MOST_VALUES)), 1)])
-        self.smooth = smoothed(data)
+        self.smooth = data.smooth
         self.expected = self.smooth.sigma if self.known is None else self.known
         points = self.smooth.points
         if not len(points):
@@ -744,13 +809,15 @@ class _Search:
                 f"But without any model the data show noise of up to {self.smooth.sigma[worst]:.2g} there: leave "
                 "`noise` out, or give that."
             )
-        hint = diagnosis.hint(self.library, self.smooth, self.data, otherwise)
-        if self.doubt is not None and hint == otherwise:
-            hint = f"Of increments of trajectories {self.doubt.said} leaves {self.doubt.share:.1e} of the squares."
+        hint = diagnosis.hint(self.library, self.smooth, self.data)
+        if hint is None and self.doubt is not None:
+            hint = (
+                f"Of increments of trajectories {self.doubt.cause.said} leaves {self.doubt.share:.1e} of the squares."
+            )
         return (
             f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "
-            f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. {hint} The "
-            "best model and the path to it are in `system.discovery`."
+            f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. "
+            f"{hint or otherwise} The best model and the path to it are in `system.discovery`."
         )
 
 
@@ -829,5 +896,5 @@ def _of_flow(
     )
     system = _system(discovery, flow.ndof, name=name, domain=found, y0=x[0], dt=flow.dt / 10)
     if not explains:
-        warnings.warn(remark, stacklevel=4)
+        warn(remark)
     return system

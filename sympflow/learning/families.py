@@ -6,15 +6,17 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import sympy
 
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.inertia import Inertia
+from sympflow.learning.library import coordinates_of
 from sympflow.learning.maps import NetworkFlow
 from sympflow.learning.models import Force, Model, drags
-from sympflow.learning.parts import Distances, Drive, FixedKinetic, Formula, Kinetic, Network, Part, Polynomial, Waves
+from sympflow.learning.parts import Distances, Drive, Fixed, Network, Part, Polynomial, Waves, kinetic, known_kinetic
 
 DEGREES = (2, 3, 4, 5, 6, 8, 10)
 HARMONICS = (1, 2, 3, 4, 6, 8)
@@ -24,11 +26,13 @@ WIDTHS = (6, 12, 24)
 WHOLE_WIDTHS = (12, 24, 40)
 FLOW_SIZES = ((2, 6, False), (2, 6, True), (3, 10, True), (5, 12, True))
 """Pairs of layers, of half of them where it is palindromic, neurons of each, and True for palindromic SympFlows."""
-POWERS = ((-1,), (-2, -1, 0, 1, 2))
-"""Powers of distances, 0 for the logarithm."""
+POWERS = ((-1,), (-2, -1, 0, 1, 2))  # Powers of distances, 0 for the logarithm
 CHANGING = 0.5
 """Variance of the total momentum along a trajectory, over the sum of those of its parts, where it is not constant."""
 MOST_TERMS = 400
+ASSUMED = {"radians": 2 * np.pi, "degrees": 360.0}
+"""Periods of angles that are tried where none is known."""
+FLAT = 0.02  # Spread of an angle, over its period, from which its cosine is told from a parabola
 
 
 @dataclass(frozen=True)
@@ -40,13 +44,14 @@ class Constraints:
     inverse_mass: np.ndarray | None  # (d, d)
     force: Force | None  # Friction or drag whose factors are to be learned, as `models.friction`
     periods: np.ndarray  # (2d,): Of the coordinates that are angles, infinite for the others
-    known: tuple[Formula, ...] = ()  # Parts of H
+    known: tuple[Fixed, ...] = ()  # Parts of H
     # (d, d): The covariance of the momenta along a trajectory, in their mean; None where it is not known
     momenta: np.ndarray | None = None
     flow_scaling: Scaling | None = None  # The units of a flow that is fitted itself, and its Δt; None for none
     velocities: bool = False  # True if [q, q'] are observed: then (M⁻¹)₁₁ = 1, or M₁₁ in the middle of the data
     middle: np.ndarray | None = None  # (d,): The mean of q
-    frequency: float | None = None  # ω of a drive, about
+    frequencies: tuple[float, ...] = ()  # ω of each drive, about
+    angles_known: bool = False  # False if coordinates may be angles though no period is known
 
     @property
     def ndof(self) -> int:
@@ -61,6 +66,16 @@ class Constraints:
         """True if there are any."""
         return bool(np.isfinite(self.periods).any())
 
+    def groups(self, name: str) -> Iterator[Group]:
+        """The models of a family, and the same where q would be angles that nobody told of."""
+        family, d = FAMILIES[name], self.ndof
+        yield Group(family, [*family.models(self)])
+        for said, period in () if self.angles_known or not family.angular else ASSUMED.items():
+            if ((self.scales[:d] > FLAT * period) & (self.scales[:d] < period)).all():
+                wrapped = replace(self, periods=np.where(np.arange(2 * d) < d, period, np.inf), angles_known=True)
+                models = (replace(c, kind=f"{c.kind}, q angles in {said}") for c in family.models(wrapped))
+                yield Group(family, [*models], assumed=True)
+
     def at_rest(self, bodies: np.ndarray) -> bool:
         """True unless the total momentum of bodies (n, dim) is seen to change, as it cannot by forces between them."""
         if self.momenta is None or self.known:
@@ -71,13 +86,13 @@ class Constraints:
     def kinetic(self) -> tuple[Part, ...]:
         """½ pᵀM⁻¹p, learned if it is not known."""
         if self.inverse_mass is not None:
-            return (FixedKinetic(self.inverse_mass),)
+            return (known_kinetic(self.inverse_mass),)
         if self.kinetic_is_known:
             return ()
-        T = Kinetic(self.scales[self.ndof :])
+        T = kinetic(self.scales[self.ndof :])
         if not self.velocities:
             return (T,)
-        unit = FixedKinetic(np.diag(np.eye(self.ndof)[0]))
+        unit = known_kinetic(np.diag(np.eye(self.ndof)[0]))
         return (unit, T.subset(np.arange(T.n) > 0)) if self.ndof > 1 else (unit,)
 
     def separated(self, *potential: Part) -> Model:
@@ -86,8 +101,8 @@ class Constraints:
 
     def whole(self, *parts: Part) -> Model:
         """H(q, p)."""
-        drive = () if self.frequency is None else (self.driven(self.frequency),)
-        return Model(self.ndof, (*parts, *drive, *self.known), self.force, self.velocities)
+        drives = map(self.driven, self.frequencies)
+        return Model(self.ndof, (*parts, *drives, *self.known), self.force, self.velocities)
 
     def driven(self, frequency: float) -> Drive:
         """Forces and stiffnesses of this frequency: of degree 2 in q, of an angle its first harmonic."""
@@ -101,10 +116,16 @@ class Constraints:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model with its name."""
+    """A model of some kind, and how many terms it has where none is left out."""
 
-    name: str
+    kind: str
     model: Any
+    whole: int | None = None
+
+    @property
+    def name(self) -> str:
+        """The kind, and how many terms are kept."""
+        return self.kind if self.whole is None else f"{self.kind}, {self.model.n} of {self.whole} terms"
 
 
 T = "T = ½ pᵀM⁻¹p"
@@ -219,7 +240,7 @@ def _flows(constraints: Constraints) -> Iterator[Candidate]:
     scaling = constraints.flow_scaling
     told = (
         constraints.force
-        or constraints.frequency
+        or constraints.frequencies
         or constraints.known
         or constraints.inverse_mass is not None
         or constraints.angles
@@ -248,6 +269,7 @@ class Family:
     # True of models that are linear in their numbers, and soon fitted. Before those that are not, the data are asked
     # whether any H explains them
     linear: bool = True
+    angular: bool = False  # True if it tells angles from other coordinates
     observed: str = "both"  # What its numbers can be told by: "qp" for states, "qv" for velocities, "both"
 
     def tells(self, constraints: Constraints) -> bool:
@@ -255,15 +277,23 @@ class Family:
         return self.observed in ("both", "qv" if constraints.velocities else "qp")
 
 
+class Group(NamedTuple):
+    """The models of a family."""
+
+    family: Family
+    models: list[Candidate]
+    assumed: bool = False  # True where q would be angles, which nobody told
+
+
 FAMILIES = {
     "central": Family(True, _central),
     "pairs": Family(True, _pairs),
-    "waves": Family(True, _waves),
+    "waves": Family(True, _waves, angular=True),
     "polynomial": Family(True, _polynomials),
     "network": Family(True, _networks, linear=False),
-    "inertia": Family(False, _inertia, linear=False),
+    "inertia": Family(False, _inertia, linear=False, angular=True),
     "magnetic": Family(False, _magnetic, observed="qv"),
-    "whole-waves": Family(False, _whole_waves, observed="qp"),
+    "whole-waves": Family(False, _whole_waves, angular=True, observed="qp"),
     "whole-polynomial": Family(False, _whole_polynomials, observed="qp"),
     "whole-network": Family(False, _whole_networks, linear=False, observed="qp"),
     "sympflow": Family(False, _flows, linear=False, observed="qp"),
@@ -289,13 +319,11 @@ def families(constraints: Constraints, name: str | None) -> list[str]:
         raise ValueError(
             f"`family` {name!r} is of functions H(q, p), not separable: leave out `separable` or `family`."
         )
-    if constraints.frequency is not None and (
-        constraints.separable is False or (name and not FAMILIES[name].separable)
-    ):
+    if constraints.frequencies and (constraints.separable is False or (name and not FAMILIES[name].separable)):
         raise ValueError("`drive` is of a separable H: leave out `separable`, or the `family`.")
-    if constraints.frequency is not None and constraints.force is drags:
+    if constraints.frequencies and constraints.force is drags:
         raise ValueError("`drive` is learned beside friction, not beside drag: pass damping=True, or leave it out.")
-    if constraints.frequency is not None and any(not part.kicks for part in constraints.known):
+    if constraints.frequencies and not all(_kicks(part, constraints.ndof) for part in constraints.known):
         raise ValueError("`drive` is of H = ½ pᵀM⁻¹p + V(q, t), which `known` does not fit: leave out one of them.")
     if constraints.inverse_mass is not None and (
         constraints.separable is False or (name and not FAMILIES[name].separable)
@@ -312,9 +340,15 @@ def families(constraints: Constraints, name: str | None) -> list[str]:
         )
     if name is not None:
         return [name]
-    only = constraints.separable if constraints.inverse_mass is None and constraints.frequency is None else True
+    only = constraints.separable if constraints.inverse_mass is None and not constraints.frequencies else True
     kinds = {name: family for name, family in FAMILIES.items() if family.tells(constraints)}
     return [name for name, family in kinds.items() if only is None or family.separable == only]
+
+
+def _kicks(part: Fixed, ndof: int) -> bool:
+    """True of a V(q), or a T(p) whose masses are constant."""
+    x = coordinates_of(part.of, ndof)
+    return part.of == "q" or (part.of == "p" and not sympy.hessian(part.expression(part.theta, x), x).free_symbols)
 
 
 def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate | None:
@@ -325,8 +359,8 @@ def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate 
     ):
         return None
     rest = tuple(part for part in parts if part.of != "p")
-    name = candidate.name.replace("T = ½ pᵀM⁻¹p", "T = ½ p²")
-    return Candidate(name, replace(candidate.model, parts=(FixedKinetic(np.eye(constraints.ndof)), *rest)))
+    kind = candidate.name.replace("T = ½ pᵀM⁻¹p", "T = ½ p²")
+    return Candidate(kind, replace(candidate.model, parts=(known_kinetic(np.eye(constraints.ndof)), *rest)))
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:
@@ -360,4 +394,4 @@ def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, value
     left = model.without(dropped)
     if any(part.n == 0 for part, former in zip(left.parts, model.parts, strict=True) if former.n):
         return None
-    return Candidate(f"{candidate.name}, {left.n} of {model.n} terms", left)
+    return replace(candidate, model=left, whole=candidate.whole or model.n)

@@ -18,7 +18,7 @@ from sympflow.learning.shooting import FINEST, Fit, Problem, chosen_method, matc
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training.least_squares import Stop, never
 
-FIRST_POINTS, SKETCH_POINTS = 10, 30  # of the pieces that a fit begins with, and that one of all terms has
+FIRST_POINTS = 10  # of the pieces that a fit begins with
 MATCHED_POINTS = 24  # of those whose increments give its start
 MATCHED_STEPS = 60
 ROUNDS = 4  # of longer pieces, or of another noise
@@ -83,7 +83,6 @@ class Setting:
     # (2d,): The noise that the best model so far leaves of whole orbits: one that leaves much more of a few points is
     # given up
     rival: np.ndarray | None = None
-    sketch: bool = False  # True to end with orbits of a few points
 
     def plausible(self, noise: np.ndarray) -> bool:
         """True unless a model leaves so much (2d,) that it is rejected whatever its last digits are."""
@@ -128,14 +127,13 @@ class Fitted:
 
 
 def fitted(
-    model: Field, data: Trajectories, setting: Setting, theta: np.ndarray | Fitted | None = None, seed: int = 0
+    model: Field, data: Trajectories, setting: Setting, theta: np.ndarray | None = None, seed: int = 0
 ) -> Fitted:
     """Fit a model: to increments, to orbits of a few points, and to orbits as long as their errors stay small.
 
-    `theta` is a start, or the fit of the same model to other trajectories, whose orbits are as long at once.
+    `theta` is a start.
     """
-    scales, former = data.scales, theta if isinstance(theta, Fitted) else None
-    theta = theta.theta if isinstance(theta, Fitted) else theta
+    scales = data.scales
     if theta is None:
         theta, moved = model.start(np.random.default_rng(seed)), data
         if model.lagrangian or model.velocities:
@@ -145,15 +143,10 @@ def fitted(
             steps = 1 if model.linear else MATCHED_STEPS
             theta = matched(model, theta, moved.pieces(MATCHED_POINTS), 1 / moved.scales, steps, setting.stop)
     given = None if setting.noise is None else np.maximum(setting.noise, FINEST * scales)
-    sigma = given if given is not None else 1e-2 * scales if former is None else former.sigma
-    span = (
-        former.span if former is not None else 0.0 if model.stepper is None else model.stepper.longest
-    )  # a map of its own is fitted over all of a step
-    pieces = data.pieces(span=span) if span else data.pieces(SKETCH_POINTS if setting.sketch else FIRST_POINTS)
-    if former is None or not span:
-        states = first_states(pieces, model, theta)
-    else:
-        states = _states(former, data, pieces, sigma, setting)
+    sigma = 1e-2 * scales if given is None else given
+    span = 0.0 if model.stepper is None else model.stepper.longest  # a map of its own is fitted over all of a step
+    pieces = _pieces(data, span)
+    states = first_states(pieces, model, theta)
     costs: list[float] = []
     made, finer = None, 1.0
     for attempt in range(1 + ROUNDS):
@@ -162,10 +155,8 @@ def fitted(
         halvings = HALVINGS if attempt else FIRST_HALVINGS
         method = chosen_method(model, theta, pieces, tolerance, halvings, setting.stop)
         problem = Problem(model, pieces, method, sigma, huber=setting.huber)
-        gain = FINE if (attempt or former is not None) and setting.plausible(sigma) else COARSE
-        most = STEPS if model.stepper is None else OWN_STEPS
-        patience = 3 if former is None else 1  # near the minimum a step tells
-        fit = minimized(problem, theta, states, iterations=most, gain=gain, patience=patience, stop=setting.stop)
+        gain = FINE if attempt and setting.plausible(sigma) else COARSE
+        fit = minimized(problem, theta, states, iterations=_most(model), gain=gain, stop=setting.stop)
         if made is not None and setting.stop() and not math.isfinite(fit.cost):
             return made
         theta, before = fit.theta, sigma
@@ -178,15 +169,42 @@ def fitted(
         orbits = np.concatenate(fit.orbits, axis=1)
         coarse = fit.step_error(np.maximum(sigma, EXACT * scales)) > STEP_ERROR
         finer = finer / 10 if coarse else finer
-        longer = 0.0 if setting.sketch else _span(model, data, method, theta, orbits, scales, sigma)
+        spread = orbits.std(axis=1) if model.velocities else scales
+        longer = _span(made, data, orbits[:, _starts(data.runs)].T, spread)
         settled = np.allclose(sigma, before, rtol=SETTLED, atol=EXACT * scales.min())
         if longer <= 1.5 * span and settled and not coarse:
             break
         if longer > 1.5 * span:
-            span, pieces = longer, data.pieces(span=longer)
+            span, pieces = longer, _pieces(data, longer)
         states = orbits[:, _starts(pieces.runs)].T
     assert made is not None
     return made
+
+
+def refitted(found: Fitted, data: Trajectories, setting: Setting, longer: bool = False) -> Fitted:
+    """The fit of the same model to other trajectories, by the same scheme: along pieces as long, or longer ones."""
+    scales, span = data.scales, found.span
+    sigma = np.maximum(found.sigma, FINEST * scales)
+    if longer and span:
+        starts = _states(found, data, data, sigma, setting)
+        span = max(span, _span(found, data, starts, found.states.std(axis=0) if found.model.velocities else scales))
+    pieces = _pieces(data, span)
+    problem = Problem(found.model, pieces, found.method, sigma, huber=setting.huber)
+    states = _states(found, data, pieces, sigma, setting)
+    most = _most(found.model)
+    fit = minimized(problem, found.theta, states, iterations=most, gain=FINE, patience=1, stop=setting.stop)
+    sigma = sigma if setting.noise is not None else np.maximum(fit.noise(), FINEST * scales)
+    return Fitted(found.model, fit.theta, sigma, fit, span, [cost / data.n_values for cost in fit.costs])
+
+
+def _pieces(data: Trajectories, span: float) -> Trajectories:
+    """Pieces of trajectories no longer than a time, of a few points if it is 0."""
+    return data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
+
+
+def _most(model: Field) -> int:
+    """The most steps of a fit."""
+    return STEPS if model.stepper is None else OWN_STEPS
 
 
 def kept(found: Fitted) -> dict[str, Any]:
@@ -202,7 +220,7 @@ def restored(model: Field, data: Trajectories, numbers: dict[str, Any], setting:
     method = Method(steppers(model)[numbers["stepper"]], numbers["longest"])
     theta, sigma, of, states = (np.asarray(numbers[name]) for name in ("theta", "sigma", "of", "states"))
     span = float(numbers["span"])
-    pieces = data.pieces(span=span) if span else data.pieces(FIRST_POINTS)
+    pieces = _pieces(data, span)
     problem = Problem(model, pieces, method, of, huber=setting.huber)
     fit = minimized(problem, theta, states, iterations=0)
     return Fitted(model, theta, sigma, fit, span, list(numbers["costs"]))
@@ -222,20 +240,11 @@ def _starts(runs: Sequence[Run]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum([run.n_points for run in runs])[:-1]])
 
 
-def _span(
-    model: Field,
-    data: Trajectories,
-    method: Method,
-    theta: np.ndarray,
-    orbits: np.ndarray,
-    scales: np.ndarray,
-    sigma: np.ndarray,
-) -> float:
+def _span(found: Fitted, data: Trajectories, states: np.ndarray, spread: np.ndarray) -> float:
     """The longest time over which orbits are followed: whole trajectories, unless their errors grow too fast."""
-    limit = float(np.clip(PER_NOISE * np.min(scales / sigma), LEAST_GROWTH, GROWTH))
-    frozen = Problem(model, data, method, sigma, frozen=True)
-    spread = orbits.std(axis=1) if model.velocities else scales
-    times = frozen.growth(theta, orbits[:, _starts(data.runs)].T, spread, limit)
+    limit = float(np.clip(PER_NOISE * np.min(data.scales / found.sigma), LEAST_GROWTH, GROWTH))
+    frozen = Problem(found.model, data, found.method, found.sigma, frozen=True)
+    times = frozen.growth(found.theta, states, spread, limit)
     soonest = float(np.quantile(times, 0.1, method="lower"))
     return soonest if math.isfinite(soonest) else max(run.span for run in data.runs)
 
@@ -299,7 +308,7 @@ class Held:
 def judged(found: Fitted, held: Trajectories, setting: Setting) -> Held:
     """The likelihood of held-out trajectories."""
     scales = held.scales
-    pieces = held.pieces(span=found.span) if found.span else held.pieces(FIRST_POINTS)
+    pieces = _pieces(held, found.span)
     sigma = np.maximum(found.sigma, EXACT * scales)
     problem = Problem(found.model, pieces, found.method, sigma, frozen=True, huber=setting.huber)
     states = _states(found, held, pieces, sigma, setting)
@@ -352,7 +361,7 @@ def left_out(found: Fitted, folds: Sequence[tuple[Trajectories, Trajectories]], 
     """The likelihood of held-out trajectories; of several divisions, each by a fit to the others from this one."""
     if len(folds) == 1:
         return judged(found, folds[0][1], setting)
-    parts = [judged(fitted(found.model, data, setting, found), held, setting) for data, held in folds]
+    parts = [judged(refitted(found, data, setting), held, setting) for data, held in folds]
     values, pairs = np.array([part.values for part in parts]), np.array([part.pairs for part in parts])
     share = np.average([part.correlation if part.pairs else 0.0 for part in parts], weights=pairs + 1e-300)
     loudness = math.sqrt(np.average([part.loudness**2 for part in parts], weights=values))

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import sympy
 
 from sympflow.learning.parts import Linear, Part, Waves
-
-if TYPE_CHECKING:
-    import sympy
 
 
 class Inertia(Part):
@@ -33,7 +30,7 @@ class Inertia(Part):
         self._pair = np.array([self.pairs.index((i, j)) for i, j in entries[:, 1:].tolist()], dtype=int)
         self._shift = np.zeros(self.n)  # of functions, which then are 0 where M₁₁ is 1
         if unit is not None:
-            there = functions.derivatives(unit[:, None], False)[0][:, 0]
+            there = functions.functions(unit[:, None])[:, 0]
             self._shift = np.where(self._pair == 0, there[entries[:, 0]], 0.0)
         self._double = np.array([1.0 if i == j else 2.0 for i, j in self.pairs])
 
@@ -89,7 +86,7 @@ class Inertia(Part):
         m, N = x.shape
         d = m // 2
         C = self._coefficients(theta)
-        f, first, second = self.functions.derivatives(x[:d], slope)
+        f, (first, second) = self.functions.functions(x[:d]), self.functions.derivatives(x[:d])
         W = self._inverse(self._matrices(C @ f))
         v = np.einsum("ijn,jn->in", W, x[d:])
         products = self._products(v)
@@ -105,8 +102,8 @@ class Inertia(Part):
             slopes[d:, d:] = W
             slopes[d:, :d] = -Wu.transpose(1, 0, 2)
             slopes[:d, d:] = -Wu
-            for (i, j), rows in second.items():
-                curved = -0.5 * ((C @ rows) * products).sum(axis=0) + (u[i] * Wu[j]).sum(axis=0)
+            for (i, j), used, rows in second:
+                curved = -0.5 * ((C[:, used] @ rows) * products).sum(axis=0) + (u[i] * Wu[j]).sum(axis=0)
                 slopes[i, j] = slopes[j, i] = curved
         if by_parameters:
             by = np.empty((m, self.n, N))
@@ -121,7 +118,7 @@ class Inertia(Part):
 
     def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         d, N = q.shape
-        f, first, _ = self.functions.derivatives(q, False)
+        f, first = self.functions.functions(q), self.functions.derivatives(q)[0]
         k, pair = self.entries[:, 0], self._pair
         g = f[k] - self._shift[:, None]
         made = np.zeros((2 * d, self.n, N))
@@ -138,12 +135,10 @@ class Inertia(Part):
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         d = len(x) // 2
-        W = self._inverse(self._matrices(self._coefficients(theta) @ self.functions.derivatives(x[:d], False)[0]))
+        W = self._inverse(self._matrices(self._coefficients(theta) @ self.functions.functions(x[:d])))
         return 0.5 * np.einsum("in,ijn,jn->n", x[d:], W, x[d:])
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
-        import sympy
-
         d = len(x) // 2
         M = sympy.zeros(d, d)
         for (i, j), row in zip(self.pairs, self._coefficients(theta), strict=True):

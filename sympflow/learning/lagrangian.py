@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -15,23 +16,19 @@ from sympflow.learning.models import Model
 from sympflow.learning.orbits import integrals
 from sympflow.learning.parts import Network, Part, Polynomial
 from sympflow.learning.reading import Run
-from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.learning.trajectories import Trajectories
 
-POINTS = 24
-"""Number of points of a piece along which p is followed."""
+POINTS = 24  # Number of points of a piece along which p is followed
 STEPS, HALVINGS, SETTLED = 12, 6, 1e-2
 """Gauss–Newton steps for masses, halvings of one, and the gain of a step that ends them."""
-DEGREE = 4
-"""Degree of the polynomial in place of a potential that is not linear in its numbers."""
+CORRELATED = 4  # Residuals along smooth curves that count as one
+DEGREE = 4  # Degree of the polynomial in place of a potential that is not linear in its numbers
 
 
-def lagrangian_start(
-    model: Model, data: Trajectories, theta: np.ndarray, smooth: Smooth | None = None
-) -> tuple[np.ndarray, Trajectories]:
+def lagrangian_start(model: Model, data: Trajectories, theta: np.ndarray) -> tuple[np.ndarray, Trajectories]:
     """θ by Lagrange's equations where they are linear in it, else as it was; and the data, smooth, with momenta."""
-    smooth, d = smooth or smoothed(data), data.ndof
-    runs = [Run(run.t, y) for run, y in zip(data.runs, smooth.states, strict=True)]
+    d = data.ndof
+    runs = [Run(run.t, y) for run, y in zip(data.runs, data.smooth.states, strict=True)]
 
     def with_momenta(states: list[np.ndarray]) -> Trajectories:
         made = (Run(run.t, y) for run, y in zip(runs, states, strict=True))
@@ -39,12 +36,8 @@ def lagrangian_start(
 
     if data.velocities and all(part.of == "q" or not part.n for part in model.parts):  # the masses are known
         return theta, with_momenta([model.states(theta, run.y) for run in runs])
-    velocities = [run.y[d:] if data.velocities else rates[:d] for run, rates in zip(runs, smooth.rates, strict=True)]
-    equations = Equations(
-        replace(model, parts=tuple(map(_linear, model.parts))),
-        replace(data, runs=tuple(Run(r.t, np.concatenate([r.y, v])) for r, v in zip(runs, velocities, strict=True))),
-    )
-    found = equations.solved()
+    equations = Equations.of(replace(model, parts=tuple(map(_linear, model.parts))), data)
+    found, *_ = equations.solved()
     if not data.velocities:
         return found, data
     masses = equations.masses(found)
@@ -53,6 +46,13 @@ def lagrangian_start(
     unit = 1.0 if model.lagrangian else np.linalg.inv(masses.mean(axis=0))[0, 0]  # of H (M⁻¹)₁₁ is 1
     states = [np.concatenate([run.y[:d], unit * equations.momenta(found, run.y[:d], run.y[d:])]) for run in runs]
     return found if model.lagrangian else theta, with_momenta(states)
+
+
+def told(model: Model, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """θ (n,) by Lagrange's equations, which are linear in it, and one over their covariance (n, n)."""
+    theta, left, J = Equations.of(model, data).solved()
+    variance = CORRELATED * (left @ left) / max(len(left) - len(theta), 1)
+    return theta, J.T @ J / max(float(variance), np.finfo(float).tiny)
 
 
 def _linear(part: Part) -> Part:
@@ -71,6 +71,16 @@ class Equations:
         self.value, self.by = model.at(np.concatenate([run.t for run in self.pieces])).momenta(self.q, self.v)
         self.scales = curves.scales[self.d : 2 * self.d, None]
 
+    @classmethod
+    def of(cls, model: Model, data: Trajectories) -> Self:
+        """The equations along smooth curves through data."""
+        smooth, d = data.smooth, data.ndof
+        curves = [
+            Run(run.t, np.concatenate([y, y[d:] if data.velocities else rates[:d]]))
+            for run, y, rates in zip(data.runs, smooth.states, smooth.rates, strict=True)
+        ]
+        return cls(model, replace(data, runs=tuple(curves)))
+
     def momenta(self, theta: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """p (d, N) at q and v."""
         value, by = self.model.momenta(q, v)
@@ -81,8 +91,8 @@ class Equations:
         known, by = self.by_mass
         return (known + np.einsum("ijkn,k->ijn", by, theta[: self.n])).T
 
-    def solved(self) -> np.ndarray:
-        """θ by least squares: linear where momenta are observed, else by Gauss–Newton steps from M = 1."""
+    def solved(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """θ, residuals and J by least squares: linear where momenta are observed, else by steps from M = 1."""
         likely = self._stacked(self.by[: self.d] / self.scales[..., None])
         theta = np.zeros(self.model.n)
         right = ((self.second - self.value[: self.d]) / self.scales).ravel()
@@ -90,7 +100,9 @@ class Equations:
             rest, rows = self._rows(self.second)
             rows, rest = self._stacked(rows / self.scales[..., None]), (rest / self.scales).ravel()
             wide = np.concatenate([likely, np.zeros((len(likely), self.model.forces))], axis=1)
-            return _least(np.concatenate([wide, rows]), np.concatenate([right, -rest]))
+            J, right = np.concatenate([wide, rows]), np.concatenate([right, -rest])
+            theta = _least(J, right)
+            return theta, right - J @ theta, J
         theta[: self.n] = _least(likely, right)  # p = v
         left, J = self._left(theta)
         forces = np.arange(self.model.n) >= self.n  # first those alone
@@ -108,7 +120,7 @@ class Equations:
             theta, left, J = theta + step, after, K
             if gained < SETTLED:
                 break
-        return theta
+        return theta, left, J
 
     def _left(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """M⁻¹ times what the equations leave, and the derivative by θ; infinite where M is not positive definite."""

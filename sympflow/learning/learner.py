@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, plain
+from sympflow.arguments import check_dt, check_flag, checked_count, floats, plain
 from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.families import Constraints, families
 from sympflow.learning.fitting import LAG, Setting, limit_of, noise_of
+from sympflow.learning.library import Library, Terms, coordinates_of
 from sympflow.learning.models import drags, friction, frictions
-from sympflow.learning.parts import Formula
-from sympflow.learning.search import Search, drive_frequency_of
-from sympflow.learning.smoothing import smoothed
+from sympflow.learning.parts import Fixed
+from sympflow.learning.search import Search, frequencies_of
 from sympflow.learning.trajectories import FEW, Trajectories, periods_of
 from sympflow.storage.identity import digest
 from sympflow.training.session import Path, Session
@@ -45,7 +46,7 @@ def learn(
     separable: bool | None = None,
     mass: float | ArrayLike | None = None,
     damping: bool | str = False,
-    drive: bool | float = False,
+    drive: bool | float | Sequence[float] = False,
     period: float | ArrayLike | None = None,
     known: HamiltonianSystem | None = None,
     family: str | None = None,
@@ -87,13 +88,13 @@ def learn(
     damping : {False, True, "each", "quadratic"}
         True to learn one rate γ of friction, p' = −∂H/∂q − γp; "each" for one rate for each p; "quadratic" for drag,
         p_i' = −∂H/∂q_i − c_i|p_i|p_i, by which `flow.system` is `sympflow.doubled`.
-    drive : bool or float
-        True to learn forces and stiffnesses a cos ωt + b sin ωt, and ω, in the time of the data; or ω, about, in
-        radians per unit of that time. Then `flow.system` is an H(q, p, t) = ½ pᵀM⁻¹p + V(q, t) of period 2π/ω, beside
-        friction or none, not beside drag.
+    drive : bool, float or sequence of float
+        True to learn forces and stiffnesses a cos ωt + b sin ωt, and ω, in the time of the data, one or two; or ω,
+        about, in radians per unit of that time, or several. Then `flow.system` is an H(q, p, t) = ½ pᵀM⁻¹p + V(q, t),
+        of period 2π/ω where ω is one, beside friction or none, not beside drag.
     period : float or array_like of shape (d,), optional
         Of H in each q, of angles: 2π, or 360 for degrees; infinite or NaN for coordinates that are none. Angles that
-        were wrapped are continued.
+        were wrapped are continued. Without one, angles in radians or degrees are tried as well.
     known : HamiltonianSystem, optional
         A part of H, symbolic; the rest is learned. Its kinetic energy, if it has one, is taken for the whole.
     family : str, optional
@@ -143,38 +144,35 @@ def learn(
     data = Trajectories.read(trajectories, ndof, period=period, **reading)
     data.check_moving()
     data.check_angles(None if period is None else np.isinf(periods_of(period, data.ndof)))
-    seed, damping, drive, replicas = plain(seed), plain(damping), plain(drive), plain(replicas)
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"`seed` must be an integer, 0 or more; got {seed!r}.")
+    damping, drive, dt, count = plain(damping), plain(drive), plain(dt), "an integer, 0 or more"
+    seed = checked_count("seed", plain(seed), 0, sys.maxsize, count)
+    replicas = checked_count("replicas", plain(replicas), 0, sys.maxsize, count)
+    if replicas == 1:
+        raise ValueError("`replicas` must be 0, or 2 or more; got 1: 20 give useful bands.")
     constraints = _constraints(data, separable, mass, damping, period, known)
-    if not isinstance(drive, bool) and not (isinstance(drive, int | float) and 0 < drive < math.inf):
+    frequencies = () if isinstance(drive, bool) else tuple(floats("drive", drive).ravel().tolist())
+    if not all(0 < frequency < math.inf for frequency in frequencies):
         raise ValueError(
-            f"`drive` must be True, for a frequency that is found, a positive one, or False; got {drive!r}."
+            f"`drive` must be True, for frequencies that are found, a positive one or several, or False; got {drive!r}."
         )
     huber = limit_of(loss)
-    dt = plain(dt)
-    if dt is not None and (isinstance(dt, bool) or not isinstance(dt, int | float) or not 0 < dt < math.inf):
-        raise ValueError(f"`dt` must be a positive finite number; got {dt!r}: leave it out for the default.")
+    check_dt(dt)
     session = Session(checkpoint, resume, plain(time_budget), progress, callback, WorkerPool(workers))
-    smooth = smoothed(data)
+    smooth = data.smooth
     rate = float(np.sqrt(np.mean((smooth.slopes / data.scales) ** 2))) if len(smooth.slopes) else 0.0
     seen = smooth.sigma if data.n_points >= ROUGH else None
     setting = Setting(noise_of(noise, data.ndof), huber, seen=seen, lag=LAG / rate if rate > 0 else 0.0)
-    if drive is not False:
-        constraints = replace(
-            constraints, frequency=drive_frequency_of(constraints, smooth) if drive is True else float(drive)
-        )
     constraints = replace(
-        constraints, flow_scaling=data.scaling._replace(t=_step(data, rate) if dt is None else float(dt))
+        constraints,
+        frequencies=frequencies_of(constraints, smooth) if drive is True else frequencies,
+        flow_scaling=data.scaling._replace(t=_step(data, rate) if dt is None else float(dt)),
     )
     chosen = families(constraints, family)
     folds = [(_cut(one, rate), _cut(others, rate)) for one, others in _divided(data, seed)]
     if len(folds) == 1:
         folds = [(_few(folds[0][0], seed), _few(folds[0][1], seed))]
-    if isinstance(replicas, bool) or not isinstance(replicas, int) or replicas < 0 or replicas == 1:
-        raise ValueError(f"`replicas` must be an integer, 0, or 2 or more; got {replicas!r}: 20 give useful bands.")
     options: dict[str, Any] = {"family": family, "loss": loss, "seed": seed, "damping": damping, "separable": separable}
-    options["drive"] = constraints.frequency
+    options["drive"] = constraints.frequencies
     identity = _identity(data, constraints, setting, options)
     search = Search(_cut(data, rate), folds, constraints, setting, seed, identity=identity, whole=data)
     if resume is not None:
@@ -237,6 +235,7 @@ def _constraints(data: Trajectories, separable: Any, mass: Any, damping: Any, pe
     momenta = None if data.velocities else _covariance(data)
     middle = np.nanmean(np.concatenate([run.y[:d] for run in data.runs], axis=1), axis=1)
     of_data: dict[str, Any] = {"momenta": momenta, "velocities": data.velocities, "middle": middle}
+    of_data["angles_known"] = period is not None
     return Constraints(data.scales, separable, inverse, DAMPINGS[damping], _periods(period, d), parts, **of_data)
 
 
@@ -255,7 +254,7 @@ def _periods(period: Any, d: int) -> np.ndarray:
     return periods
 
 
-def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
+def _formulas(known: Any, d: int) -> tuple[Fixed, ...]:
     """The parts of a system that is a part of H."""
     if not isinstance(known, HamiltonianSystem):
         raise TypeError(f"`known` must be a HamiltonianSystem, a part of H; got {known!r}.")
@@ -265,18 +264,20 @@ def _formulas(known: Any, d: int) -> tuple[Formula, ...]:
             f"`known` must be a symbolic system of {d} degrees of freedom that depends on no time and has no friction: "
             "define it by HamiltonianSystem.from_sympy."
         )
-    q, p = symbols.q, symbols.p
-    parts = [("y", symbols.H, (*q, *p))]
+    parts = [("y", symbols.H)]
     if symbols.V is not None and symbols.T is not None:
-        parts = [("q", symbols.V, q), ("p", symbols.T, p)]
+        parts = [("q", symbols.V), ("p", symbols.T)]
     values = {v: known.params[v.name] for v in symbols.H.free_symbols if v.name in known.params}
-    return tuple(Formula(of, f.subs(values), names) for of, f, names in parts if f.free_symbols & set(names))
+    values |= dict(zip((*symbols.q, *symbols.p), coordinates_of("y", d), strict=True))
+    written = ((of, f.subs(values, simultaneous=True)) for of, f in parts)
+    moving = ((of, Library([f], d)) for of, f in written if f.free_symbols & {*coordinates_of(of, d)})
+    return tuple(Fixed(Terms(library, of), np.ones(1)) for of, library in moving)
 
 
 def _identity(
     data: Trajectories, constraints: Constraints, setting: Setting, options: dict[str, Any]
 ) -> dict[str, Any]:
     """The description that a search must share with the one that it goes on with."""
-    known = [str(part.formula) for part in constraints.known]
+    known = [str(part.expression(part.theta, coordinates_of(part.of, data.ndof))) for part in constraints.known]
     of_data = digest([data, constraints.inverse_mass, constraints.periods, setting.noise])
     return {"config": json.dumps(options), "architecture": json.dumps(known), "system": of_data}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import sympy as sp
 
 from sympflow.hamiltonian.symbolic import generate, parse
 from sympflow.learning.models import Model
-from sympflow.learning.parts import Linear, Part
+from sympflow.learning.parts import Curvature, Linear, Sum
 
 NEAR = 0.05
 """Least distance from a singular point, over the size of the coordinates, of data for which 1/r is in the library."""
@@ -30,6 +30,12 @@ Coordinates = tuple[sp.Symbol, ...]
 def coordinates(ndof: int) -> tuple[Coordinates, Coordinates]:
     """The symbols q1 … qd and p1 … pd."""
     return sp.symbols(f"q1:{ndof + 1}", real=True), sp.symbols(f"p1:{ndof + 1}", real=True)
+
+
+def coordinates_of(part: str, ndof: int) -> Coordinates:
+    """Those of the coordinates that a part of H has: "q", "p" or "y" for both."""
+    q, p = coordinates(ndof)
+    return {"q": q, "p": p, "y": (*q, *p)}[part]
 
 
 def polynomials(ndof: int, degree: int = 4) -> list[sp.Expr]:
@@ -150,97 +156,65 @@ class Library:
         return sp.Add(*[sp.Float(float(c)) * f for c, f in zip(theta, self.expressions, strict=True)])
 
 
-class Terms(Part):
+class Terms(Sum):
     """Σ_k θ_k f_k, the terms of a library, which are all of q alone, of p alone, or of both."""
 
     def __init__(self, library: Library, of: str) -> None:
         self.of, self.library, self.n = of, library, len(library)
-        self._sums: dict[bytes, tuple[Any, Any]] = {}
-        self._first = library.ndof if of == "p" else 0
 
     @cached_property
     def quadratic(self) -> bool:
         return all(term.quadratic for term in self.library.terms)
 
     @property
-    def terms(self) -> bool:
-        return True
+    def width(self) -> int:
+        return self.library.ndof * (2 if self.of == "y" else 1)
 
     def subset(self, kept: np.ndarray) -> Terms:
         return Terms(self.library.subset(np.flatnonzero(kept).tolist()), self.of)
 
-    @cached_property
-    def _symbols(self) -> tuple[sp.Symbol, ...]:
-        q, p = coordinates(self.library.ndof)
-        return {"q": q, "p": p, "y": (*q, *p)}[self.of]
+    def _filled(self, x: np.ndarray, order: int) -> np.ndarray:
+        """All derivatives of an order, (m, …, n, N)."""
+        places, function = _derivatives(self.library.expressions, coordinates_of(self.of, self.library.ndof), order)
+        made = np.zeros((*[len(x)] * order, self.n, x.shape[1]))
+        for place, entry in zip(places, function(*x), strict=True):
+            made[place] = entry
+        return made
 
-    @cached_property
-    def _forms(self) -> np.ndarray:
-        """The second derivatives (m, m, n) of quadratic forms."""
-        entries = [sp.hessian(f, self._symbols).tolist() for f in self.library.expressions]
-        return np.moveaxis(np.array(entries, dtype=float), 0, -1)
+    def functions(self, x: np.ndarray) -> np.ndarray:
+        return self._filled(x, 0)
 
-    def _sum(self, used: np.ndarray) -> tuple[Any, Any]:
-        """The derivatives of the sum of some terms (n,)."""
-        key = used.tobytes()
-        if key not in self._sums:
-            self._sums[key] = _derivatives(tuple(np.array(self.library.expressions)[used]), self._symbols)
-        return self._sums[key]
+    def derivatives(self, x: np.ndarray) -> tuple[np.ndarray, Curvature]:
+        pairs = itertools.combinations_with_replacement(range(len(x)), 2)
+
+        def curvature() -> Curvature:
+            made = self._filled(x, 2)
+            yield from ((pair, slice(None), made[pair]) for pair in pairs)
+
+        return self._filled(x, 1), curvature()
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
-        m, N = x.shape
-        slopes: np.ndarray | None = None
-        if self.quadratic:
-            W = self._forms @ theta
-            value, slopes = W @ x, W[..., None] if slope else None
-        else:
-            used = theta != 0  # of terms that may be missing, few have a coefficient
-            first, second = self._sum(used)
-            numbers = (*x, *theta[used].tolist())
-            value = np.empty((m, N))
-            for row, entry in zip(value, first(*numbers), strict=True):
-                row[:] = entry
-            if slope:
-                slopes = np.zeros((m, m, N))
-                places, function = second()
-                for (i, j), entry in zip(places, function(*numbers), strict=True):
-                    slopes[i, j] = slopes[j, i] = entry
-        columns = np.zeros((m, self.n, N)) if by_parameters else None
-        if columns is not None:
-            start = self.library.ndof if self.of == "p" else 0
-            for k, term in enumerate(self.library.terms):
-                rows = [i - start for i in term.rows]
-                for i, entry in zip(rows, term.gradient(*x[rows]), strict=True):
-                    columns[i, k] = entry
-        return Linear(value, slopes, columns)
-
-    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-        y = np.zeros((x.shape[1], 2 * self.library.ndof))
-        y[:, slice(self.library.ndof, None) if self.of == "p" else slice(len(x))] = x.T
-        return self.library.values(y) @ theta
+        used = theta != 0
+        if used.all() or self.quadratic:
+            return super().gradient(theta, x, slope, by_parameters)
+        value, slopes, _ = self.subset(used).gradient(theta[used], x, slope, False)
+        return Linear(value, slopes, self._filled(x, 1) if by_parameters else None)
 
     def expression(self, theta: np.ndarray, x: Sequence[sp.Symbol]) -> sp.Expr:
-        return self.library.hamiltonian(theta).subs(dict(zip(self._symbols, x, strict=True)), simultaneous=True)
+        symbols = dict(zip(coordinates_of(self.of, self.library.ndof), x, strict=True))
+        return self.library.hamiltonian(theta).subs(symbols, simultaneous=True)
 
 
-@lru_cache(maxsize=256)
-def _derivatives(terms: tuple[sp.Expr, ...], symbols: tuple[sp.Symbol, ...]) -> tuple[Any, Any]:
-    """The gradient of Σ θ_k f_k as a function of the columns of x and of θ; and its slope, made when it is asked for.
-
-    The slope is the places of entries that are not 0, on and above the diagonal, and a function of these entries.
-    """
-    theta = sp.symbols(f"theta:{len(terms)}", real=True)
-    whole = sp.Add(*(c * f for c, f in zip(theta, terms, strict=True)))
-    first = [sp.diff(whole, x) for x in symbols]
-
-    @cache
-    def second() -> tuple[list[tuple[int, int]], Any]:
-        m = len(symbols)
-        entries = {(i, j): sp.diff(first[i], symbols[j]) for i in range(m) for j in range(i, m)}
-        kept = {place: entry for place, entry in entries.items() if entry != 0}
-        return [*kept], generate([*kept.values()], [*symbols, *theta], "numpy")
-
-    return generate(first, [*symbols, *theta], "numpy"), second
+@lru_cache(maxsize=512)
+def _derivatives(terms: tuple[sp.Expr, ...], symbols: Coordinates, order: int) -> tuple[list[tuple[int, ...]], Any]:
+    """The derivatives of an order that are not 0, as a function of the coordinates, and their places (i, …, k)."""
+    entries = {
+        (*places, k): sp.diff(f, *(symbols[i] for i in places)) if places else f
+        for places in itertools.combinations_with_replacement(range(len(symbols)), order)
+        for k, f in enumerate(terms)
+    }
+    entries = {place: entry for place, entry in entries.items() if entry != 0}
+    return [*entries], generate([*entries.values()], symbols, "numpy")
 
 
 def library_for(terms: Any, ndof: int, degree: int, states: np.ndarray) -> tuple[Library, tuple[sp.Expr, ...]]:

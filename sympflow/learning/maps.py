@@ -21,8 +21,7 @@ from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.learning.models import VectorField
 from sympflow.learning.orbits import Orbit, Over, Stepper
 
-ON_TIME = 1e-9
-"""Share of Δt by which a time may exceed it and still counts as Δt."""
+ON_TIME = 1e-9  # Share of Δt by which a time may exceed it and still counts as Δt
 
 
 @dataclass(frozen=True)
@@ -60,8 +59,8 @@ class NetworkFlow(VectorField):
     """
 
     separable = nystrom = lagrangian = linear = False
-    forces, drive = 0, None
-    parts = places = ()
+    forces = 0
+    parts = places = drives = ()
 
     def __init__(self, scaling: Scaling, pairs: int, width: int, palindromic: bool) -> None:
         self.scaling, self.pairs, self.width, self.palindromic = scaling, pairs, width, palindromic

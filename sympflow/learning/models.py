@@ -9,14 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, pairwise
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+import sympy
 
 from sympflow.learning.parts import Drive, Linear, Part, Polynomial
-
-if TYPE_CHECKING:
-    import sympy
 
 NEWTON = 8  # steps by which momenta are found of velocities
 
@@ -39,9 +37,9 @@ class VectorField:
         """The states (2d, N) of observations."""
         return y
 
-    def frequency(self, theta: np.ndarray) -> float | None:
-        """The angular frequency of the drive; None without one."""
-        return None
+    def frequencies(self, theta: np.ndarray) -> list[float]:
+        """The angular frequencies of the drives."""
+        return []
 
 
 Force = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -107,16 +105,16 @@ class Model(VectorField):
         return 0 if self.force is None else self.force(np.zeros((2 * self.ndof, 1)))[0].shape[1]
 
     @cached_property
-    def drive(self) -> Drive | None:
-        """The part that depends on time."""
-        return next((part for part in self.parts if isinstance(part, Drive)), None)
+    def drives(self) -> tuple[Drive, ...]:
+        """The parts that depend on time."""
+        return tuple(part for part in self.parts if isinstance(part, Drive))
 
     def at(self, t: np.ndarray) -> Model:
-        return self if self.drive is None else replace(self, parts=tuple(part.at(t) for part in self.parts))
+        return replace(self, parts=tuple(part.at(t) for part in self.parts)) if self.drives else self
 
-    def frequency(self, theta: np.ndarray) -> float | None:
+    def frequencies(self, theta: np.ndarray) -> list[float]:
         shares = zip(self.parts, self.places, strict=True)
-        return next((p.frequency + float(theta[own][-1]) for p, own in shares if isinstance(p, Drive)), None)
+        return [part.frequency + float(theta[own][-1]) for part, own in shares if isinstance(part, Drive)]
 
     @property
     def separable(self) -> bool:
@@ -230,8 +228,6 @@ class Model(VectorField):
 
     def expression(self, theta: np.ndarray) -> sympy.Expr:
         """H in q1 … qd, p1 … pd, or q and p."""
-        import sympy
-
         names = [f"{c}{i + 1}" if self.ndof > 1 else c for c in "qp" for i in range(self.ndof)]
         y = sympy.symbols(names, real=True)
         shares = zip(self.parts, self.places, strict=True)
@@ -255,7 +251,7 @@ class FreeField(VectorField):
     """A vector field of polynomials that need not be Hamiltonian, to be compared with those that are."""
 
     separable = nystrom = lagrangian = False
-    linear, forces, drive = True, 0, None
+    linear, forces, drives = True, 0, ()
     stepper = None
 
     def __init__(self, scales: Any, degree: int) -> None:
@@ -271,16 +267,11 @@ class FreeField(VectorField):
     def field(self, theta: np.ndarray, y: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         """The vector field."""
         m, N = y.shape
-        rows = theta.reshape(m, -1)
-        powers, K = self.polynomial.tables(y), self.polynomial.n
-        terms = self.polynomial.monomials(powers, self.polynomial.exponents)
-        slopes = np.empty((m, m, N)) if slope else None
-        if slopes is not None:
-            for j in range(m):
-                factor, left = self.polynomial.derivatives[j,]
-                slopes[:, j] = (rows * factor) @ self.polynomial.monomials(powers, left)
+        rows, K = theta.reshape(m, -1), self.polynomial.n
+        terms = self.polynomial.functions(y)
         columns = np.zeros((m, self.n, N)) if by_parameters else None
         if columns is not None:
             for i in range(m):
                 columns[i, i * K : (i + 1) * K] = terms
+        slopes = np.stack([rows @ by for by in self.polynomial.derivatives(y)[0]], axis=1) if slope else None
         return Linear(rows @ terms, slopes, columns)

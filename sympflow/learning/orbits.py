@@ -292,6 +292,8 @@ def _first_slope(run: Run, i: int) -> float:
 
 def integrals(t: np.ndarray, rates: np.ndarray) -> np.ndarray:
     """The integrals of rates (…, k) from the first time on, by cubic splines where there are points for them."""
+    if not np.isfinite(rates).all():
+        return np.full_like(rates, np.nan)
     if len(t) < 4:
         parts = np.diff(t) * (rates[..., 1:] + rates[..., :-1]) / 2
         return np.concatenate([np.zeros((*rates.shape[:-1], 1)), np.cumsum(parts, axis=-1)], axis=-1)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from itertools import combinations, combinations_with_replacement, product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import sympy
 
-if TYPE_CHECKING:
-    import sympy
 STEEP = 5.0
 """Size of the weights and biases of neurons, in the spread of the coordinates, beyond which they would be steps."""
 
@@ -22,6 +21,10 @@ class Linear(NamedTuple):
     value: np.ndarray  # (m, N)
     slope: np.ndarray | None = None  # (m, m, N): ∂f/∂x
     by_parameters: np.ndarray | None = None  # (m, n, N): ∂f/∂θ
+
+
+Curvature = Iterable[tuple[tuple[int, int], Any, np.ndarray]]
+"""Second derivatives (k, N) of some functions by pairs of coordinates, with the places of these functions."""
 
 
 class Part(ABC):
@@ -96,7 +99,52 @@ class Part(ABC):
         return np.concatenate(rows[self.of])
 
 
-class Polynomial(Part):
+class Sum(Part):
+    """Σ_k θ_k f_k of functions that are given."""
+
+    @property
+    def terms(self) -> bool:
+        return True
+
+    @property
+    @abstractmethod
+    def width(self) -> int:
+        """How many coordinates it is a function of."""
+
+    @abstractmethod
+    def functions(self, x: np.ndarray) -> np.ndarray:
+        """The functions (n, N) at columns x (m, N)."""
+
+    @abstractmethod
+    def derivatives(self, x: np.ndarray) -> tuple[np.ndarray, Curvature]:
+        """Their gradients (m, n, N), and one by one their second derivatives, those that are not 0."""
+
+    @cached_property
+    def _forms(self) -> np.ndarray:
+        """The second derivatives (m, m, n) of quadratic forms."""
+        made = np.zeros((self.width, self.width, self.n))
+        for (i, j), used, terms in self.derivatives(np.ones((self.width, 1)))[1]:
+            made[i, j, used] = made[j, i, used] = terms[:, 0]
+        return made
+
+    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
+        m, N = x.shape
+        if self.quadratic:
+            W = self._forms @ theta
+            by = np.tensordot(self._forms, x, ([1], [0])) if by_parameters else None
+            return Linear(W @ x, W[..., None] if slope else None, by)
+        first, second = self.derivatives(x)
+        slopes = np.zeros((m, m, N)) if slope else None
+        if slopes is not None:
+            for (i, j), used, terms in second:
+                slopes[i, j] = slopes[j, i] = theta[used] @ terms
+        return Linear(np.stack([theta @ rows for rows in first]), slopes, first if by_parameters else None)
+
+    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return theta @ self.functions(x)
+
+
+class Polynomial(Sum):
     """Σ_m θ_m Π_i (x_i/s_i)^m_i, of exponents m (n, m) and scales s (m,), of the size of the data: θ are comparable."""
 
     def __init__(self, of: str, exponents: Any, scales: Any) -> None:
@@ -108,8 +156,8 @@ class Polynomial(Part):
         return bool((self.exponents.sum(axis=1) == 2).all())
 
     @property
-    def terms(self) -> bool:
-        return True
+    def width(self) -> int:
+        return len(self.scales)
 
     @classmethod
     def up_to(cls, degree: int, of: str, scales: Any) -> Polynomial:
@@ -119,56 +167,48 @@ class Polynomial(Part):
         return cls(of, sorted(exponents, key=lambda e: (sum(e), e[::-1])), scales)
 
     @cached_property
-    def derivatives(self) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
+    def _derivatives(self) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
         """For each list of coordinates, of one or two: the factors and exponents of the derivatives by them."""
         made: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
         m = self.exponents.shape[1]
-        for places in [(i,) for i in range(m)] + [(i, j) for i in range(m) for j in range(i, m)]:
+        for places in [(i,) for i in range(m)] + [*combinations_with_replacement(range(m), 2)]:
             factor, left = np.ones(self.n), self.exponents.copy()
             for i in places:
                 factor, left[:, i] = factor * left[:, i] / self.scales[i], np.maximum(left[:, i] - 1, 0)
             made[places] = factor, left
         return made
 
-    def tables(self, x: np.ndarray) -> list[np.ndarray]:
-        """The powers of each coordinate, (degree + 1, N)."""
+    def _monomials(self, x: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """Monomials (n, N) at columns x, as a function of exponents (n, m)."""
         powers = []
         for z, most in zip(x / self.scales[:, None], self.exponents.max(axis=0, initial=0), strict=True):
             table = np.ones((most + 1, len(z)))
             for k in range(1, most + 1):
                 np.multiply(table[k - 1], z, out=table[k])
             powers.append(table)
-        return powers
 
-    @staticmethod
-    def monomials(powers: list[np.ndarray], exponents: np.ndarray) -> np.ndarray:
-        made = powers[0][exponents[:, 0]]
-        for table, e in zip(powers[1:], exponents.T[1:], strict=True):
-            made *= table[e]
-        return made
+        def monomials(exponents: np.ndarray) -> np.ndarray:
+            made = powers[0][exponents[:, 0]]
+            for table, e in zip(powers[1:], exponents.T[1:], strict=True):
+                made *= table[e]
+            return made
 
-    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
-        m, N = x.shape
-        powers, derivatives = self.tables(x), self.derivatives
-        value = np.empty((m, N))
-        columns = np.empty((m, self.n, N)) if by_parameters else None
-        for i in range(m):
-            factor, left = derivatives[i,]
-            made = self.monomials(powers, left)
-            value[i] = (theta * factor) @ made
-            if columns is not None:
-                np.multiply(made, factor[:, None], out=columns[i])
-        slopes = np.empty((m, m, N)) if slope else None
-        if slopes is not None:
-            for i in range(m):
-                for j in range(i, m):
-                    factor, left = derivatives[i, j]
-                    used = factor != 0
-                    slopes[i, j] = slopes[j, i] = (theta * factor)[used] @ self.monomials(powers, left[used])
-        return Linear(value, slopes, columns)
+        return monomials
 
-    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return theta @ self.monomials(self.tables(x), self.exponents)
+    def functions(self, x: np.ndarray) -> np.ndarray:
+        return self._monomials(x)(self.exponents)
+
+    def derivatives(self, x: np.ndarray) -> tuple[np.ndarray, Curvature]:
+        made = self._monomials(x)
+        first = np.zeros((len(x), self.n, x.shape[1]))
+        for row, (factor, left) in zip(first, self._derivatives.values(), strict=False):
+            np.multiply(made(left), factor[:, None], out=row)
+        second = (
+            (places, used, factor[used, None] * made(left[used]))
+            for places, (factor, left) in self._derivatives.items()
+            if len(places) == 2 and (used := factor != 0).any()
+        )
+        return first, second
 
     def subset(self, kept: np.ndarray) -> Polynomial:
         """The polynomial of some of the monomials (n,)."""
@@ -179,73 +219,60 @@ class Polynomial(Part):
         return theta / np.prod(self.scales**self.exponents, axis=1)
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
-        import sympy
-
         terms = zip(self.coefficients(theta), self.exponents.tolist(), strict=True)
         return sympy.Add(
             *(sympy.Float(c, 17) * sympy.Mul(*(v**e for v, e in zip(x, m, strict=True))) for c, m in terms if c)
         )
 
 
-class Kinetic(Polynomial):
-    """½ pᵀM⁻¹p, M⁻¹ symmetric, θ its entries on and above the diagonal; or on the diagonal alone."""
-
-    def __init__(self, scales: Any, mixed: bool = True) -> None:
-        d = len(scales)
-        pairs = [(i, j) for i in range(d) for j in range(i, d if mixed else i + 1)]
-        exponents = np.zeros((len(pairs), d), dtype=int)
-        for row, pair in zip(exponents, pairs, strict=True):
-            for i in pair:
-                row[i] += 1
-        super().__init__("p", exponents, scales)
-        self._pairs = np.array(pairs)
-        self._units = 1 / np.array([self.scales[i] * self.scales[j] for i, j in pairs])
-
-    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
-        m, N = x.shape
-        i, j = self._pairs.T
-        W = np.zeros((m, m))
-        np.add.at(W, (i, j), theta * self._units)
-        W += W.T  # an entry of the diagonal is twice its coefficient
-        by = None
-        if by_parameters:
-            by, places = np.zeros((m, self.n, N)), np.arange(self.n)
-            by[i, places] += self._units[:, None] * x[j]
-            by[j, places] += self._units[:, None] * x[i]
-        return Linear(W @ x, W[:, :, None] if slope else None, by)
+def kinetic(scales: Any) -> Polynomial:
+    """Return ½ pᵀM⁻¹p, M⁻¹ symmetric, θ its entries on and above the diagonal."""
+    units = np.eye(len(scales), dtype=int)
+    return Polynomial("p", [a + b for a, b in combinations_with_replacement(units, 2)], scales)
 
 
-class FixedKinetic(Part):
-    """½ pᵀM⁻¹p of a mass matrix that is given."""
+class Fixed(Part):
+    """A function that is known: a sum with numbers that are not learned."""
 
-    def __init__(self, inverse_mass: np.ndarray) -> None:
-        self.of, self.n, self.inverse_mass = "p", 0, inverse_mass
+    def __init__(self, part: Sum, theta: np.ndarray) -> None:
+        self.of, self.n, self.part, self.theta = part.of, 0, part, theta
 
     @property
     def quadratic(self) -> bool:
-        return True
+        return self.part.quadratic
 
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
-        W = self.inverse_mass
-        return Linear(
-            W @ x, W[:, :, None] if slope else None, np.empty((len(x), 0, x.shape[1])) if by_parameters else None
-        )
+        value, slopes, _ = self.part.gradient(self.theta, x, slope, False)
+        return Linear(value, slopes, np.empty((len(x), 0, x.shape[1])) if by_parameters else None)
 
     def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not (self.quadratic and self.of == "p"):
+            return super().momenta(q, v)
         p = np.linalg.pinv(self.inverse_mass) @ v
         return np.concatenate([p, np.zeros_like(p)]), np.zeros((2 * len(q), 0, q.shape[1]))
 
+    @property
+    def inverse_mass(self) -> np.ndarray:
+        """M⁻¹ of a kinetic energy ½ pᵀM⁻¹p."""
+        slopes = self.part.gradient(self.theta, np.ones((self.part.width, 1)), True, False).slope
+        assert slopes is not None
+        return slopes[..., 0]
+
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return 0.5 * np.einsum("in,ij,jn->n", x, self.inverse_mass, x)
+        return self.part.value(self.theta, x)
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
-        import sympy
-
-        v = sympy.Matrix(list(x))
-        return sympy.expand((v.T * sympy.Matrix(self.inverse_mass.tolist()) * v)[0] / 2)
+        return self.part.expression(self.theta, x)
 
 
-class Waves(Part):
+def known_kinetic(inverse_mass: np.ndarray) -> Fixed:
+    """Return ½ pᵀM⁻¹p of a mass matrix that is given."""
+    rows, columns = np.triu_indices(len(inverse_mass))
+    theta = np.where(rows == columns, 0.5, 1.0) * inverse_mass[rows, columns]
+    return Fixed(kinetic(np.ones(len(inverse_mass))), theta)
+
+
+class Waves(Sum):
     """Σ_m θ_m Π_i (x_i/s_i)^m_i cos(k_m·x + φ_m): Fourier series in angles, with powers of the other coordinates.
 
     Exponents m and wave vectors k are (n, m), phases φ (n,): 0 for cosines, −π/2 for sines.
@@ -259,8 +286,8 @@ class Waves(Part):
         self._place = self._place.ravel()
 
     @property
-    def terms(self) -> bool:
-        return True
+    def width(self) -> int:
+        return self.waves.shape[1]
 
     @classmethod
     def up_to(
@@ -296,47 +323,29 @@ class Waves(Part):
         c, s = np.cos(self.phases)[:, None], np.sin(self.phases)[:, None]
         return cos * c - sin * s, -(sin * c + cos * s)
 
-    def derivatives(
-        self, x: np.ndarray, twice: bool
-    ) -> tuple[np.ndarray, np.ndarray, dict[tuple[int, int], np.ndarray]]:
-        """The terms (n, N), their slopes (m, n, N), and for i ≤ j their second derivatives (n, N) if asked for."""
-        m, N = x.shape
+    def functions(self, x: np.ndarray) -> np.ndarray:
+        return self.powers.functions(x) * self._turns(x)[0]
+
+    def derivatives(self, x: np.ndarray) -> tuple[np.ndarray, Curvature]:
+        k = self.waves.T[..., None]
         wave, turned = self._turns(x)
+        pairs, all_ = [*combinations_with_replacement(range(len(x)), 2)], slice(None)
         if not self.powers.exponents.any():  # of angles alone
-            slopes = self.waves.T[..., None] * turned
-            pairs = combinations_with_replacement(range(m), 2) if twice else ()
-            return wave, slopes, {(i, j): -(self.waves[:, i] * self.waves[:, j])[:, None] * wave for i, j in pairs}
-        powers = self.powers.tables(x)
-        whole = self.powers.monomials(powers, self.powers.exponents)
-        slopes = np.empty((m, self.n, N))
-        first, second = [], {}
-        for i in range(m):
-            factor, left = self.powers.derivatives[i,]
-            first.append(factor[:, None] * self.powers.monomials(powers, left) if factor.any() else 0.0)
-            slopes[i] = first[i] * wave + self.waves[:, i, None] * whole * turned
-        for i, j in combinations_with_replacement(range(m), 2) if twice else ():
-            factor, left = self.powers.derivatives[i, j]
-            ki, kj = self.waves[:, i, None], self.waves[:, j, None]
-            second[i, j] = (first[i] * kj + first[j] * ki) * turned - ki * kj * whole * wave
-            if factor.any():
-                second[i, j] += factor[:, None] * self.powers.monomials(powers, left) * wave
-        return whole * wave, slopes, second
+            return k * turned, (((i, j), all_, -k[i] * k[j] * wave) for i, j in pairs)
+        whole, (first, second) = self.powers.functions(x), self.powers.derivatives(x)
 
-    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
-        m, N = x.shape
-        _, by, second = self.derivatives(x, slope)
-        slopes = np.empty((m, m, N)) if slope else None
-        if slopes is not None:
-            for (i, j), terms in second.items():
-                slopes[i, j] = slopes[j, i] = theta @ terms
-        return Linear(np.stack([theta @ rows for rows in by]), slopes, by if by_parameters else None)
+        def curvature() -> Curvature:
+            bent = {pair: (used, terms) for pair, used, terms in second}
+            for i, j in pairs:
+                made = (first[i] * k[j] + first[j] * k[i]) * turned - k[i] * k[j] * whole * wave
+                if (i, j) in bent:
+                    used, terms = bent[i, j]
+                    made[used] += terms * wave[used]
+                yield (i, j), all_, made
 
-    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return theta @ (self.powers.monomials(self.powers.tables(x), self.powers.exponents) * self._turns(x)[0])
+        return first * wave + k * whole * turned, curvature()
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
-        import sympy
-
         made = []
         rows = zip(
             self.powers.coefficients(theta), self.powers.exponents.tolist(), self.waves, self.phases, strict=True
@@ -427,8 +436,6 @@ class Network(Part):
         return w @ np.tanh(a @ self._embedded(x)[0] + b[:, None])
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
-        import sympy
-
         w, a, b = self._split(theta)
         inputs = []
         for i, kind in self.inputs:
@@ -522,8 +529,6 @@ class Distances(Part):
         return total
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
-        import sympy
-
         made = []
         for c, (a, b, e) in zip(theta, self.kinds, strict=True):
             others = [0 if b is None else x[i] for i in self.bodies[a if b is None else b]]
@@ -535,48 +540,7 @@ class Distances(Part):
         return sympy.Add(*made)
 
 
-class Formula(Part):
-    """A function that is known, in symbols of the coordinates."""
-
-    def __init__(self, of: str, formula: sympy.Expr, symbols: Sequence[sympy.Symbol]) -> None:
-        self.of, self.n, self.formula, self.symbols = of, 0, formula, tuple(symbols)
-
-    @property
-    def kicks(self) -> bool:
-        """True of a V(q), or a T(p) whose masses are constant."""
-        import sympy
-
-        return self.of == "q" or (self.of == "p" and not sympy.hessian(self.formula, self.symbols).free_symbols)
-
-    @cached_property
-    def _functions(self) -> tuple[Any, Any, Any]:
-        """The function, its gradient and its second derivatives on and above the diagonal."""
-        import sympy
-
-        first = [self.formula.diff(v) for v in self.symbols]
-        second = [f.diff(v) for i, f in enumerate(first) for v in self.symbols[i:]]
-        return tuple(sympy.lambdify([self.symbols], f, "numpy", cse=True) for f in (self.formula, first, second))
-
-    def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
-        m, N = x.shape
-        _, first, second = self._functions
-        value = np.stack([np.broadcast_to(f, N) for f in first(x)])
-        slopes = np.empty((m, m, N)) if slope else None
-        if slopes is not None:
-            for (i, j), f in zip(combinations_with_replacement(range(m), 2), second(x), strict=True):
-                slopes[i, j] = slopes[j, i] = f
-        return Linear(value, slopes, np.empty((m, 0, N)) if by_parameters else None)
-
-    def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(self._functions[0](x), x.shape[1])
-
-    def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
-        return self.formula.subs(dict(zip(self.symbols, x, strict=True)), simultaneous=True)
-
-
 def _float(value: float) -> sympy.Float:
-    import sympy
-
     return sympy.Float(float(value), 17)
 
 
@@ -597,7 +561,7 @@ class Drive(Part):
         """The terms of which the cosine or the sine is kept."""
         return Drive(self.base.subset(kept[: self.base.n] | kept[self.base.n : -1]), self.frequency)
 
-    def at(self, t: np.ndarray) -> Part:
+    def at(self, t: np.ndarray) -> Drive:
         return Drive(self.base, self.frequency, t)
 
     def _waves(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -621,8 +585,6 @@ class Drive(Part):
         return self.base.value(a, x) * cos + self.base.value(b, x) * sin
 
     def expression(self, theta: np.ndarray, x: Sequence[sympy.Symbol]) -> sympy.Expr:
-        import sympy
-
         angle = _float(self.frequency + theta[-1]) * sympy.Symbol("t", real=True)
         a, b = (self.base.expression(part, x) for part in np.split(theta[:-1], 2))
         return a * sympy.cos(angle) + b * sympy.sin(angle)

@@ -30,6 +30,8 @@ RUNS = (ORBIT, "run", "run_id", "trajectory", "trajectory_id", "traj", "id")
 """Names of the columns of times and of trajectories that are recognized, in lower case."""
 BESIDE = ("energy", "status")
 """Columns of tables of sympflow that are no states."""
+VELOCITY = r"v_?(\d*)|dq_?(\d*)(?:_?dt)?|q_?(\d*)_?dot_?(\d*)"
+"""Names of the columns of velocities: v1, dq1, dq1_dt, q1_dot, qdot1."""
 ORDERS = ("halves", "pairs")
 OBSERVED = {"qp": "p", "qv": "v", "q": "v"}
 """The meaning of the rows of states, with the letter of the second half; velocities of "q" are missing."""
@@ -233,7 +235,11 @@ def _of_file(path: Path) -> Any:
         sep = None if ending == ".txt" else "\t" if ending == ".tsv" else ","
         with warnings.catch_warnings():  # of another engine for separators that are found
             warnings.simplefilter("ignore")
-            return pandas.read_csv(path, sep=sep, comment="#", **_header(path))
+            options = {"sep": sep, "comment": "#", **_header(path)}
+            if "names" not in options:  # else pandas gives the second of two columns of one name another
+                first = pandas.read_csv(path, **options, header=None, nrows=1, dtype=str)
+                _check_different(first.iloc[0].dropna().str.strip().tolist() if len(first) else [])
+            return pandas.read_csv(path, **options)
     if ending == ".npz":
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return dict(arrays)
@@ -278,6 +284,12 @@ def _header(path: Path) -> dict[str, Any]:
     )
 
 
+def _check_different(names: list[str]) -> None:
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"`data` has more than one column {', '.join(twice)}: drop one of them, or name them apart.")
+
+
 def _loaded(data: Any) -> Any:
     """The Dataset in memory, unless what its file tells of would not fit there."""
     if data.nbytes > 8 * MAX_ASKED_VALUES:
@@ -309,7 +321,10 @@ def of_table(
     velocities: bool,
     observed: str,
 ) -> tuple[list[Found], tuple[str, ...]]:
+    if any(name is not None for name in table.index.names):
+        table = table.reset_index()
     columns = [str(c) for c in table.columns]
+    _check_different(columns)
     table = table.set_axis(columns, axis=1)
     of_time = _column(columns, time, TIMES, "time")
     if of_time is None:
@@ -372,7 +387,8 @@ def _coordinates(
         return tuple(rest[i] for i in rows_of(order, len(rest)))
     raise ValueError(
         f"`data` has columns {', '.join(rest)}, of which the coordinates and momenta are not recognized: name them by "
-        "`q` and `p`, or give `ndof` if they are all, q's first, or in another `order`."
+        "`q` and `p`, or give `ndof` if they are all, q's first, or in another `order`; of velocities pass "
+        'observed="qv" too.'
     )
 
 
@@ -387,7 +403,9 @@ def _positions(rest: list[str], ndof: int | None, q: Any) -> tuple[str, ...]:
 
 def _numbered(columns: list[str], letter: str) -> list[str]:
     """The columns letter1, letter2, … in order, or letter alone."""
-    numbers = {int(m[1] or 1): c for c in columns if (m := re.fullmatch(rf"{letter}_?(\d*)", c.lower()))}
+    form = VELOCITY if letter == "v" else rf"{letter}_?(\d*)"
+    found = [(c, re.fullmatch(form, c.lower())) for c in columns]
+    numbers = {int("".join(m.groups("")) or 1): c for c, m in found if m}
     return [numbers[i] for i in range(1, len(numbers) + 1)] if sorted(numbers) == [*range(1, len(numbers) + 1)] else []
 
 
@@ -411,7 +429,8 @@ def width_of(found: list[Found], ndof: int | None) -> int:
     (width,) = widths
     if width % 2:
         raise ValueError(
-            f"`data` has states of {width} numbers, which is odd: give q1 … qd, p1 … pd; the time stands apart."
+            f"`data` has states of {width} numbers, which is odd: give q1 … qd, p1 … pd, the time apart; of positions "
+            'alone pass observed="q".'
         )
     if ndof is not None and 2 * ndof != width:
         raise ValueError(f"`ndof` is {ndof}, but states have {width} numbers: give ndof={width // 2}, or drop columns.")

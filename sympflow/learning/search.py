@@ -14,14 +14,14 @@ import torch
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from sympflow.arguments import floats
+from sympflow.arguments import floats, warn
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
 from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning.diagnosis import drive_frequency, fields_of, hint
-from sympflow.learning.families import FAMILIES, MOST_TERMS, Candidate, Constraints, pruned, with_unit_mass
+from sympflow.learning.diagnosis import MOST_SLOPES, drive_frequency, driven, fields_of, hint
+from sympflow.learning.families import MOST_TERMS, Candidate, Constraints, Group, pruned, with_unit_mass
 from sympflow.learning.fitting import (
     SILENT,
     Fitted,
@@ -32,15 +32,17 @@ from sympflow.learning.fitting import (
     judged,
     kept,
     left_out,
+    refitted,
     restored,
 )
+from sympflow.learning.lagrangian import told
 from sympflow.learning.library import library_for
 from sympflow.learning.models import FreeField, Model, drags, frictions
 from sympflow.learning.orbits import Field, Method
 from sympflow.learning.parts import Distances, Drive, Part, Polynomial
 from sympflow.learning.reading import Run
-from sympflow.learning.smoothing import Smooth, smoothed
-from sympflow.learning.symplecticity import DAMPED, Reading, best_by_increments, forced, free_reading
+from sympflow.learning.smoothing import Smooth
+from sympflow.learning.symplecticity import DAMPED, Reading, affords, best_by_increments, forced, free_reading, sample
 from sympflow.learning.trajectories import Trajectories
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training import checkpoint as checkpoints
@@ -49,7 +51,7 @@ from sympflow.training.starts import step_of
 from sympflow.training.trainer import train
 
 SHARE = 3  # of families that are still to be tried, whose time is given to the next
-MANY = 20  # numbers of a model that is simplified before its orbits are followed
+PRUNINGS = 3  # of a model by smooth curves, after each of which they tell its numbers anew
 HOPELESS = 2.0  # squares of increments, over those of the best model, from which a model is one of the last
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable
@@ -65,18 +67,21 @@ CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
 SYMPLECTIC = 1e-9  # defect of a field, up to which it is of an H
 GROWS = 4.0  # standard errors below 0, from which a negative friction is no chance
 DRAG_STEPS = 20  # of a Gauss method in Δt, with a force that has a kink
+SCATTERED = 400  # states at which 𝓗 is looked at
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
-def drive_frequency_of(constraints: Constraints, smooth: Smooth) -> float:
-    """The angular frequency of a drive, by slopes beside those of a library of terms and friction."""
+def frequencies_of(constraints: Constraints, smooth: Smooth) -> tuple[float, ...]:
+    """The angular frequencies of one drive or two, by slopes beside those of a library of terms and friction."""
+    smooth = smooth.some(MOST_SLOPES)
     d, x = constraints.ndof, smooth.points
     if not len(x):
         raise ValueError("`drive` cannot be found without successive points that have all values: give its frequency.")
     fields = library_for(None, d, 4, x)[0].fields(x)
-    resistance = fields_of(constraints.force or frictions, x)
+    X = np.concatenate([fields, fields_of(constraints.force or frictions, x)], axis=2)
     base = constraints.driven(1.0)
-    return drive_frequency(np.concatenate([fields, resistance], axis=2), smooth, constraints.scales, base)
+    found = driven(X, smooth, constraints.scales, base)[1]
+    return tuple(found or [drive_frequency(X, smooth, constraints.scales, base)])
 
 
 @dataclass(frozen=True)
@@ -148,11 +153,9 @@ def without_growth(found: Fitted) -> Fitted:
     errors = np.sqrt(np.diag(covariance))
     worst = int(np.argmin(np.where(growing, theta / errors, np.inf)))
     if theta[worst] < -GROWS * errors[worst]:
-        warnings.warn(
+        warn(
             f"`damping` is {theta[worst]:.2g} ± {errors[worst]:.1g} by the data, whose energy grows: it is taken as 0. "
-            "Look at the order of the times and the sign of the momenta, or leave `damping` out.",
-            UserWarning,
-            stacklevel=5,
+            "Look at the order of the times and the sign of the momenta, or leave `damping` out."
         )
     moved = covariance[:, growing] @ np.linalg.pinv(covariance[np.ix_(growing, growing)]) @ theta[growing]
     return replace(found, theta=np.where(growing, 0.0, theta - moved))
@@ -252,9 +255,9 @@ class Search:
             deadline = deadline.part(1 - max(TABLE_SHARE, min(0.6, TABLE_SECONDS / session.time_budget)))
         self.late = deadline.over
         setting = replace(self.setting, stop=deadline.over)
-        total = sum(1 for name in names for _ in FAMILIES[name].models(self.constraints))
-        with session.bar(total, "Models") as self.bar:
-            queue = self._ask(names, setting, session)
+        groups = sorted((g for name in names for g in self.constraints.groups(name)), key=lambda group: group.assumed)
+        with session.bar(sum(len(group.models) for group in groups), "Models") as self.bar:
+            queue = self._ask(groups, setting, session)
             if self.best is not None:
                 self.final, self.cut = self.winner[1], deadline.over()
                 return
@@ -279,26 +282,27 @@ class Search:
         candidate, self.final, _ = self.winner
         if not deadline.over():
             smooth = replace(setting, seen=None) if self.winner[2].lag else setting
-            found = fitted(candidate.model, self.whole or self.all, smooth, self.final)
+            found = refitted(self.final, self.whole or self.all, smooth, longer=True)
             shorter = found.span < self.final.span or not math.isfinite(found.fit.cost)
             self.final = self.final if setting.stop() and shorter else found
         self.final = without_growth(self.final)
         self.cut = deadline.over()
 
-    def _ask(self, names: list[str], setting: Setting, session: Session) -> list[tuple[bool, list[Candidate]]]:
+    def _ask(self, groups: list[Group], setting: Setting, session: Session) -> list[tuple[bool, list[Candidate]]]:
         """Keep the best of the simple models if no H explains the data, which is known before any other is fitted.
 
         Where increments say so, orbits of that model are compared with those of another reading. The models of the
         families are returned in the order in which they are to be tried, with True for those that are linear: those
         that leave much more of increments than the best of all are the last.
         """
-        queue = [(FAMILIES[name].linear, [*FAMILIES[name].models(self.constraints)]) for name in names]
+        smooth = sample(self.folds[0][0])
+        queue = [(g.family.linear, [c for one in g.models for c in self._sparse(one, smooth)]) for g in groups]
         linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
-        drive = None
-        if self.constraints.frequency is None and not self.data.velocities and not self.late():
-            drive = self._drive()
+        drives: tuple[Drive, ...] = ()
+        if not (self.constraints.frequencies or self.data.velocities or self.late()):
+            drives = self._drives()
         models = [candidate.model for candidate in linear]
-        found = best_by_increments(*self.folds[0], models, drive, setting.stop)
+        found = best_by_increments(*self.folds[0], models, drives, setting.stop)
         if found is None:
             return queue
         place, self.reading, squares = found
@@ -313,22 +317,19 @@ class Search:
         hopeless = [id(linear[k]) for k in squares if squares[k] > HOPELESS * squares[place]]
         kept = [(kind, [c for c in some if id(c) not in hopeless]) for kind, some in queue]
         # H = T(p) + V(q) is tried first, unless functions H(q, p) alone explain increments; networks last
-        separable = [name for name in names if FAMILIES[name].separable]
-        promising = any(
-            of for (_, of), name in zip(kept, names, strict=True) if name in separable and FAMILIES[name].linear
-        )
-        apart = bool(squares) and not promising
+        separable = [group.family.separable for group in groups]
+        apart = not any(of and kind and apart for (kind, of), apart in zip(kept, separable, strict=True))
         judged = [any(id(c) in map(id, linear) for c in of) for _, of in queue]
-        order = sorted(range(len(names)), key=lambda i: (not judged[i], apart and names[i] in separable))
+        order = sorted(range(len(groups)), key=lambda i: (not judged[i], apart and separable[i]))
         late = [(True, [c for c in some if id(c) in hopeless]) for _, some in queue]
         return [group for group in [*(kept[i] for i in order), *late] if group[1]]
 
-    def _drive(self) -> Drive | None:
-        """A drive of the likeliest frequency; None where the data cannot tell one."""
-        smooth = smoothed(self.data)
+    def _drives(self) -> tuple[Drive, ...]:
+        """Drives of the likeliest frequencies; none where the data cannot tell them."""
+        smooth = self.data.smooth
         if len(np.unique(smooth.owner)) < 2 or len(smooth.points) < 4 * self.constraints.driven(1.0).n:
-            return None
-        return self.constraints.driven(drive_frequency_of(self.constraints, smooth))
+            return ()
+        return tuple(map(self.constraints.driven, frequencies_of(self.constraints, smooth)))
 
     def _first_fold(self, model: Model, setting: Setting) -> tuple[Fitted, Held]:
         """A model that is fitted to the first division of the trajectories, and what it leaves of the others there."""
@@ -345,21 +346,19 @@ class Search:
             over = self.best is not None and (self.best[2].exact or setting.stop())
             if over or worse == 2 or not self._affords(candidate):
                 return
-            sparse = self._sparse(candidate, setting)
-            made = None if sparse is None else self._try(sparse, setting, session)
-            if made is None or not (made[2].explained or setting.stop()):
-                made = self._try(candidate, setting, session)
+            made = self._try(candidate, setting, session)
             better = best is None or gains(best[2], made[2])
             worse, best = (0, made) if better else (worse + 1, best)
 
-    def _sparse(self, candidate: Candidate, setting: Setting) -> Candidate | None:
-        """A model of many numbers whose orbits take long, without the terms that short orbits do not ask for."""
-        if candidate.model.n < MANY or not candidate.model.lagrangian:
-            return None
-        found = fitted(candidate.model, self.data, replace(setting, sketch=True), seed=self.seed)
-        if not math.isfinite(found.fit.cost):
-            return None
-        return pruned(candidate, found.theta, found.fit.normal.precision(), self.data.n_values)
+    def _sparse(self, candidate: Candidate, data: Trajectories) -> list[Candidate]:
+        """A model by Lagrange's equations, before it the same without the terms that smooth curves do not ask for."""
+        found = candidate
+        for _ in range(PRUNINGS if candidate.model.lagrangian and affords(data, candidate.model) else 0):
+            fewer = None if self.late() else pruned(found, *told(found.model, data), data.n_values)
+            if fewer is None:
+                break
+            found = fewer
+        return [candidate] if found is candidate else [found, candidate]
 
     def _affords(self, candidate: Candidate) -> bool:
         """True if there are more numbers than the model and the initial states have."""
@@ -439,22 +438,18 @@ class Search:
         if held.explained:
             share = float(np.min(self.winner[1].sigma / self.data.scales))
             if share > SILENT:
-                warnings.warn(
+                warn(
                     f"The best model, {candidate.name}, explains next to nothing: the noise that it leaves is "
                     f"{share:.0%} of the spread of every coordinate or more. Points may be in no order, of other "
-                    "trajectories or too far apart; else there is only noise.",
-                    UserWarning,
-                    stacklevel=4,
+                    "trajectories or too far apart; else there is only noise."
                 )
             elif self.unseen:
-                warnings.warn(remark_on(self.unseen), UserWarning, stacklevel=4)
+                warn(remark_on(self.unseen))
             return
         if not math.isfinite(held.loudness):
-            warnings.warn(
+            warn(
                 f"The time budget ended before the best model, {candidate.name}, was compared with held-out "
-                "trajectories: give it more.",
-                UserWarning,
-                stacklevel=4,
+                "trajectories: give it more."
             )
             return
         said = (
@@ -475,17 +470,16 @@ class Search:
                     f"{free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
                 )
             if free.remedy:
-                warnings.warn(f"{said} {free.remedy}", UserWarning, stacklevel=4)
+                warn(f"{said} {free.remedy}")
                 return
-        smooth = smoothed(self._whole(self.data))
+        smooth = self._whole(self.data).smooth
         otherwise = "Give more trajectories, say what is known of H, or give the `noise` if it is larger than it looks."
         if self.cut:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
-        library, drive = library_for(None, self.data.ndof, 4, smooth.points)[0], None
-        if self.constraints.frequency is not None:
-            drive = self.constraints.driven(candidate.model.frequency(self.winner[1].theta))
-        said += " " + hint(library, smooth, self.data, otherwise, self.constraints.force, drive)
-        warnings.warn(said, UserWarning, stacklevel=4)
+        library = library_for(None, self.data.ndof, 4, smooth.points)[0]
+        drives = [self.constraints.driven(w) for w in candidate.model.frequencies(self.winner[1].theta)]
+        found = hint(library, smooth, self.data, self.constraints.force, drives)
+        warn(f"{said} {found or otherwise}")
 
     def freedom(self, setting: Setting) -> Freedom | None:
         """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
@@ -523,7 +517,9 @@ class Search:
             share = max(share, left / held.squares(scales))
             if not gains(held, theirs) or not share < (DAMPED if reading.numbers else FREER):
                 return None
-        return Freedom(reading.said, reading.remedy(fit.theta), share, *reading.test(fit.theta, fit.states.T, scales))
+        return Freedom(
+            reading.cause.said, reading.remedy(fit.theta), share, *reading.test(fit.theta, fit.states.T, scales)
+        )
 
     def _affords_field(self, model: Field) -> bool:
         return model.n <= MOST_TERMS and self.numbers > 2 * model.n
@@ -539,11 +535,7 @@ class Search:
             if len(thetas) > 1 and session.deadline.over():
                 break
         if len(thetas) < n:
-            warnings.warn(
-                f"The time budget ended the bootstrap after {len(thetas)} of {n} replicas: bands are rough.",
-                UserWarning,
-                stacklevel=4,
-            )
+            warn(f"The time budget ended the bootstrap after {len(thetas)} of {n} replicas: bands are rough.")
         return Replicas(model, self.final.method, self.final.theta, np.stack(thetas), len(self.all.runs))
 
     # the flow ---------------------------------------------------------------------------------------------------------
@@ -587,7 +579,7 @@ class Search:
         if not data.velocities:
             return data
         model, theta = self.winner[0].model, self.winner[1].theta
-        runs = zip(data.runs, smoothed(data).states, strict=True)
+        runs = zip(data.runs, data.smooth.states, strict=True)
         return replace(data, runs=tuple(Run(run.t, model.states(theta, y)) for run, y in runs), velocities=False)
 
     def _domain(self) -> tuple[Box | Tube, np.ndarray]:
@@ -606,10 +598,12 @@ class Search:
         domain: Domain
         domain, states = self._domain()
         energies = model.hamiltonian(found.theta, states.T)
-        start, options = 0.0, {}
-        frequency = model.frequency(found.theta)
-        if frequency is not None:
-            start, options = float(self.all.runs[0].t[0]), {"time": "t", "period": 2 * math.pi / frequency}
+        start = 0.0
+        options: dict[str, Any] = {}
+        frequencies = model.frequencies(found.theta)
+        if frequencies:
+            period = 2 * math.pi / frequencies[0] if len(frequencies) == 1 else None
+            start, options = float(self.all.runs[0].t[0]), {"time": "t", "period": period}
         elif isinstance(domain, Box) and np.isfinite(energies).all():
             top = float(energies.max())
             domain = EnergySublevel(top + MARGIN * (top - float(energies.min())), domain)
@@ -648,17 +642,15 @@ class Search:
         if system.separable and still and self._is_worse(flow):
             flow, told = self._collocated(system, dt), []
         for warning in told:
-            warnings.warn(str(warning.message), warning.category, stacklevel=3)
+            warn(str(warning.message), warning.category)
         flow.figures = {**flow.figures, **self.figures(flow.dt)}
         whole = still and not isinstance(system, DoubledSystem)
         flow.figures["energy_scatter"] = self.energy_scatter(flow) if whole and not session.deadline.over() else None
         if self._is_worse(flow):
             error, noise = flow.figures["one_step_error"], flow.figures["noise"]
-            warnings.warn(
+            warn(
                 f"The flow is worse than the H that was learned: its one-step error is {error:.1e}, the noise "
-                f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme.",
-                UserWarning,
-                stacklevel=4,
+                f"{noise:.1e}. Give a longer `time_budget` or a shorter `dt`, or solve `flow.system` with a scheme."
             )
         flow.history = self.history
         physical = system.physical if isinstance(system, DoubledSystem) else system
@@ -700,7 +692,7 @@ class Search:
             except ValueError as error:
                 if dt is None:
                     raise
-                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+                warn(f"{error} The flow that was made has its own.")
             return train(system, None, progress=session.progress, seed=self.seed, **options)
 
     def _collocated(self, system: HamiltonianSystem, dt: float | None) -> FlowMap:
@@ -716,7 +708,7 @@ class Search:
             try:
                 return SympFlow.collocated(system, dt=dt, states=states)
             except ValueError as error:
-                warnings.warn(f"{error} The flow that was made has its own.", UserWarning, stacklevel=4)
+                warn(f"{error} The flow that was made has its own.")
         return SympFlow.collocated(system, dt=step, states=states)
 
     def _is_worse(self, flow: FlowMap) -> bool:
@@ -755,7 +747,8 @@ class Search:
 
     def energy_scatter(self, flow: FlowMap) -> float | None:
         """The standard deviation of 𝓗 along a held-out trajectory, in their mean; None where no state is whole."""
-        runs = [run.y[:, np.isfinite(run.y).all(axis=0)] for run in self._whole(self.held).runs]
+        step = 1 + self.held.n_points // SCATTERED
+        runs = [run.y[:, np.isfinite(run.y).all(axis=0)][:, ::step] for run in self._whole(self.held).runs]
         energies = self._energy(flow, np.concatenate(runs, axis=1).T)
         along = np.split(energies, np.cumsum([y.shape[1] for y in runs])[:-1])
         scatter = [float(np.std(values)) for values in along if len(values) > 1]

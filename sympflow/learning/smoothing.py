@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from sympflow.learning.reading import Run
-from sympflow.learning.trajectories import Trajectories
 
-FEWEST = 6
-"""Points of a coordinate from which a curve is made; with fewer there are differences."""
+FEWEST = 6  # Points of a coordinate from which a curve is made; with fewer there are differences
 WIDTHS = (5, 7, 9, 13, 19, 27, 39, 55)
 """Points of the windows in which a polynomial is fitted, for the value and the slope in their middle."""
-WINDOW, DEGREE = 6, 3
-"""Points of a window from which the noise is estimated, and the degree of all polynomials."""
+WINDOW, DEGREE = 6, 3  # Points of a window from which the noise is estimated, and the degree of all polynomials
 
 
 @dataclass(frozen=True)
@@ -28,15 +27,29 @@ class Smooth:
     times: np.ndarray  # (m,): Their times, and the places of their trajectories
     owner: np.ndarray  # (m,)
     sigma: np.ndarray  # (2d,): The noise of each coordinate, 0 if the trajectories are too short to tell it
+    step: float  # The median time from one of all points to the next
+
+    @cached_property
+    def longest(self) -> float:
+        """The longest time along one trajectory."""
+        return max(float(np.ptp(self.times[self.owner == i])) for i in np.unique(self.owner))
+
+    def some(self, most: int) -> Smooth:
+        """The same with so many of the points at most, drawn at random."""
+        if len(self.points) <= most:
+            return self
+        drawn = np.sort(np.random.default_rng(0).permutation(len(self.points))[:most])
+        one = self.points[drawn], self.slopes[drawn], self.times[drawn], self.owner[drawn]
+        return Smooth(self.states, self.rates, *one, self.sigma, self.step)
 
 
-def smoothed(data: Trajectories) -> Smooth:
+def smoothed(runs: Sequence[Run], velocities: bool) -> Smooth:
     """Local cubic polynomials through each coordinate, the width of their windows by leave-one-out cross-validation.
 
     Of trajectories with fewer than six points the derivatives are differences, at the mean of two states. Velocities
     that are missing are the derivatives of the positions.
     """
-    runs = [_with_velocities(run) for run in data.runs] if data.velocities else data.runs
+    given, runs = runs, [_with_velocities(run) for run in runs] if velocities else runs
     made = [_curve(run) for run in runs]
     middle = np.nanmean(np.concatenate([run.y for run in runs], axis=1), axis=1)
     states = tuple(np.where(np.isfinite(one[0]), one[0], middle[:, None]) for one in made)
@@ -48,10 +61,11 @@ def smoothed(data: Trajectories) -> Smooth:
     times = np.concatenate([one[4] for one in made])
     owner = np.repeat(np.arange(len(made)), [len(one[4]) for one in made])
     known = np.isfinite(points).all(1) & np.isfinite(slopes).all(1)
-    noise = np.concatenate([_roughness(run) for run in data.runs], axis=1)
+    noise = np.concatenate([_roughness(run) for run in given], axis=1)
     noise[np.isnan(noise).all(axis=1)] = 0.0
-    sigma = np.zeros(2 * data.ndof) if noise.shape[1] == 0 else np.sqrt(_middle(noise))
-    return Smooth(states, rates, points[known], slopes[known], times[known], owner[known], sigma)
+    sigma = np.zeros(len(noise)) if noise.shape[1] == 0 else np.sqrt(_middle(noise))
+    step = float(np.median(np.concatenate([np.diff(run.t) for run in runs])))
+    return Smooth(states, rates, points[known], slopes[known], times[known], owner[known], sigma, step)
 
 
 def _with_velocities(run: Run) -> Run:

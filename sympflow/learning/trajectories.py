@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import MAX_ASKED_VALUES, floats, plain, real_number
+from sympflow.arguments import MAX_ASKED_VALUES, checked_count, floats, plain, warn
 from sympflow.flow.scaling import Scaling
 from sympflow.learning.reading import (
     OBSERVED,
@@ -31,9 +30,11 @@ from sympflow.learning.reading import (
     rows_of,
     width_of,
 )
+from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.show.cards import Card, Shown
 from sympflow.show.pictures import MOST_LINES, trajectory_figure
 from sympflow.show.style import saved
+from sympflow.storage.layout import imported
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -97,6 +98,7 @@ class Trajectories(Shown):
             - A table of pandas with a row for each time, or a CSV or Parquet file of one: columns for the trajectory,
               the time and the coordinates.
             - A Dataset of xarray as `to_xarray` makes it, or a NetCDF file or zarr store of one.
+            - A list of dictionaries or tables, one or more trajectories each; or of dictionaries of a row each.
 
             NaN marks a value that is missing. Points without any value are left out. A trajectory whose times all
             descend is turned around.
@@ -137,10 +139,8 @@ class Trajectories(Shown):
         >>> Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)]))).ndof
         1
         """
-        if ndof is not None and not (real_number(ndof) and 1 <= ndof < MAX_ASKED_VALUES and ndof == int(ndof)):
-            raise ValueError(
-                f"`ndof` must be a positive integer, the degrees of freedom; got {ndof!r}: or leave it out."
-            )
+        if ndof is not None:
+            checked_count("ndof", ndof, 1, MAX_ASKED_VALUES, "a positive integer, the degrees of freedom, or left out")
         if observed not in OBSERVED:
             raise ValueError(f"`observed` must be one of {', '.join(OBSERVED)}; got {observed!r}.")
         if observed != "qp" and velocity_mass is not None:
@@ -160,6 +160,14 @@ class Trajectories(Shown):
             order = "halves"
         elif isinstance(data, str | Path):
             return cls.read(opened(Path(data)), ndof, **given, **converted)
+        elif isinstance(data, list | tuple) and data and all(map(_is_named, data)):
+            if not any(np.ndim(value) for one in data for value in dict(one).values()):  # a row each
+                return cls.read(imported("pandas", "Reading rows").DataFrame(data), ndof, **given, **converted)
+            parts = [cls.read(one, ndof, **given, **converted) for one in data]
+            if len({part.names for part in parts}) > 1:
+                said = "; ".join(sorted({", ".join(part.names) for part in parts}))
+                raise ValueError(f"`data` has parts with different coordinates, {said}: give all the same names.")
+            return replace(parts[0], runs=tuple(run for part in parts for run in part.runs))
         else:
             found, names = list(of_arrays(data)), ()
         if not found:
@@ -219,6 +227,11 @@ class Trajectories(Shown):
             rates = np.concatenate([np.diff(run.y) / np.diff(run.t) for run in self.runs], axis=1)
             spread[missing] = np.nanstd(np.roll(rates, self.ndof, axis=0)[missing], axis=1)
         return np.where(spread > 0, spread, 1.0)
+
+    @cached_property
+    def smooth(self) -> Smooth:
+        """Smooth curves through the trajectories, with their slopes, and the noise."""
+        return smoothed(self.runs, self.velocities)
 
     @cached_property
     def time_scale(self) -> float:
@@ -281,11 +294,9 @@ class Trajectories(Shown):
                     "machine: give `units`, or numbers nearer to 1."
                 )
             if seen.size and abs(seen.mean()) > FAR * seen.std() > 0:
-                warnings.warn(
+                warn(
                     f"`trajectories` have {name} about {seen.mean():.3g}, {abs(seen.mean()) / seen.std():.1g} times "
-                    "its spread, by which powers of it lose their digits: subtract that from it.",
-                    UserWarning,
-                    stacklevel=4,
+                    "its spread, by which powers of it lose their digits: subtract that from it."
                 )
 
     def split(self, share: float = 0.2, seed: int = 0) -> tuple[Trajectories, Trajectories]:
@@ -412,6 +423,11 @@ def _cut(run: Run, points: int, span: float) -> Iterator[Run]:
 def _labelled(runs: Sequence[Run]) -> Iterator[Found]:
     for i, run in enumerate(runs):
         yield f"trajectory {i}", run.t, run.y
+
+
+def _is_named(data: Any) -> bool:
+    """True of a dictionary, a table or a Dataset."""
+    return isinstance(data, Mapping) or _is_a("pandas", "DataFrame", data)
 
 
 def _is_a(library: str, kind: str, data: Any) -> bool:

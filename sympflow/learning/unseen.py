@@ -14,15 +14,11 @@ from sympflow.learning.reading import Run
 
 SAME = 1e-3
 """Variance of a function over the data, in that over a box around them, below which it is the same at all points."""
-CHANCE = 3.0
-"""Variance of a function, in that which the errors of the states make, up to which it may be all chance."""
-MOST_SQUARES = 12
-"""Coordinates up to which functions of degree 2 are looked at, beside those of degree 1."""
-SLIGHT = 0.05
-"""Share of the largest term of a function, below which another is left out of its text."""
+CHANCE = 3.0  # Variance of a function, in that which the errors of the states make, up to which it may be all chance
+MOST_SQUARES = 12  # Coordinates up to which functions of degree 2 are looked at, beside those of degree 1
+SLIGHT = 0.05  # Share of the largest term of a function, below which another is left out of its text
 SAMPLED = 4000
-RADIUS = 0.1
-"""Radius of a domain around a trajectory, in the spread of each coordinate."""
+RADIUS = 0.1  # Radius of a domain around a trajectory, in the spread of each coordinate
 
 
 def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part: Part | None = None) -> list[sp.Expr]:

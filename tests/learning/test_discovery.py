@@ -10,7 +10,6 @@ import sympflow
 from sympflow.learning.library import Library, coordinates, library_for, polynomials
 from sympflow.learning.orbits import Gauss, Method
 from sympflow.learning.shooting import Problem, minimized
-from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import damped_pendulum, pendulum
 
@@ -180,33 +179,6 @@ def test_the_hamiltonian_behind_a_flow():
     np.testing.assert_allclose(sorted(record.coefficients), [-1.0, 0.5], rtol=1e-3)
 
 
-def test_bad_arguments_are_refused():
-    data = measured(pendulum(), 0.01, n=1)
-    with pytest.raises(ValueError, match="`data` has 62 values, 60 beside the initial states, and the library"):
-        sympflow.discover(data, degree=12)
-    for argument, value in (("degree", 1.5), ("most_terms", 0), ("seed", -1)):
-        with pytest.raises(ValueError, match=f"`{argument}` must be an integer"):
-            sympflow.discover(data, **{argument: value})
-    with pytest.raises(ValueError, match="`terms` is an empty list: name terms, or some of polynomials, "):
-        sympflow.discover(data, [])
-    with pytest.raises(ValueError, match=r"`terms` has 'x\*\*2': `expression` holds x"):
-        sympflow.discover(data, ["x**2"])
-    with pytest.raises(ValueError, match=r"`terms` has 'q2', which holds q2: write it in q1 … q1"):
-        sympflow.discover(data, ["q2"])
-    with pytest.raises(ValueError, match="is a constant"):
-        sympflow.discover(data, ["3"])
-    with pytest.raises(ValueError, match="not finite at the data"):
-        sympflow.discover(data, ["sqrt(q - 100)"])
-    with pytest.raises(ValueError, match="`noise` must be"):
-        sympflow.discover(data, noise=-1.0)
-    with pytest.raises(ValueError, match="`held_out` must be"):
-        sympflow.discover(data, held_out=1.0)
-    with pytest.raises(ValueError, match="`loss` must be one of squares, huber"):
-        sympflow.discover(data, loss="absolute")
-    with pytest.raises(ValueError, match="`piece` must be"):
-        sympflow.discover(data, piece=0.0)
-
-
 def test_the_gain_of_a_term_is_what_its_fit_gains():
     """An H(q, p) that is not separable; the linear model of a small coefficient is right to its size."""
     library = Library([q**2, sp.cos(q), p**2, p**2 * q**2], 1)
@@ -239,7 +211,7 @@ def test_outliers_are_left_to_hubers_loss():
 
 def test_noise_and_slopes_are_seen_without_a_model():
     _, y = measured(pendulum(), 0.02, n=20)
-    curves = smoothed(Trajectories.read((t, y)))
+    curves = Trajectories.read((t, y)).smooth
     np.testing.assert_allclose(curves.sigma, 0.02, rtol=0.25)
     field = pendulum().vector_field(curves.points)
     assert np.std(curves.slopes - field) < 0.1 * np.std(field)

@@ -1,7 +1,6 @@
 """A flow from trajectories: shooting recovers H to rounding, to what the noise allows, and says what it did."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,16 +9,15 @@ from scipy.integrate import solve_ivp
 
 import sympflow
 from sympflow.learning.families import FAMILIES, Candidate, pruned
-from sympflow.learning.fitting import Held, Setting, fitted, judged, left_out, restored
+from sympflow.learning.fitting import Setting, fitted, judged, left_out, restored
 from sympflow.learning.inertia import Inertia
-from sympflow.learning.learner import MOST_VALUES, _constraints, _cut, _divided, _few
+from sympflow.learning.learner import _constraints
 from sympflow.learning.library import Library, Terms
 from sympflow.learning.models import Model, drags, friction
 from sympflow.learning.orbits import Gauss, Method, first_states
-from sympflow.learning.parts import Distances, Drive, FixedKinetic, Formula, Kinetic, Network, Polynomial, Waves
+from sympflow.learning.parts import Distances, Drive, Fixed, Network, Polynomial, Waves, kinetic, known_kinetic
 from sympflow.learning.search import Replicas, Search, replica, without_growth
 from sympflow.learning.shooting import Problem, chosen_method, matched, minimized
-from sympflow.learning.smoothing import smoothed
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.session import Session
@@ -44,7 +42,7 @@ def trajectories(n, points, rate=0.0, noise=0.0, span=2.0, seed=0):
 
 def quartic(data, force=None):
     q, p = data.scales
-    return Model(1, (Kinetic([p]), Polynomial.up_to(4, "q", [q])), force)
+    return Model(1, (kinetic([p]), Polynomial.up_to(4, "q", [q])), force)
 
 
 def problem(model, data, sigma, **options):
@@ -133,7 +131,7 @@ def test_noise_and_standard_errors_are_those_of_the_data():
     deviations, sigmas = [], []
     for seed in range(6):
         data = Trajectories.read(trajectories(8, 15, noise=0.02, seed=seed))
-        model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+        model = Model(1, (known_kinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
         theta, fit = problem(model, data, np.full(2, 0.02))
         found = minimized(fit, theta, first_states(data))
         deviations.append((found.theta - [STIFF / 2, QUARTIC / 4]) / np.sqrt(np.diag(found.covariance())))
@@ -179,7 +177,8 @@ PARTS = [
     Distances.between(np.array([[0], [1]]), (-2, 0, 1), 1.3),
     Distances(np.array([[0, 1]]), [(0, None, -1), (0, None, 0), (0, None, 3)], 1.3),
     Inertia(Waves.up_to(1, 1, "q", np.ones(1), np.array([2 * np.pi]), constant=True)),
-    Formula("q", sympy.sin(Q[0]) * Q[1] ** 2, Q),
+    Fixed(Terms(Library([sympy.sin(Q[0]) * Q[1] ** 2], 2), "q"), np.ones(1)),
+    kinetic([1.3, 0.9]),
     Terms(Library([Q[0] ** 2 * Q[1], sympy.cos(Q[0] - Q[1]), 1 / Q[1]], 2), "q"),
     Terms(Library([Q[0] ** 2, Q[0] * Q[1]], 2), "q"),
 ]
@@ -210,7 +209,7 @@ def test_a_fit_ends_within_an_orbit_when_its_time_is_up(part):
     """At any step: the time is asked for at every point of the orbits, and what was fitted is kept."""
     t = np.linspace(0, 20, 101)
     data = Trajectories.read([(t, np.stack([a * np.cos(t), np.sin(t), -a * np.sin(t), np.cos(t)])) for a in (0.5, 1)])
-    model, asked = Model(2, (Kinetic([1.0, 1.0]), part)), []
+    model, asked = Model(2, (kinetic([1.0, 1.0]), part)), []
     for most in (0, 3, 40, 400):
         asked.clear()
 
@@ -390,31 +389,67 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
 RELATIVISTIC = sympflow.HamiltonianSystem.from_sympy("sqrt(1 + p**2) + 0*q")
 
 
+LEARN, DISCOVER, BOTH = (sympflow.learn,), (sympflow.discover,), (sympflow.learn, sympflow.discover)
+REFUSED = [
+    (BOTH, {"ndof": "1"}, "`ndof` must be a positive integer"),
+    (BOTH, {"ndof": 1.5}, "`ndof` must be a positive integer"),
+    (BOTH, {"ndof": True}, "`ndof` must be a positive integer"),
+    (BOTH, {"noise": "a"}, "`noise` must be made of real numbers"),
+    (BOTH, {"noise": np.nan}, "`noise` must be a standard deviation"),
+    (BOTH, {"noise": -1.0}, "`noise`"),
+    (BOTH, {"loss": "absolute"}, "`loss` must be one of squares, huber"),
+    (BOTH, {"seed": -1}, "`seed` must be an integer"),
+    (LEARN, {"seed": "x"}, "`seed` must be an integer"),
+    (LEARN, {"family": "unknown"}, "`family`"),
+    (LEARN, {"damping": 0.1}, "`damping`"),
+    (LEARN, {"damping": [1]}, "`damping`"),
+    (LEARN, {"drive": -1.0}, "`drive`"),
+    (LEARN, {"drive": [1.0, 0.0]}, "`drive`"),
+    (LEARN, {"drive": np.nan}, "`drive`"),
+    (LEARN, {"drive": 1.0, "separable": False}, "`drive`"),
+    (LEARN, {"drive": True, "damping": "quadratic"}, "`drive` .* not beside drag"),
+    (LEARN, {"drive": np.float32(1.0), "known": RELATIVISTIC}, "`drive` .* `known`"),
+    (LEARN, {"mass": 1.0, "separable": False}, "`mass`"),
+    (LEARN, {"dt": -1.0}, "`dt`"),
+    (LEARN, {"replicas": 1}, "`replicas`"),
+    (DISCOVER, {"terms": 3}, "`terms`"),
+    (DISCOVER, {"terms": []}, "`terms` is an empty list: name terms, or some of polynomials, "),
+    (DISCOVER, {"terms": ["x**2"]}, r"`terms` has 'x\*\*2': `expression` holds x"),
+    (DISCOVER, {"terms": ["q2"]}, r"`terms` has 'q2', which holds q2: write it in q1 … q1"),
+    (DISCOVER, {"terms": ["3"]}, "`terms` .* is a constant"),
+    (DISCOVER, {"terms": ["sqrt(q - 100)"]}, "`terms` .* not finite at the data"),
+    (DISCOVER, {"held_out": "x"}, "`held_out` must be"),
+    (DISCOVER, {"held_out": 1.0}, "`held_out` must be"),
+    (DISCOVER, {"piece": "x"}, "`piece` must be"),
+    (DISCOVER, {"piece": 0.0}, "`piece` must be"),
+    (DISCOVER, {"progress": 3}, "`progress`"),
+    (DISCOVER, {"degree": 100}, "`degree` must be an integer"),
+    (DISCOVER, {"degree": 1.5}, "`degree` must be an integer"),
+    (DISCOVER, {"most_terms": 0}, "`most_terms` must be an integer"),
+    (DISCOVER, {"degree": 14}, "`data` has 96 values, 88 beside the initial states, and the library"),
+]
+
+
 @pytest.mark.parametrize(
-    ("runs", "options", "match"),
-    [
-        (1, {}, "one trajectory only"),
-        (4, {"noise": -1.0}, "`noise`"),
-        (4, {"family": "unknown"}, "`family`"),
-        (4, {"loss": "absolute"}, "`loss`"),
-        (4, {"damping": 0.1}, "`damping`"),
-        (4, {"drive": -1.0}, "`drive`"),
-        (4, {"drive": 1.0, "separable": False}, "`drive`"),
-        (4, {"drive": True, "damping": "quadratic"}, "`drive` .* not beside drag"),
-        (4, {"drive": np.float32(1.0), "known": RELATIVISTIC}, "`drive` .* `known`"),
-        (4, {"mass": 1.0, "separable": False}, "`mass`"),
-        (4, {"dt": -1.0}, "`dt`"),
-        (4, {"seed": "x"}, "`seed`"),
-    ],
+    ("make", "options", "match"), [(make, *rest) for makes, *rest in REFUSED for make in makes], ids=str
 )
-def test_what_cannot_be_learned_is_refused(runs, options, match):
+def test_what_cannot_be_learned_is_refused(make, options, match):
+    with pytest.raises((ValueError, TypeError), match=f"^{match}"):
+        make(trajectories(4, 12), **options)
+
+
+@pytest.mark.parametrize("make", BOTH)
+def test_numbers_without_powers_are_refused(make):
+    with pytest.raises(ValueError, match=r"^`trajectories` have q1 up to .*give `units`"):
+        make([(t, 1e80 * y) for t, y in trajectories(4, 12)])
+
+
+@pytest.mark.parametrize(
+    ("runs", "points", "match"), [(1, 6, "one trajectory only"), (2, 2, "fewer than the simplest model")]
+)
+def test_too_few_numbers_are_refused(runs, points, match):
     with pytest.raises(ValueError, match=match):
-        sympflow.learn(trajectories(runs, 6), **options)
-
-
-def test_too_few_numbers_are_refused():
-    with pytest.raises(ValueError, match="fewer than the simplest model"):
-        sympflow.learn(trajectories(2, 2))
+        sympflow.learn(trajectories(runs, points))
 
 
 def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
@@ -428,11 +463,11 @@ def test_a_killed_run_goes_on_from_its_checkpoint(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sympflow.learn(runs, dt=0.5, checkpoint=path, callback=interrupt)
+        sympflow.learn(runs, dt=0.5, family="polynomial", checkpoint=path, callback=interrupt)
     data = Trajectories.read(runs)
     search = Search(data, data.folds(0.2, 0), _constraints(data, None, None, False, None, None), Setting(), 0)
     with pytest.raises(ValueError, match="`resume` is a run with another"):
-        sympflow.learn(trajectories(6, 12, noise=0.02), dt=0.5, resume=path)
+        sympflow.learn(trajectories(6, 12, noise=0.02), dt=0.5, family="polynomial", resume=path)
     state = checkpoints.read(path)
     assert state["step"] == 2
     name, numbers = next(iter(state["optimizer"].items()))
@@ -459,11 +494,18 @@ T = np.linspace(0, 10, 51)
 CLOCKS = {
     "drive": (lambda t, q, p: [p, -q - q**3 + 0.3 * np.cos(1.7 * t)], r"drive=1\.(69|70)", {"drive": True}),
     "stiffness": (lambda t, q, p: [p, -(1 + 0.3 * np.cos(2.3 * t)) * q], r"drive=2\.(29|30)", {"drive": 2.3}),
+    "two drives": (
+        lambda t, q, p: [p, -q + 0.3 * np.cos(1.7 * t) + 0.2 * np.sin(2.9 * t)],
+        r"drive=\[1\.(69|70)\d*, 2\.(89|90)",
+        {"drive": True},
+    ),
     "drag": (lambda t, q, p: [p, -q - q**3 - 0.3 * abs(p) * p], 'damping="quadratic"', {"damping": "quadratic"}),
 }
 
 
-@pytest.fixture(scope="module", params=["drive", pytest.param("stiffness", marks=pytest.mark.slow), "drag"])
+@pytest.fixture(
+    scope="module", params=["drive", pytest.param("stiffness", marks=pytest.mark.slow), "two drives", "drag"]
+)
 def forced(request):
     """Noisy trajectories of what no H(q, p) explains, with the remedy that a warning names."""
     field, remedy, options = CLOCKS[request.param]
@@ -486,7 +528,7 @@ def test_drives_and_drag_are_named_with_the_remedy(forced):
 def test_drives_and_drag_are_learned(forced, tmp_path):
     """The orbits of what was learned, and is read from a file, are those without noise, to a part of it."""
     y, data, _, options = forced
-    flow = sympflow.learn(data, family="polynomial", time_budget=30, dt=0.25, **options)
+    flow = sympflow.learn(data, family="polynomial", time_budget=None, dt=0.25, **options)
     assert flow.figures["noise"] == pytest.approx(0.005, rel=0.1)
     flow.save(tmp_path / "flow.safetensors")
     flow = sympflow.load(tmp_path / "flow.safetensors")
@@ -496,17 +538,9 @@ def test_drives_and_drag_are_learned(forced, tmp_path):
     assert np.abs(made - y[:, :, :26]).max() < 0.01
 
 
-def test_orbits_that_diverge_are_left_out_of_the_region_of_a_flow():
-    data = Trajectories.read(trajectories(8, 15))
-    search = Search(data, [data.split(0.2, 0)], _constraints(data, None, None, False, None, None), Setting(), 0)
-    for lost, kept in ((np.array([[np.nan, 1.0], [2.0, 3.0]]), [[2.0, 3.0]]), (np.full((2, 2), np.inf), data.states)):
-        search.final = SimpleNamespace(states=lost)
-        assert np.array_equal(search._states(), kept)
-
-
 def test_replicas_tell_how_certain_a_prediction_is():
     data = Trajectories.read(trajectories(8, 15, noise=0.02))
-    model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+    model = Model(1, (known_kinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
     found = fitted(model, data, Setting())
     thetas = np.stack([replica((model, data, Setting(), found.theta, 0), k) for k in range(6)])
     replicas = Replicas(model, found.method, found.theta, thetas, 8)
@@ -526,7 +560,7 @@ def test_bands_cover_the_truth_as_often_as_they_say():
     times = np.linspace(0, 4, 5)
     field = lambda t, y: [y[1] / MASS, -STIFF * y[0] - QUARTIC * y[0] ** 3]  # noqa: E731
     true = solve_ivp(field, (0, 4), [0.5, 0.0], t_eval=times, rtol=1e-12, atol=1e-13).y
-    model = Model(1, (FixedKinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
+    model = Model(1, (known_kinetic(np.array([[1 / MASS]])), Polynomial("q", [[2], [4]], [1.0])))
     inside = []
     for seed in range(20):
         data = Trajectories.read(trajectories(9, 15, noise=0.05, seed=seed))
@@ -586,7 +620,7 @@ def test_chaotic_trajectories_are_followed_in_pieces():
     t = np.linspace(0, 100, 251)
     y = sympflow.solve(system, "kahan_li8", (0, 100), y0, t_eval=t, dt=0.05).y
     data = Trajectories.read((t, y + 5e-3 * np.random.default_rng(0).normal(size=y.shape)))
-    model = Model(2, (FixedKinetic(np.eye(2)), Polynomial("q", [[2, 0], [0, 2], [2, 1], [0, 3]], [1.0, 1.0])))
+    model = Model(2, (known_kinetic(np.eye(2)), Polynomial("q", [[2, 0], [0, 2], [2, 1], [0, 3]], [1.0, 1.0])))
     found = fitted(model, data, Setting())
     assert 5 < found.span < 50
     errors = np.sqrt(np.diag(found.fit.covariance()))
@@ -597,8 +631,8 @@ def test_chaotic_trajectories_are_followed_in_pieces():
 def test_residuals_beyond_the_noise_of_the_data_are_not_explained():
     """Silent residuals of a model that fits nothing, as of pieces too short to tell, count by their size."""
     data = Trajectories.read(trajectories(4, 16, noise=0.01))
-    wrong = Model(1, (FixedKinetic(np.eye(1)), Polynomial("q", [[2]], [1.0])))
-    setting = Setting(seen=smoothed(data).sigma)
+    wrong = Model(1, (known_kinetic(np.eye(1)), Polynomial("q", [[2]], [1.0])))
+    setting = Setting(seen=data.smooth.sigma)
     held = left_out(fitted(wrong, data, setting), data.folds(), setting)
     assert len(held.losses) == 4
     assert held.excess > 2
@@ -628,21 +662,13 @@ def test_a_coordinate_that_stands_still_is_refused():
         sympflow.learn([(t, y * [[1], [0]]) for t, y in trajectories(4, 6)])
 
 
-def test_of_many_numbers_a_part_chooses_the_model():
-    data = Trajectories.read((np.linspace(0, 1, 101), np.random.default_rng(0).normal(size=(300, 2, 101))))
-    few = _few(data, 0)
-    assert 0.98 * MOST_VALUES < few.n_values <= MOST_VALUES
-    assert any(run is not other for run, other in zip(few.runs, data.runs, strict=False))  # not the first ones
-    assert _few(few, 0) is few
-
-
 def test_networks_grow_no_steps():
     """A jump of the force by a coarse step of the data is met by a neuron of bounded slope, not by a step."""
     q = np.linspace(-1, 1, 41)
     runs = [(np.linspace(0, 1, 41), np.stack([q, np.sign(q + shift)])) for shift in (0.0, 0.01)]
     data = Trajectories.read(runs)
     network = Network("q", 3, data.scales[:1])
-    model = Model(1, (FixedKinetic(np.eye(1)), network))
+    model = Model(1, (known_kinetic(np.eye(1)), network))
     theta = matched(model, model.start(np.random.default_rng(0)), data, 1 / data.scales, 60)
     a = np.abs(theta[3:])
     assert a.max() < 40
@@ -670,84 +696,19 @@ def test_models_that_increments_rule_out_are_tried_last():
     data = Trajectories.read([(t, y + 0.003 * rng.normal(size=y.shape)) for t, y in runs])
     search = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0)
     names = ["polynomial", "network", "whole-polynomial", "whole-network"]
-    groups = [[c.name for c in some] for _, some in search._ask(names, Setting(), Session())]
+    asked = [group for name in names for group in search.constraints.groups(name)]
+    groups = [[c.name for c in some] for _, some in search._ask(asked, Setting(), Session())]
     assert groups[0][0] == "H(q, p) a polynomial of degree 4"
     assert all("network" in name for group in groups[1:3] for name in group)
     assert "T = ½ pᵀM⁻¹p, V a polynomial of degree 2" in groups[3]
     assert groups[4][:2] == ["H(q, p) a polynomial of degree 2", "H(q, p) a polynomial of degree 3"]
 
 
-def test_a_family_is_climbed_by_its_own_best():
-    """Two models are worse than another family, the third is far better; two that are no better end it."""
-    losses = {"other": 0.0, "2": 5.0, "3": 5.1, "4": -9.0, "5": -9.0, "6": -9.0, "8": -9.0}
-    data = Trajectories.read(trajectories(8, 15))
-    search, tried = Search(data, data.folds(), _constraints(data, None, None, False, None, None), Setting(), 0), []
-
-    def fit(candidate, setting, session):
-        tried.append(candidate.name)
-        held = Held((), (), np.full(3, losses[candidate.name]), 3, 0.5, 9, False, 1.0)
-        return candidate, SimpleNamespace(sigma=np.ones(2)), held
-
-    search._fit = fit
-    candidates = [Candidate(name, SimpleNamespace(n=1)) for name in losses]
-    search._climb(candidates[:1], Setting(), Session())
-    search._climb(candidates[1:], Setting(), Session())
-    assert tried == ["other", "2", "3", "4", "5", "6"]
-    assert search.best[0].name == "4"
-
-
-def test_a_long_run_is_cut_and_the_only_one_divided():
-    t = np.linspace(0, 60, 961)
-    one = Trajectories.read((t, np.stack([np.cos(t), -np.sin(t)])))
-    ((kept, held),) = _divided(one, 0)
-    assert (len(kept.runs), len(held.runs)) == (5, 3)
-    assert kept.n_points + held.n_points == 961
-    cut = _cut(one, rate=1.0)
-    assert [run.n_points for run in cut.runs] == [192, 192, 192, 192, 193]  # no piece of one point
-    assert _cut(one.pieces(20), rate=1.0).runs[0].n_points == 20
-    with pytest.raises(ValueError, match="one trajectory only"):
-        _divided(one.subset([0]).pieces(40).subset([0]), 0)
-
-
-HOSTILE = [
-    ({}, 1e80, ValueError, "`trajectories` have q1 up to .*give `units`"),
-    ({"ndof": "1"}, 1, ValueError, "`ndof` must be a positive integer"),
-    ({"ndof": 1.5}, 1, ValueError, "`ndof` must be a positive integer"),
-    ({"ndof": True}, 1, ValueError, "`ndof` must be a positive integer"),
-    ({"noise": "a"}, 1, TypeError, "`noise` must be made of real numbers"),
-    ({"noise": np.nan}, 1, ValueError, "`noise` must be a standard deviation"),
-]
-
-
-@pytest.mark.parametrize("make", [sympflow.learn, sympflow.discover])
-@pytest.mark.parametrize(("options", "factor", "error", "message"), HOSTILE)
-def test_hostile_input_is_refused_by_learn_and_discover(make, options, factor, error, message):
-    with pytest.raises(error, match=message):
-        make([(t, factor * y) for t, y in trajectories(4, 12)], **options)
-
-
-@pytest.mark.parametrize(
-    ("make", "options", "error"),
-    [
-        (sympflow.learn, {"damping": [1]}, ValueError),
-        (sympflow.learn, {"drive": np.nan}, ValueError),
-        (sympflow.discover, {"terms": 3}, TypeError),
-        (sympflow.discover, {"held_out": "x"}, ValueError),
-        (sympflow.discover, {"piece": "x"}, ValueError),
-        (sympflow.discover, {"progress": 3}, TypeError),
-        (sympflow.discover, {"degree": 100}, ValueError),
-    ],
-)
-def test_hostile_options_are_refused_by_name(make, options, error):
-    with pytest.raises(error, match=f"^`{next(iter(options))}`"):
-        make(trajectories(4, 12), **options)
-
-
 def test_units_of_any_size_give_the_same_formula():
     """A step of the fit knows no unit: q in 1e20, p in 1e-20, and all as integers, single numbers or objects."""
     t = np.linspace(0, 6, 31)
     y = np.array([y for _, y in orbits(t)]) * np.ones((1, 2, 1))
-    terms = ["p**2", "q**2", "q**3", "q**4", "q*p"]
+    terms = ["p**2", "q**2", "q**4", "q*p"]
     found = [sympflow.discover((t, y.astype(kind)), terms).discovery for kind in (float, np.float32)]
     found.append(sympflow.discover((t, y.astype(object) * np.array([[1e20], [1e-20]])), terms).discovery)
     for one in found:

@@ -347,3 +347,38 @@ def test_files_that_cannot_be_read_are_named(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=rf"^`data` names the file .*{name}.*cannot be read .*check that it is whole"):
         Trajectories.read(tmp_path / name)
+
+
+TABLES = [{"t": t, "q": RUN[0], "p": RUN[1]}, {"t": 2 * t, "q": 2 * RUN[0], "p": 2 * RUN[1]}]
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda pd: TABLES,
+        lambda pd: [pd.DataFrame(one) for one in TABLES],
+        lambda pd: pd.concat([pd.DataFrame(one).assign(run=i) for i, one in enumerate(TABLES)]).to_dict("records"),
+        lambda pd: pd.concat([pd.DataFrame(one).assign(run=i) for i, one in enumerate(TABLES)]).set_index(["run", "t"]),
+    ],
+    ids=["dictionaries", "tables", "rows", "times in the index"],
+)
+def test_tables_come_one_by_one_in_rows_or_with_an_index(made):
+    assert_same(Trajectories.read(made(pytest.importorskip("pandas"))), EACH)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ("tqpq", r"^`data` has more than one column q: drop one of them"),
+        (["t", "q", "qdot"], r"velocities, qdot, and no momenta: .* observed=\"qv\""),
+        (["t", "q1", "q2", "q1_dot", "dq2_dt"], r"velocities, q1_dot, dq2_dt, and no momenta"),
+    ],
+)
+@pytest.mark.parametrize("file", [False, True])
+def test_columns_of_one_name_and_velocities_are_told(columns, message, file, tmp_path):
+    pd = pytest.importorskip("pandas")
+    data = pd.DataFrame(np.column_stack([t, *FOUR])[:, : len(columns)], columns=[*columns])
+    if file:
+        data.to_csv(tmp_path / "run.csv", index=False)
+    with pytest.raises(ValueError, match=message):
+        Trajectories.read(tmp_path / "run.csv" if file else data)

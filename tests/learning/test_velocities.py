@@ -12,7 +12,7 @@ from sympflow.learning.lagrangian import lagrangian_start
 from sympflow.learning.learner import _constraints
 from sympflow.learning.models import Model, friction
 from sympflow.learning.orbits import first_states
-from sympflow.learning.parts import FixedKinetic, Kinetic, Polynomial
+from sympflow.learning.parts import Fixed, Polynomial, kinetic, known_kinetic
 from sympflow.learning.trajectories import Trajectories
 from sympflow.systems import double_pendulum
 
@@ -165,14 +165,14 @@ def test_only_the_factor_of_h_is_given():
     """(M⁻¹)₁₁ = 1 beside the numbers of all others."""
     constraints = Constraints(np.ones(4), None, None, None, np.full(4, np.inf), velocities=True, middle=np.zeros(2))
     model = constraints.separated(Polynomial.up_to(2, "q", np.ones(2)))
-    assert model.n == Kinetic([1.0, 1.0]).n - 1 + 5
-    assert isinstance(model.parts[0], FixedKinetic)
+    assert model.n == kinetic([1.0, 1.0]).n - 1 + 5
+    assert isinstance(model.parts[0], Fixed)
     W = model.field(np.ones(model.n), np.eye(4), True, False).slope[:2, 2:]
     assert np.broadcast_to(W, (2, 2, 4))[..., 0] == pytest.approx(np.array([[1.0, 1.0], [1.0, 2.0]]))
 
 
 def test_the_first_velocity_is_the_slope_of_the_positions():
     data, y = observations(PENDULUM, "q")
-    model = Model(1, (FixedKinetic(np.eye(1)),), velocities=True)
+    model = Model(1, (known_kinetic(np.eye(1)),), velocities=True)
     starts = first_states(data, model, np.zeros(0))
     assert starts[:, 1] == pytest.approx(2 * y[:, 1, 0], abs=0.02)  # of a cubic over 0.36
