@@ -391,7 +391,7 @@ def beside(t: Any, x: Array) -> Any:
         return np.float64(t) if type(t) is float else np.asarray(t, dtype=float)[()]  # 1/t at 0 is infinite, no error
     import torch
 
-    return torch.as_tensor(t, dtype=torch.float64, device=x.device)
+    return as_tensor(t).to(dtype=torch.float64, device=x.device)
 
 
 def detached(x: Any) -> Any:

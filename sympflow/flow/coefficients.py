@@ -11,11 +11,15 @@ from torch import Tensor, nn
 
 from sympflow.arrays import to_numpy
 from sympflow.flow.potentials import Time
-from sympflow.flow.tables import free_numbers
+from sympflow.flow.tables import Total, free_numbers
 
 
 class FreeTable(nn.Module):
-    """c_i(τ) = Σ_k c_ik f_k(τ), i = 1 … n, which enter as t^power c_i(t/Δt); the free c_ik are a parameter."""
+    """c_i(τ) = Σ_k c_ik f_k(τ), i = 1 … n, which enter as t^power c_i(t/Δt); the free c_ik are a parameter.
+
+    In a palindrome, c_i = c_{n+1−i}. With a `total`, Σ c_i is 1 for every value of the parameters: at τ = 0 ("start"),
+    or at every τ ("always"). Only the c_i that are `present` are not always 0; by default all are.
+    """
 
     basis: Tensor
     offset: Tensor
@@ -23,20 +27,20 @@ class FreeTable(nn.Module):
     def __init__(
         self,
         n: int,
-        terms: int,
-        dt: float,
+        exponents: Sequence[int],
         power: int,
-        palindromic: bool,
-        bound: int,
-        total: float | None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        palindromic: bool = True,
+        total: Total = None,
         present: Sequence[int] | None = None,
+        *,
+        dt: float,
+        **like: Any,
     ) -> None:
         super().__init__()
-        self.dt, self.power = dt, power
-        self._free, basis, offset = free_numbers(n, terms, palindromic, bound, total, present)
-        like: dict[str, Any] = {"dtype": dtype, "device": device}
+        self.n, self.exponents, self.power, self.dt = n, tuple(exponents), power, dt
+        self.total, self.present = total, present
+        self._free, basis, offset = free_numbers(n, len(self.exponents), palindromic, total, present)
+        like = {"dtype": torch.float64, **like}
         self.register_buffer("basis", torch.as_tensor(basis, **like), persistent=False)
         self.register_buffer("offset", torch.as_tensor(offset, **like), persistent=False)
         self.free = nn.Parameter(torch.zeros(len(self._free), **like))
@@ -73,28 +77,7 @@ class FreeTable(nn.Module):
 
 
 class Coefficients(FreeTable):
-    """c_i(τ) = Σ_k c_ik τ^(e_k), i = 1 … n: a column of a splitting table, which enters as t^power c_i(t/Δt).
-
-    In a palindrome, c_i = c_{n+1−i}. With a `total`, Σ c_i(0) = total for every value of the parameters; if that holds
-    `always`, Σ c_i(τ) = total at every τ. Only the c_i that are `present` are not always 0; by default all are.
-    """
-
-    def __init__(
-        self,
-        n: int,
-        exponents: tuple[int, ...],
-        dt: float,
-        power: int,
-        palindromic: bool,
-        total: float | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
-        always: bool = False,
-        present: Sequence[int] | None = None,
-    ) -> None:
-        bound = len(exponents) if always else int(total is not None)
-        super().__init__(n, len(exponents), dt, power, palindromic, bound, total, dtype, device, present)
-        self.exponents, self.always, self.present = exponents, always, present
+    """c_i(τ) = Σ_k c_ik τ^(e_k), i = 1 … n: a column of a splitting table."""
 
     def set_constant(self, c: Sequence[Any]) -> None:
         """Let c_i(τ) be c_i at every τ."""
@@ -119,25 +102,10 @@ class Coefficients(FreeTable):
 
 
 class Column(FreeTable):
-    """c_i(τ) = c_i0 + τ² Σ_k c_ik T_{k−1}(2τ² − 1), c_i = c_{n+1−i}; it enters as t^m c_i(t/Δt).
+    """c_i(τ) = c_i0 + τ² Σ_k c_ik T_{k−1}(2τ² − 1), of a palindrome.
 
-    Even polynomials make a palindrome time-reversible; Chebyshev's T_k keep the high degrees of filters well
-    conditioned.
+    Even polynomials make it time-reversible; Chebyshev's T_k keep the high degrees of filters well conditioned.
     """
-
-    def __init__(
-        self,
-        n: int,
-        terms: int,
-        dt: float,
-        power: int,
-        total: str | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
-    ) -> None:
-        bound = terms if total == "always" else int(total == "start")
-        super().__init__(n, terms, dt, power, True, bound, None if total is None else 1.0, dtype, device)
-        self.n, self.terms, self.total = n, terms, total
 
     def values(self, t: Time) -> Tensor:
         """t^m c_i(t/Δt): (n, …), the shape of t behind."""
@@ -151,11 +119,11 @@ class Column(FreeTable):
         return np.asarray(t)[..., None] ** self.power * (self.functions(t) @ c.T)
 
     def _functions(self, tau: Any) -> list[Any]:
-        functions = [1 + 0 * tau]
-        if self.terms > 1:
+        functions, terms = [1 + 0 * tau], len(self.exponents)
+        if terms > 1:
             x, square = 2 * tau**2 - 1, tau**2
             chebyshev = [1 + 0 * tau, x]
-            while len(chebyshev) < self.terms - 1:
+            while len(chebyshev) < terms - 1:
                 chebyshev.append(2 * x * chebyshev[-1] - chebyshev[-2])
-            functions += [square * T for T in chebyshev[: self.terms - 1]]
+            functions += [square * T for T in chebyshev[: terms - 1]]
         return functions

@@ -247,24 +247,15 @@ def _thawed(path: Path, system: HamiltonianSystem | None = None) -> Any:
 def _tables(shape: PrimedShape, dt: float, arrays: Mapping[str, np.ndarray]) -> Tables:
     """The tables of a flow whose free numbers are arrays of a file."""
 
-    def columns(prefix: str, sequence: Any, total: float | None) -> Any:
-        def column(
-            name: str,
-            n: int,
-            exponents: tuple[int, ...],
-            power: int,
-            palindromic: bool,
-            total: float | None,
-            always: bool = False,
-            present: Any = None,
-        ) -> FrozenColumn:
-            bound = len(exponents) if always else int(total is not None)
-            _, basis, offset = free_numbers(n, len(exponents), palindromic, bound, total, present)
-            return FrozenColumn(offset + basis @ arrays[f"{prefix}{name}.free"].astype(float), exponents)
+    def columns(inside: bool) -> Any:
+        def column(name: str, n: int, exponents: tuple[int, ...], power: int, *given: Any) -> FrozenColumn:
+            _, basis, offset = free_numbers(n, len(exponents), *given)
+            free = arrays[f"{'' if inside else 'processor_'}{name}.free"]
+            return FrozenColumn(offset + basis @ free.astype(float), exponents)
 
-        return shape.columns(sequence, total, column)
+        return shape.columns(inside, column)
 
-    inside, outside = columns("", shape.kernel, 1.0), columns("processor_", shape.outer, None)
+    inside, outside = columns(True), columns(False)
     return Tables(shape.substeps(inside, outside), len(shape.outer), dt, shape.monomials)
 
 

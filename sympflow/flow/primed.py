@@ -83,15 +83,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         self.shape = shape
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
 
-        def column(name: str, n: int, exponents: tuple[int, ...], power: int, *given: Any, **more: Any) -> Coefficients:
-            palindromic, total = given
-            return Coefficients(n, exponents, self.dt, power, palindromic, total, **more, **like)
-
-        def columns(sequence: Sequence[Kind], total: float | None) -> Columns:
-            made = shape.columns(sequence, total, column)
+        def columns(inside: bool) -> Columns:
+            made = shape.columns(inside, lambda name, *given: Coefficients(*given, dt=self.dt, **like))
             return made if made.polynomials is None else made._replace(polynomials=nn.ModuleList(made.polynomials))
 
-        inside, outside = columns(shape.kernel, 1.0), columns(shape.outer, None)
+        inside, outside = columns(True), columns(False)
         self.kicks, self.drifts, self.gradients, self.curvatures, self.polynomials = inside
         self.processor_kicks, self.processor_drifts, self.processor_gradients = outside[:3]
         self.processor_curvatures, self.processor_polynomials = outside[3:]

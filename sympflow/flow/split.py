@@ -28,7 +28,7 @@ from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.tables import Memory
+from sympflow.flow.tables import Memory, Total
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
@@ -148,11 +148,10 @@ class SplitFlow(SystemFlow):
             raise ValueError(f"`force_gradient` {gradients!r} is not the same from either end of {n_kicks} kicks.")
         if not set(self.gradient_kicks) <= set(range(n_kicks)) or (gradients and "shear" in self.kinds):
             raise ValueError(f"`force_gradient` {gradients!r} names no kicks: count them from 0 to {n_kicks - 1}.")
-        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
+        like: dict[str, Any] = {"dt": self.dt, "dtype": checked_dtype(dtype), "device": checked_device(device)}
 
-        def column(part: int, power: int, total: str | None) -> Column:
-            n = self.sequence.count(part)
-            return Column(n, terms, self.dt, power, total, **like)
+        def column(part: int, power: int, total: Total) -> Column:
+            return Column(self.sequence.count(part), range(terms), power, total=total, **like)
 
         modules = torch.nn.ModuleList
         rest = [k for k in range(1, len(self.kinds) + 1) if k in self.sequence]
@@ -162,7 +161,7 @@ class SplitFlow(SystemFlow):
         self.weights = modules(column(k, 1, "start") for k in rest)
         self.filters = modules(column(k, 0, None) for k in rest for _ in turning if filters)
         n_gradients = len(self.gradient_kicks)
-        self.gradients = modules(Column(n_gradients, terms, self.dt, 3, **like) for _ in range(n_gradients > 0))
+        self.gradients = modules(Column(n_gradients, range(terms), 3, **like) for _ in range(n_gradients > 0))
         self._slot = {k: i for i, k in enumerate(rest)}
         self._turning = turning
         for c in self.columns():  # equal steps, φ = 1

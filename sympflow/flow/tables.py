@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 Kind = Literal["kick", "drift"]
 MakeColumn = Callable[..., Any]
+Total = Literal["start", "always"] | None
+"""When the numbers of a column add up to 1."""
 
 MOST_KEPT = 256  # a flow with a processor has five for each step length
 
@@ -89,23 +91,23 @@ class PrimedShape:
         """The kinds of the maps of χ."""
         return _alternating(self.first, 2 * self.processor + 1 if self.processor else 0)
 
-    def columns(self, sequence: Sequence[Kind], total: float | None, make: MakeColumn) -> Columns:
-        """Return columns of K, of a `total` of 1, or of χ: ``make(name, n, exponents, power, mirrored, total, …)``."""
+    def columns(self, inside: bool, make: MakeColumn) -> Columns:
+        """Return columns of K or of χ: ``make(name, n, exponents, power, palindromic, total, present)``."""
+        sequence = self.kernel if inside else self.outer
         if not sequence:
             return Columns()
-        powers, mirrored = range(0, self.degree, 2 if self.palindromic else 1), self.palindromic and total is not None
+        powers, mirrored = tuple(range(0, self.degree, 2 if self.palindromic else 1)), self.palindromic and inside
 
-        def column(name: str, kind: Kind, power: int, total: float | None = None, **more: Any) -> Any:
-            return make(name, sequence.count(kind), tuple(powers), power, mirrored, total, **more)
+        def column(name: str, kind: Kind, power: int, total: Total = None, present: Any = None) -> Any:
+            return make(name, sequence.count(kind), powers, power, mirrored, total, present)
 
-        having, curved = (None, None) if total is None else (self.gradient_kicks, self.curvature_kicks)
+        having, curved = (self.gradient_kicks, self.curvature_kicks) if inside else (None, None)
         curved = having if curved is None else curved
-
         return Columns(
-            column("kicks", "kick", 1, total),
-            column("drifts", "drift", 1, total, always=self.timed and total is not None),
-            column("gradients", "kick", 3, present=having) if self.force_gradient else None,
-            column("curvatures", "kick", 5, present=curved) if self.curvature else None,
+            column("kicks", "kick", 1, "start" if inside else None),
+            column("drifts", "drift", 1, ("always" if self.timed else "start") if inside else None),
+            column("gradients", "kick", 3, None, having) if self.force_gradient else None,
+            column("curvatures", "kick", 5, None, curved) if self.curvature else None,
             [column(f"polynomials.{i}", "kick", 3) for i in range(len(self.monomials))] if self.monomials else None,
         )
 
@@ -332,13 +334,14 @@ def _numbers(s: Substep, values: dict[int, np.ndarray], sign: int) -> list[Any]:
 
 
 def free_numbers(
-    n: int, terms: int, palindromic: bool, bound: int, total: float | None, present: Sequence[int] | None
+    n: int, terms: int, palindromic: bool, total: Total, present: Sequence[int] | None
 ) -> tuple[list[tuple[int, int]], np.ndarray, np.ndarray]:
     """Return the places (i, k) of the free numbers of a `FreeTable`, its basis (n, K, f) and its offset (n, K)."""
     representative = np.minimum(np.arange(n), np.arange(n)[::-1]) if palindromic else np.arange(n)
     count = np.bincount(representative)
     last = len(count) - 1
     kept = range(n) if present is None else present
+    bound = terms if total == "always" else int(total == "start")
     free = [(i, k) for i in range(last + 1) if i in kept for k in range(terms) if i != last or k >= bound]
     basis, offset = np.zeros((n, terms, len(free))), np.zeros((n, terms))
     for column, (i, k) in enumerate(free):
@@ -346,7 +349,7 @@ def free_numbers(
         if k < bound:
             basis[representative == last, k, column] = -count[i] / count[last]
     if total is not None:
-        offset[representative == last, 0] = total / count[last]
+        offset[representative == last, 0] = 1.0 / count[last]
     return free, basis, offset
 
 

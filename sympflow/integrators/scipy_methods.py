@@ -6,7 +6,7 @@ import math
 from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -175,10 +175,14 @@ class _Scipy(RungeKutta):
                         failure = f"The solution became non-finite after t = {solver.t_old:.15g}. End `t_span` earlier."
                         break
                     stats["n_steps"] += 1
-                    interpolant = _Lazily(solver.dense_output)
-                    t_new, y_new = record.take(solver.t_old, y_old, solver.t, solver.y, interpolant)
+                    dense: Any = cache(solver.dense_output)  # built when first needed: DOP853's costs evaluations
+
+                    def within(s: float, dense: Any = dense) -> np.ndarray:
+                        return dense()(s)
+
+                    t_new, y_new = record.take(solver.t_old, y_old, solver.t, solver.y, within)
                     if problem.dense_output:
-                        interpolants.append(interpolant.output)
+                        interpolants.append(dense())
                     if t_eval is None or problem.dense_output:
                         times.append(t_new)
                         states.append(y_new)
@@ -256,20 +260,6 @@ TOGETHER = 4096  # numbers of states of the steps that are told at once
 def _together(steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     times, states, lengths = (np.stack(column) for column in zip(*steps, strict=True))
     return times, states, lengths
-
-
-class _Lazily:
-    """The interpolant of a step, built when it is first needed (DOP853's costs evaluations)."""
-
-    def __init__(self, build: Any) -> None:
-        self._build = build
-
-    @cached_property
-    def output(self) -> Any:
-        return self._build()
-
-    def __call__(self, t: float) -> np.ndarray:
-        return self.output(t)
 
 
 def _scipy_method(solver: Any, order: int, source: str) -> type[_Scipy]:

@@ -8,10 +8,11 @@ memory, where gradient and Hessian stand in the code once, in a loop over the st
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property, reduce
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
 from itertools import pairwise
 from operator import mul
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,9 @@ MOST_IN_REGISTERS = 4  # unknowns
 ABREAST = 4  # numbers of a row of a matrix that are changed together
 MOST_REVERSED = 40  # numbers of a state whose cotangents are in registers
 LONG = 4e6  # operations between two looks for a stop
+
+Cells = Any
+"""Numbers by their places: a list, or `Rows` in memory."""
 
 
 @kept
@@ -97,19 +101,13 @@ class NewtonCode(OneStep):
 
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
         self._given = lettered, tableau, compensated, damped
-        self._tableau, self._compensated, self._damped = tableau, compensated, damped
-        self._nodes, self.stages = stage_nodes(tableau), len(tableau[1])
+        self.tableau, self.compensated, self.damped = tableau, compensated, damped
+        self.nodes, self.stages = stage_nodes(tableau), len(tableau[1])
         n = 2 * lettered.symbols.ndof
         super().__init__(lettered, n * (1 + compensated) + 1, n * (self.stages + 1) * damped)
         self.unknowns = n * self.stages
         self.work = 4 * self.unknowns**3
         self.block = int(min(max(LONG / self.unknowns**3, 1), Rollouts.block))
-
-    def _changes(self, K: Sequence[Value]) -> Value:
-        """Σ B_i K_i of one variable."""
-        return _total([b * x for b, x in zip(self._tableau[1], K, strict=True)])
-
-    # H ------------------------------------------------------------------------------------------------------------
 
     @cached_property
     def slopes(self) -> Program:
@@ -122,7 +120,7 @@ class NewtonCode(OneStep):
         return Program(program.inputs, [*slope, *(entry for row in rows for entry in row)])
 
     @cached_property
-    def _field_reversed(self) -> Program:
+    def field_reversed(self) -> Program:
         """The derivatives of J∇H·μ by the parameters, from q, p, the parameters and the letters, and from μ."""
         symbols, n, d = self.lettered.symbols, self.n_out, self.ndof
         program = recorded(self.lettered.expressions, (*symbols.q, *symbols.p, *self.lettered.given))
@@ -133,24 +131,256 @@ class NewtonCode(OneStep):
         return Program([*program.inputs, *mu], gradient(total, parameters))
 
     @cached_property
-    def _leftover(self) -> list[float]:
+    def leftover(self) -> list[float]:
         """Numbers c with Σ_i c_i A_ij = 1."""
-        return [float(x) for x in np.linalg.solve(np.array(self._tableau[0], dtype=float), np.ones(self.stages))]
+        return [float(x) for x in np.linalg.solve(np.array(self.tableau[0], dtype=float), np.ones(self.stages))]
 
-    def _leftovers(self, end: Sequence[Any], mu: Sequence[Any]) -> list[Any]:
-        """The cotangents of the state before a step: those of its end, λ, and Σ_i v_i, of which Aᵀv = μ − Bλ."""
-        n, pairs = self.n_out, [*zip(self._leftover, self._tableau[1], strict=True)]
-        return [x + _total([c * (mu[i * n + m] - b * x) for i, (c, b) in enumerate(pairs)]) for m, x in enumerate(end)]
 
-    def _square(self, outputs: list[Any]) -> tuple[list[Any], list[list[Any]]]:
-        """∇H, and ∇²H of its upper triangle."""
-        n = self.n_out
-        g, rest = outputs[:n], iter(outputs[n:])
-        S = [[0.0] * n for _ in range(n)]
-        for i in range(n):
-            for j in range(i, n):
-                S[i][j] = S[j][i] = next(rest)
-        return g, S
+class _Iteration:
+    """One of Newton's iterations: from y and the numbers of a column to a better K.
+
+    Numbers are in lists, and loops are written out; see `_Looped`. M has rows with the residual behind the unknowns.
+    """
+
+    def __init__(self, method: NewtonCode, wide: int, *numbers: Cells) -> None:
+        self.method, self.wide = method, wide
+        self.n, self.d, self.s, self.N = method.n_out, method.ndof, method.stages, method.unknowns
+        self.y, self.K, self.column, self.M, self.Y, self.g, self.S, self.sizes = numbers
+        self.A, self.scale = self.array("A", np.ravel(method.tableau[0])), self.array("scale", method.tableau[2])
+
+    each: Any = staticmethod(range)
+    """``each(n)``: execute what follows for 0 … n − 1."""
+
+    def cell(self, x: Any) -> Any:
+        """A place of one number, its `value`."""
+        return SimpleNamespace(value=x)
+
+    def array(self, name: str, values: Any) -> Cells:
+        """Numbers that do not change."""
+        return [float(x) for x in values]
+
+    def fill_row(self, factor: Any, i: Any, j: Any) -> None:
+        """Write a factor times n numbers of S, from i on, to M, from j on."""
+        self.M[j : j + self.n] = [factor * x for x in self.S[i : i + self.n]]
+
+    def solve(self) -> None:
+        """Put M⁻¹ times the residual in its place."""
+        N, M = self.N, self.M
+        M[N :: self.wide] = _eliminated(
+            [M[i : i + N] for i in range(0, len(M), self.wide)], M[N :: self.wide], self.sizes
+        )
+
+    def execute(self, sized: bool = False) -> Any:
+        """Change K; the relative size of the change. `sized` if the sizes of the unknowns are known."""
+        self.fill(sized)
+        self.solve()
+        return self._moved()
+
+    def fill(self, sized: bool = False) -> None:
+        """The equations for K into M, and the sizes."""
+        for i in self.each(self.s):
+            self._assemble(i)
+        if not sized:
+            self._fill_sizes()
+
+    def _fill_stage(self, i: Any) -> None:
+        """The state of a stage into Y."""
+        for m in self.each(self.n):
+            x = self.cell(self.y[m])
+            for j in self.each(self.s):
+                x.value = x.value + self.A[i * self.s + j] * self.K[j * self.n + m]
+            self.Y[m] = x.value
+        for m in self.each(self.d) if self.method.damped else ():
+            self.Y[m + self.d] = self.Y[m + self.d] * self._growth(i + self.s + 1, m)
+
+    def _assemble(self, i: Any) -> None:
+        """The equations of a stage."""
+        n, d, s = self.n, self.d, self.s
+        self._fill_stage(i)
+        self.fill_slopes(i)
+        for m in self.each(d) if self.method.damped else ():  # rows e^{γτ} ∂H/∂q, columns ∂p/∂P
+            up = self._growth(i, m)
+            self.g[m] = self.g[m] * up
+            for k in self.each(d):
+                down = self._growth(i + s + 1, k)
+                for place, factor in ((m * n + k, up), (m * n + k + d, up * down), ((m + d) * n + k + d, down)):
+                    self.S[place] = self.S[place] * factor
+        factor = self.column[0] * self.scale[i]
+        for part, signed in enumerate((factor, -factor)):  # J∇H = (∂H/∂p, −∂H/∂q)
+            for m in self.each(d):
+                other, unknown = m + (1 - part) * d, i * n + m + part * d
+                row = unknown * self.wide
+                self.M[row + self.N] = self.K[unknown] - signed * self.g[other]
+                for filling in range(self.N + 1, self.wide):
+                    self.M[row + filling] = 0.0
+                for j in self.each(s):
+                    self.fill_row(-(signed * self.A[i * s + j]), other * n, row + j * n)
+                self.M[row + unknown] = self.M[row + unknown] + 1.0
+
+    def pulled(self, end: Sequence[Any], slopes: bool) -> list[Any]:
+        """The cotangents of y, and with `slopes` of the parameters, for those λ of the state after the step.
+
+        By the transposed equations, for μ: those of y are λ + Σ_i v_i, of which Aᵀv = μ − Bλ.
+        """
+        n, d, N, wide, method = self.n, self.d, self.N, self.wide, self.method
+        weights = method.tableau[1]
+        if method.damped:
+            end = [*end[:d], *(x * self.column[method.size - d + k] for k, x in enumerate(end[d:]))]
+        self.fill()
+        for i in self.each(N):
+            self.sizes[i] = 1.0 / self.sizes[i]
+            for j in self.each(i):
+                a, b = i * wide + j, j * wide + i
+                self.M[a], self.M[b] = self.M[b], self.M[a]
+        for k, x in enumerate(b * x for b in weights for x in end):
+            self.M[k * wide + N] = x
+        self.solve()
+        mu = [self.M[k * wide + N] for k in range(N)]
+        pairs = [*enumerate(zip(method.leftover, weights, strict=True))]
+        found = [x + _total([c * (mu[i * n + m] - b * x) for i, (c, b) in pairs]) for m, x in enumerate(end)]
+        totals = [self.cell(0.0) for _ in range(method.parameters if slopes else 0)]
+        for i in self.each(self.s) if slopes else ():
+            self._fill_stage(i)
+            of_stage = [self.M[(i * n + m) * wide + N] for m in range(n)]
+            if method.damped:
+                of_stage[d:] = [x * self._growth(i, m) for m, x in enumerate(of_stage[d:])]
+            factor = self.column[0] * self.scale[i]
+            by_parameters = method.field_reversed(*(self.Y[m] for m in range(n)), *self.given_at(i), *of_stage)
+            for total, x in zip(totals, by_parameters, strict=True):
+                total.value = total.value + factor * x
+        return [*found, *(total.value for total in totals)]
+
+    def _growth(self, i: Any, m: Any) -> Any:
+        """e^{γτ} at stage i, and its reciprocal at i + s + 1."""
+        return self.column[i * self.d + m + (self.method.size - 2 * self.d * (self.s + 1))]
+
+    def fill_slopes(self, i: Any) -> None:
+        """∇H into g and ∇²H into S, whose entries that are always 0 are that already, of a stage."""
+        n, method = self.n, self.method
+        outputs = method.slopes(*(self.Y[m] for m in range(n)), *self.given_at(i))
+        for m, x in enumerate(outputs[:n]):
+            self.g[m] = x
+        upper = ((j, k) for j in range(n) for k in range(j, n))
+        for (j, k), x in zip(upper, outputs[n:], strict=True):
+            if not is_zero(x):
+                self.S[j * n + k] = self.S[k * n + j] = x
+
+    def given_at(self, i: Any) -> list[Any]:
+        """The parameters, and the letters of a stage."""
+        method, count = self.method, len(self.method.lettered.letters)
+        places = [*range(1, 1 + method.parameters), *(i * count + (method.size + k) for k in range(count))]
+        return [self.column[place] for place in places]
+
+    def _fill_sizes(self) -> None:
+        """The reciprocal size of each unknown: of its variable, or of the largest of its kind where that is 0."""
+        for part in range(2):
+            top = self.cell(0.0)
+            for m in self.each(self.d):
+                row = m + part * self.d
+                own = self.cell(abs(self.y[row]))
+                for i in self.each(self.s):
+                    u = i * self.n + row
+                    own.value = _larger(_larger(own.value, abs(self.K[u])), abs(self.M[u * self.wide + self.N]))
+                self.sizes[row] = own.value
+                top.value = _larger(top.value, own.value)
+            largest = where(top.value > 0.0, top.value, 1.0)
+            for m in self.each(self.d):
+                row = m + part * self.d
+                size = where(self.sizes[row] > 0.0, self.sizes[row], largest)
+                size = 1.0 / where(size < SMALLEST, SMALLEST, size)
+                for i in self.each(self.s):
+                    self.sizes[i * self.n + row] = size
+
+    def _moved(self) -> Any:
+        """Change K; the larger of ‖ΔK_q‖/(‖q‖ + ‖K_q‖) and ‖ΔK_p‖/(‖p‖ + ‖K_p‖), maxima over components and stages."""
+        ratios = []
+        for part in range(2):
+            top, scale = self.cell(0.0), self.cell(0.0)
+            for m in self.each(self.d):
+                row, largest = m + part * self.d, self.cell(0.0)
+                for i in self.each(self.s):
+                    u = i * self.n + row
+                    change = self.M[u * self.wide + self.N]
+                    new = self.K[u] - change
+                    self.K[u] = new
+                    top.value = _top(top.value, abs(change))
+                    largest.value = _larger(largest.value, abs(new))
+                scale.value = _larger(scale.value, abs(self.y[row]) + largest.value)
+            ratios.append(where(top.value > 0.0, top.value / scale.value, top.value))
+        return where(ratios[1] <= ratios[0], ratios[0], ratios[1])
+
+    def fill_letters(self) -> None:
+        """What depends on t alone, at all stages, behind the numbers of the column."""
+        method, count = self.method, len(self.method.lettered.letters)
+        nodes = self.array("nodes", method.nodes)
+        for i in self.each(self.s) if count else ():
+            for k, x in enumerate(method.letters_at([self.column[j] for j in range(method.size)], nodes[i])):
+                self.column[i * count + (method.size + k)] = x
+
+    def advance(self, solved: Value) -> None:
+        """y plus its change, by Kahan's compensated sums, with the errors behind; NaN where K was not solved."""
+        n, method = self.n, self.method
+        for m in self.each(n):
+            change, old = _total([b * self.K[m + i * n] for i, b in enumerate(method.tableau[1])]), self.y[m]
+            new = old + change
+            if method.compensated:
+                new, self.y[m + n] = added(old, change - self.y[m + n])
+            self.y[m] = new
+        for m in self.each(self.d) if method.damped else ():
+            self.y[m + self.d] = self.y[m + self.d] * self.column[m + (method.size - self.d)]
+        for m in self.each(n):
+            self.y[m] = where(solved, self.y[m], float("nan"))
+
+
+class _Looped(_Iteration):
+    """The same in machine code, over numbers in memory; terms of a kind are looped over too, by the arrays `data`."""
+
+    def __init__(self, method: _InMemory, wide: int, *places: Value) -> None:
+        self.code, self.places, self.data = places[0].code, places, places[8:]
+        super().__init__(method, wide, *(Rows(x, DOUBLE) for x in places[:8]))
+        self.looped, self.terms = method, method.terms
+
+    def each(self, n: int) -> Iterator[Value]:
+        with self.code.over(n) as i:
+            yield i
+
+    def cell(self, x: Any) -> Any:
+        return self.code.variable(self.code.operand(x, DOUBLE))
+
+    def array(self, name: str, values: Any) -> Cells:
+        return Rows(self.code.array(name, values), DOUBLE)
+
+    def fill(self, sized: bool = False) -> None:
+        def filled(*places: Value) -> None:
+            _Iteration.fill(_Looped(self.looped, self.wide, *places))
+
+        self.code.outlined("filled", self.places, filled)
+
+    def fill_row(self, factor: Any, i: Any, j: Any) -> None:
+        type = Type("double", ABREAST if self.n % ABREAST == 0 else 2)
+        with self.code.over(self.n // type.width) as k:
+            at = k * type.width
+            self.code.store(factor * self.code.load(self.S.place, i + at, type), self.M.place, j + at)
+
+    def solve(self) -> None:
+        places = [self.M.place, self.sizes.place]
+        self.code.outlined("solve", places, partial(_solve, N=self.N, wide=self.wide), rare=False)
+
+    def fill_slopes(self, i: Any) -> None:
+        if self.terms is None:
+            super().fill_slopes(i)
+            return
+        self.clear(self.g, self.n)
+        self.clear(self.S, self.n**2)
+
+        def targets(places: list[Value]) -> list[tuple[Rows, Value]]:
+            return [(self.g, m) for m in places] + [(self.S, i * self.n + j) for i in places for j in places]
+
+        self.terms.add(self.data, self.terms.derivatives(0, True), [self.Y], self.given_at(i), targets)
+
+    def clear(self, x: Cells, count: int) -> None:
+        for i in self.each(count):
+            x[i] = 0.0
 
 
 class _InRegisters(NewtonCode):
@@ -160,118 +390,18 @@ class _InRegisters(NewtonCode):
 
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         """One step: y, the errors of compensated sums, and the count of iterations."""
-        code, n, d = values[0].code, self.n_out, self.ndof
-        y, errors, count = values[:n], values[n:-1], values[-1]
-        column = self.column(code, numbers, step)
-        K, taken, lost, *_ = self._iterated(code, y, column)
-        changes = [self._changes(K[m::n]) for m in range(n)]
-        if self._compensated:
-            sums = [added(old, change - error) for old, change, error in zip(y, changes, errors, strict=True)]
-            state, errors = [total for total, _ in sums], [error for _, error in sums]
-        else:
-            state = [old + change for old, change in zip(y, changes, strict=True)]
-        if self._damped:
-            decay = column[self.size - d :]
-            state = [*state[:d], *(p * e for p, e in zip(state[d:], decay, strict=True))]
-        nan = code.constant(float("nan"), y[0].type)
-        return [*(code.select(lost, nan, x) for x in state), *errors, count + taken]
+        found, taken, solved = self._solved(values[:-1], numbers, step)
+        found.advance(solved)
+        return [*found.y, values[-1] + taken]
 
-    def _gradient_and_hessian(
-        self, Y: Sequence[Any], column: Sequence[Any], stage: int
-    ) -> tuple[list[Any], list[list[Any]]]:
-        """∇H and ∇²H at a stage, with friction of [q, P] as the equations hold them."""
-        d, n, letters = self.ndof, self.n_out, len(self.lettered.letters)
-        start = self.size + stage * letters
-        given = [*column[1 : 1 + self.parameters], *column[start : start + letters]]
-        if not self._damped:
-            return self._square(self.slopes(*Y, *given))
-        growths = column[self.size - 2 * d * (self.stages + 1) :]
-        grown, shrunk = (growths[d * (i * (self.stages + 1) + stage) :][:d] for i in range(2))
-        Y = [*Y[:d], *(P * e for P, e in zip(Y[d:], shrunk, strict=True))]
-        g, S = self._square(self.slopes(*Y, *given))
-        row, entry = [*grown, *[1.0] * d], [*[1.0] * d, *shrunk]
-        g = [a * x for a, x in zip(row, g, strict=True)]
-        return g, [[row[i] * S[i][j] * entry[j] for j in range(n)] for i in range(n)]
-
-    def _equations(self, y: Sequence[Any], K: Sequence[Any], column: Sequence[Any]) -> tuple[list[Any], list[Any]]:
-        """The residuals of the equations for K, and the rows of their derivatives by K."""
-        A, _, scale = self._tableau
-        n, d, h, rows, residual = self.n_out, self.ndof, column[0], [], []
-        for i in range(self.stages):
-            Y = [y[m] + _total([A[i][j] * K[j * n + m] for j in range(self.stages)]) for m in range(n)]
-            g, S = self._gradient_and_hessian(Y, column, i)
-            f, J = [*g[d:], *(-x for x in g[:d])], [*S[d:], *([-x for x in row] for row in S[:d])]
-            for m in range(n):
-                residual.append(K[i * n + m] - h * scale[i] * f[m])
-                row = [-(h * (scale[i] * A[i][j])) * J[m][k] for j in range(self.stages) for k in range(n)]
-                row[i * n + m] = 1.0 + row[i * n + m]
-                rows.append(row)
-        return residual, rows
-
-    def _iteration(self, y: Sequence[Any], K: Sequence[Any], column: Sequence[Any], sizes: Sequence[Any]) -> list[Any]:
-        """One of Newton's iterations: the new K, the relative size of the change, and the sizes of the variables."""
-        residual, rows = self._equations(y, K, column)
-        sizes = sizes or self._sizes(y, residual)
-        change = _eliminated(rows, residual, list(sizes) * self.stages)
-        new = [k - x for k, x in zip(K, change, strict=True)]
-        return [*new, self._relative_size(change, y, new), *sizes]
-
-    def _sizes(self, y: Sequence[Any], residual: Sequence[Any]) -> list[Any]:
-        """The reciprocal size of each variable, or of the largest of its kind where that is 0."""
-        n, d = self.n_out, self.ndof
-        own = [_largest([y[m], *(residual[i * n + m] for i in range(self.stages))]) for m in range(n)]
-        weights = []
-        for part in (own[:d], own[d:]):
-            top = _largest(part)
-            for size in part:
-                found = where(size > 0.0, size, where(top > 0.0, top, 1.0))
-                weights.append(1.0 / where(found < SMALLEST, SMALLEST, found))
-        return weights
-
-    def _relative_size(self, change: Sequence[Any], y: Sequence[Any], K: Sequence[Any]) -> Any:
-        """The largest of ‖Δq‖/(‖q‖ + ‖K_q‖) and ‖Δp‖/(‖p‖ + ‖K_p‖), maxima over components and stages."""
-        n, d = self.n_out, self.ndof
-        ratios = []
-        for part in (range(d), range(d, n)):
-            top = _largest([change[i * n + m] for i in range(self.stages) for m in part])
-            scale = _largest([abs(y[m]) + _largest([K[i * n + m] for i in range(self.stages)]) for m in part])
-            ratios.append(where(top > 0.0, top / scale, top))
-        return where(ratios[0] <= ratios[1], ratios[1], ratios[0])
-
-    @cached_property
-    def _iterations(self) -> tuple[Program, Program]:
-        """The first iteration, of y and the column's numbers, and the others, of K and the sizes too."""
-        n, N, size = self.n_out, self.unknowns, self.size + self.stages * len(self.lettered.letters)
-
-        def first(*numbers: Any) -> list[Any]:
-            return self._iteration(numbers[:n], [0.0] * N, numbers[n:], ())
-
-        def other(*numbers: Any) -> list[Any]:
-            y, column, K, sizes = (numbers[i:j] for i, j in pairwise([0, n, n + size, n + size + N, None]))
-            return self._iteration(y, K, column, sizes)[: N + 1]
-
-        names = [f"{letter}_{i}" for letter, m in (("y", n), ("c", size), ("K", N), ("w", n)) for i in range(m)]
-        return traced(first, *names[: n + size]), traced(other, *names)
-
-    @cached_property
-    def _pull(self) -> Program:
-        """The cotangents of a state, and the μ, from it, the numbers, K, the sizes, and those of the state after it."""
-        n, N, size, s = self.n_out, self.unknowns, self.size + self.stages * len(self.lettered.letters), self.stages
-
-        def pulled(*numbers: Any) -> list[Any]:
-            y, column, K, sizes, end = (numbers[i:j] for i, j in pairwise([0, n, n + size, n + size + N, -n, None]))
-            if self._damped:
-                decay = column[self.size - self.ndof : self.size]
-                end = (*end[: n - self.ndof], *map(mul, end[n - self.ndof :], decay))
-            rows = self._equations(y, K, column)[1]
-            transposed = [[row[i] for row in rows] for i in range(N)]
-            mu = _eliminated(transposed, [b * x for b in self._tableau[1] for x in end], [1.0 / w for w in sizes] * s)
-            return [*self._leftovers(end, mu), *mu]
-
-        names = [
-            f"{letter}_{i}" for letter, m in (("y", n), ("c", size), ("K", N), ("w", n), ("e", n)) for i in range(m)
-        ]
-        return traced(pulled, *names)
+    def _solved(self, y: list[Value], numbers: Numbers, step: Value) -> tuple[_Iteration, Value, Value]:
+        """A step whose K are known, the iterations taken, and where they converged."""
+        code, letters = y[0].code, self.stages * len(self.lettered.letters)
+        column: list[Any] = [*self.column(code, numbers, step), *[0.0] * letters]
+        found = self._iteration(y, [0.0] * self.unknowns, column)
+        found.fill_letters()
+        found.K, taken, solved = self._iterated(code, y[: self.n_out], column)
+        return found, taken, solved
 
     def adjoint(
         self,
@@ -283,36 +413,50 @@ class _InRegisters(NewtonCode):
         slopes: bool,
         *room: Room,
     ) -> tuple[list[Value], list[Value]]:
-        code, type, n, y = step.code, values[0].type, self.n_out, values[: self.n_out]
-        K, *_, sizes, column = self._iterated(code, y, self.column(code, numbers, step))
-        found = [code.operand(x, type) for x in self._pull(*y, *column, *K, *sizes, *cotangents[:n])]
-        zero, of_stages = code.constant(0.0, type), []
-        for i in range(self.stages if slopes else 0):
-            Y = [y[m] + _total([a * K[j * n + m] for j, a in enumerate(self._tableau[0][i])]) for m in range(n)]
-            of_stages.append(self._pulled_field(Y, column, i, found[(1 + i) * n :][:n]))
-        of_numbers = [code.operand(_total(each), type) for each in zip(*of_stages, strict=True)]
-        return [*found[:n], *[zero] * (self.n_values - n)], of_numbers
+        code, type, n = step.code, values[0].type, self.n_out
+        found, *_ = self._solved(values[:n], numbers, step)
+        given = [*found.y, *found.column, *found.K, *cotangents[:n]]
+        ends = 0, n, n + len(found.column), len(given) - n, None
 
-    def _pulled_field(self, Y: Sequence[Any], column: Sequence[Any], stage: int, mu: Sequence[Any]) -> list[Any]:
-        """The cotangents of the parameters for those, μ, of the residuals of a stage."""
-        d, letters = self.ndof, len(self.lettered.letters)
-        start = self.size + stage * letters
-        if self._damped:
-            growths = column[self.size - 2 * d * (self.stages + 1) :]
-            grown, shrunk = (growths[d * (i * (self.stages + 1) + stage) :][:d] for i in range(2))
-            Y, mu = [*Y[:d], *map(mul, Y[d:], shrunk)], [*mu[:d], *map(mul, mu[d:], grown)]
-        factor = column[0] * self._tableau[2][stage]
-        given = [*column[1 : 1 + self.parameters], *column[start : start + letters]]
-        return [factor * x for x in self._field_reversed(*Y, *given, *mu)]
+        def pulled(*numbers: Any) -> list[Any]:
+            y, column, K, end = (numbers[i:j] for i, j in pairwise(ends))
+            return self._iteration(y, K, [*column]).pulled(end, slopes)
 
-    def _iterated(
-        self, code: Code, y: Sequence[Value], column: list[Value]
-    ) -> tuple[list[Value], Value, Value, list[Value], list[Value]]:
-        """The K of a step, the iterations taken, where they were in vain, the sizes, and all numbers."""
+        results = traced(pulled, *(f"x_{i}" for i in range(len(given))))(*given)
+        results = [code.operand(x, type) for x in results]
+        return [*results[:n], *[code.constant(0.0, type)] * (self.n_values - n)], results[n:]
+
+    def _iteration(
+        self, y: Sequence[Any], K: Sequence[Any], column: list[Any], sizes: Sequence[Any] = ()
+    ) -> _Iteration:
+        """One of Newton's iterations, of new lists for what it changes."""
+        n, N, wide = self.n_out, self.unknowns, self.unknowns + 1
+        rooms = [0.0] * (N * wide), [0.0] * n, [0.0] * n, [0.0] * n**2
+        return _Iteration(self, wide, list(y), list(K), column, *rooms, [*sizes] * self.stages or [0.0] * N)
+
+    @cached_property
+    def _iterations(self) -> tuple[Program, Program]:
+        """The first iteration, of y and the column's numbers, and the others, of K and the sizes too."""
+        n, N, size = self.n_out, self.unknowns, self.size + self.stages * len(self.lettered.letters)
+
+        def first(*numbers: Any) -> list[Any]:
+            found = self._iteration(numbers[:n], [0.0] * N, [*numbers[n:]])
+            of_change = found.execute()
+            return [*found.K, of_change, *found.sizes[:n]]
+
+        def other(*numbers: Any) -> list[Any]:
+            y, column, K, sizes = (numbers[i:j] for i, j in pairwise([0, n, n + size, n + size + N, None]))
+            found = self._iteration(y, K, [*column], sizes)
+            of_change = found.execute(sized=True)
+            return [*found.K, of_change]
+
+        names = [f"{letter}_{i}" for letter, m in (("y", n), ("c", size), ("K", N), ("w", n)) for i in range(m)]
+        return traced(first, *names[: n + size]), traced(other, *names)
+
+    def _iterated(self, code: Code, y: Sequence[Value], column: Sequence[Value]) -> tuple[list[Value], Value, Value]:
+        """The K of a step, the iterations taken, and where they converged."""
         N, type = self.unknowns, y[0].type
         first, other = self._iterations
-        if self.driven:
-            column = [*column, *(x for c in self._nodes for x in self.letters_at(column, c))]
         (*outputs,) = (code.operand(x, type) for x in first(*y, *column))
         K, size, sizes = [code.variable(x) for x in outputs[:N]], code.variable(outputs[N]), outputs[N + 1 :]
         taken, small = code.variable(code.constant(1.0, type)), code.variable(size.value <= TOLERANCE)
@@ -329,7 +473,7 @@ class _InRegisters(NewtonCode):
                 variable.value = x
             taken.value, small.value, size.value = count, done, found
             active.value = now & ~done & (found < np.inf) & (count < MOST_ITERATIONS)
-        return [x.value for x in K], taken.value, ~small.value, sizes, column
+        return [x.value for x in K], taken.value, small.value
 
 
 class _InMemory(NewtonCode):
@@ -339,54 +483,40 @@ class _InMemory(NewtonCode):
 
     def __init__(self, lettered: Lettered, tableau: Tableau, compensated: bool, damped: bool) -> None:
         super().__init__(lettered, tableau, compensated, damped)
-        symbols = lettered.symbols
-        self._terms = terms_of(lettered) if is_large(symbols) else None
-        self.data = [] if self._terms is None else self._terms.data
-        n, N = self.n_out, self.unknowns
-        self._numbers = self.size + self.stages * len(self.lettered.letters)
-        self._sizes = [N, self._numbers, N * self._wide, n, n, n * n, N]
+        self.terms = terms_of(lettered) if is_large(lettered.symbols) else None
+        self.data = [] if self.terms is None else self.terms.data
+        n, N, numbers = self.n_out, self.unknowns, self.size + self.stages * len(lettered.letters)
+        self._wide = -(-(N + 1) // ABREAST) * ABREAST  # the last ones fill up registers
+        self._sizes = [N, numbers, N * self._wide, n, n, n * n, N]
         self.room = sum(self._sizes)
-
-    @property
-    def _wide(self) -> int:
-        """Numbers of a row of the matrix: the last ones the residual, and what fills up registers."""
-        return -(-(self.unknowns + 1) // ABREAST) * ABREAST
 
     def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
         """One step in place: y, the errors of compensated sums, and the count of iterations."""
-        code, n = room.code, self.n_out
-        taken, small, arguments = self._solved(room, numbers, step)
-        K, column = arguments[1:3]
-        with code.over(n) as m:
-            self._advance(room, K, m, small)
-        if self._damped:
-            with code.over(self.ndof) as m:
-                room.store(room.load(m + self.ndof) * code.load(column, m + (self.size - self.ndof)), m + self.ndof)
+        found, taken, solved = self._solved(room, numbers, step)
+        found.advance(solved)
         room.add(taken, room.size - 1)
 
-    def _solved(self, room: Room, numbers: Numbers, step: Value) -> tuple[Value, Value, list[Value]]:
-        """The iterations of a step, if they were not in vain, and the arguments of `_iterated`."""
-        code, n, N = room.code, self.n_out, self.unknowns
-        K, column, M, Y, g, S, sizes = (room.part(sum(self._sizes[:i]), room.work) for i in range(7))
-        given = self.column(code, numbers, step)
-        for i, x in enumerate(given):
-            code.store(x, column, i)
-        self._store_letters(code, given, column)
-        _fill(code, K, N)
-        _fill(code, S, n * n)
-        data = [room.data(i) for i in range(len(self.data))]
-        arguments = [room.state, K, column, M, Y, g, S, sizes, *data]
+    def _solved(self, room: Room, numbers: Numbers, step: Value) -> tuple[_Iteration, Value, Value]:
+        """The same as in registers."""
+        code = room.code
+        rooms = [room.part(sum(self._sizes[:i]), room.work) for i in range(7)]
+        found = _Looped(self, self._wide, room.state, *rooms, *(room.data(i) for i in range(len(self.data))))
+        for i, x in enumerate(self.column(code, numbers, step)):
+            found.column[i] = x
+        found.fill_letters()
+        found.clear(found.K, self.unknowns)
+        found.clear(found.S, self.n_out**2)
 
         def iteration(values: list[Value]) -> tuple[Value, list[Value]]:
             before, taken, _ = values
-            size = code.outlined("iteration", arguments, self._iterated, DOUBLE, rare=False)
+            size = found.execute()
             small = (size <= TOLERANCE) | ((size <= ROUNDING) & (0.5 * before <= size))
             taken = taken + 1.0
             return ~small & (size < np.inf) & (taken < MOST_ITERATIONS), [size, taken, small]
 
         start = [code.constant(np.inf), code.constant(0.0), code.constant(0, BOOL)]
         _, taken, small = code.repeat(start, iteration)
-        return taken, small, arguments
+        return found, taken, small
 
     def adjoint(
         self,
@@ -398,241 +528,61 @@ class _InMemory(NewtonCode):
         slopes: bool,
         *room: Room,
     ) -> tuple[list[Value], list[Value]]:
-        code, n, d, N, wide, zero = step.code, self.n_out, self.ndof, self.unknowns, self._wide, step.code.constant(0.0)
+        n, zero = self.n_out, step.code.constant(0.0)
         for k, x in enumerate(values[:n]):
             room[0].store(x, k)
-        *_, arguments = self._solved(room[0], numbers, step)
-        state, K, column, M, Y, _, _, sizes, *_ = arguments
-        end = cotangents[:n]
-        if self._damped:
-            end = [*end[:d], *(x * code.load(column, self.size - d + k) for k, x in enumerate(end[d:]))]
-        code.outlined("filled", arguments, self._filled)
-        with code.over(N) as i:
-            code.store(1.0 / code.load(sizes, i), sizes, i)
-            with code.over(i) as j:
-                a, b = code.load(M, i * wide + j), code.load(M, j * wide + i)
-                code.store(b, M, i * wide + j)
-                code.store(a, M, j * wide + i)
-        for k, weight in enumerate(self._tableau[1]):
-            for r, x in enumerate(end):
-                code.store(weight * x, M, (k * n + r) * wide + N)
-        code.outlined("solve", [M, sizes], self._solve, rare=False)
-        mu = [code.load(M, k * wide + N) for k in range(N)]
-        totals = [code.variable(zero) for _ in range(self.parameters if slopes else 0)]
-        if slopes:
-            letters, A = len(self.lettered.letters), code.array("A", np.ravel(self._tableau[0]))
-            scale = code.array("scale", self._tableau[2])
-            with code.over(self.stages) as i:
-                self._fill_stage(code, state, K, column, Y, A, i)
-                weights = [code.load(M, (i * n + m) * wide + N) for m in range(n)]
-                if self._damped:
-                    grown = self._growths(code, column, i)[0]
-                    weights = [*weights[:d], *(x * code.load(grown, m) for m, x in enumerate(weights[d:]))]
-                given = [code.load(column, 1 + k) for k in range(self.parameters)]
-                given += [code.load(column, i * letters + (self.size + k)) for k in range(letters)]
-                found = self._field_reversed(*(code.load(Y, m) for m in range(n)), *given, *weights)
-                factor = code.load(column) * code.load(scale, i)
-                for total, x in zip(totals, found, strict=True):
-                    total.value = total.value + factor * x
-        found = self._leftovers(end, mu)
-        return [*found, *[zero] * (self.n_values - n)], [x.value for x in totals]
+        found, *_ = self._solved(room[0], numbers, step)
+        results = found.pulled(cotangents[:n], slopes)
+        return [*results[:n], *[zero] * (self.n_values - n)], results[n:]
 
-    def _store_letters(self, code: Code, given: Sequence[Value], column: Value) -> None:
-        """The letters of all stages, behind the numbers of the column."""
-        letters = len(self.lettered.letters)
-        if letters:
-            nodes = code.array("nodes", self._nodes)
-            with code.over(self.stages) as i:
-                for k, x in enumerate(self.letters_at(given, code.load(nodes, i))):
-                    code.store(x, column, i * letters + (self.size + k))
 
-    def _advance(self, room: Room, K: Value, m: Value, small: Value) -> None:
-        """A variable plus its change, by Kahan's compensated sum; NaN where the step was not solved."""
-        code, n = room.code, self.n_out
-        change, old = self._changes([code.load(K, m + i * n) for i in range(self.stages)]), room.load(m)
-        if self._compensated:
-            new, error = added(old, change - room.load(m + n))
-            room.store(error, m + n)
-        else:
-            new = old + change
-        room.store(where(small, new, float("nan")), m)
+def _solve(M: Value, sizes: Value, N: int, wide: int) -> None:
+    """Eliminate the unknowns in place: the last column of M becomes the solution.
 
-    def _iterated(self, *arguments: Value) -> Value:
-        """One of Newton's iterations in memory; the relative size of the change."""
-        state, K, _, M, _, _, _, sizes, *_ = arguments
-        code, N, wide = K.code, self.unknowns, self._wide
-        self._filled(*arguments)
-        code.outlined("solve", [M, sizes], self._solve, rare=False)
-        with code.over(N) as i:
-            code.store(code.load(K, i) - code.load(M, i * wide + N), K, i)
-        return self._relative_size_in_memory(code, state, K, M)
+    Pivots are the largest of their column in units of the sizes of the unknowns, whose reciprocals `sizes` go
+    along.
+    """
+    code, type = M.code, Type("double", ABREAST)
+    with code.over(N) as k:
+        row = code.at(M, k * wide)
 
-    def _fill_stage(self, code: Code, state: Value, K: Value, numbers: Value, Y: Value, A: Value, i: Value) -> None:
-        """The state of a stage into Y."""
-        n, d = self.n_out, self.ndof
-        with code.over(n) as m:
-            x = code.variable(code.load(state, m))
-            with code.over(self.stages) as j:
-                x.value = x.value + code.load(A, i * self.stages + j) * code.load(K, j * n + m)
-            code.store(x.value, Y, m)
-        if self._damped:
-            shrunk = self._growths(code, numbers, i)[1]
-            with code.over(d) as m:
-                code.store(code.load(Y, m + d) * code.load(shrunk, m), Y, m + d)
+        def better(i: Value, values: list[Value], k: Value = k) -> list[Value]:
+            i = i + k + 1
+            size = abs(code.load(M, i * wide + k)) * code.load(sizes, i)
+            larger = values[0] < size
+            return [code.select(larger, size, values[0]), code.select(larger, i, values[1])]
 
-    def _filled(self, *arguments: Value) -> None:
-        """The equations for K into M, and the sizes of the unknowns."""
-        state, K, numbers, M, Y, g, S, sizes, *data = arguments
-        code, n, d, N, wide = K.code, self.n_out, self.ndof, self.unknowns, self._wide
-        A, scale = code.array("A", np.ravel(self._tableau[0])), code.array("scale", self._tableau[2])
-        h = code.load(numbers)
-        with code.over(self.stages) as i:
-            self._fill_stage(code, state, K, numbers, Y, A, i)
-            grown, shrunk = self._growths(code, numbers, i) if self._damped else (Y, Y)
-            self._fill_slopes(code, numbers, Y, g, S, i, data)
-            if self._damped:
-                _scale_slopes(code, d, grown, shrunk, g, S)
-            factor = h * code.load(scale, i)
-            with code.over(n) as m:
-                first = m < d
-                other = code.select(first, m + d, m - d)  # J∇H = (∂H/∂p, −∂H/∂q)
-                signed = code.select(first, factor, -factor)
-                unknown = i * n + m
-                row = code.at(M, unknown * wide)
-                code.store(code.load(K, unknown) - signed * code.load(g, other), row, N)
-                for filling in range(N + 1, wide):
-                    code.store(code.constant(0.0), row, filling)
-                with code.over(self.stages) as j:
-                    entry = -(signed * code.load(A, i * self.stages + j))
-                    type = Type("double", ABREAST if n % ABREAST == 0 else 2)
-                    with code.over(n // type.width) as k:
-                        entries = entry * code.load(S, other * n + k * type.width, type)
-                        code.store(entries, row, j * n + k * type.width)
-                code.store(code.load(row, unknown) + 1.0, row, unknown)
-        self._fill_sizes(code, state, K, M, sizes)
-
-    def _growths(self, code: Code, numbers: Value, i: Value) -> tuple[Value, Value]:
-        """The places of e^{γτ} of a stage, and of their reciprocals."""
-        d, start = self.ndof, self.size - 2 * self.ndof * (self.stages + 1)
-        return code.at(numbers, i * d + start), code.at(numbers, (i + self.stages + 1) * d + start)
-
-    def _fill_slopes(
-        self, code: Code, numbers: Value, Y: Value, g: Value, S: Value, i: Value, data: Sequence[Value]
-    ) -> None:
-        """∇H into g and ∇²H into S, of a stage."""
-        n, letters = self.n_out, len(self.lettered.letters)
-        given = [code.load(numbers, 1 + k) for k in range(self.parameters)]
-        given += [code.load(numbers, i * letters + (self.size + k)) for k in range(letters)]
-        if self._terms is not None:  # a loop over the terms of each kind
-            _fill(code, g, n)
-            _fill(code, S, n * n)
-            slope, rows = Rows(g, DOUBLE), Rows(S, DOUBLE)
-
-            def targets(places: list[Value]) -> list[tuple[Rows, Value]]:
-                return [(slope, m) for m in places] + [(rows, i * n + j) for i in places for j in places]
-
-            self._terms.add(data, self._terms.derivatives(0, True), [Rows(Y, DOUBLE)], given, targets)
-            return
-        slopes, hessian = self._square(self.slopes(*(code.load(Y, m) for m in range(n)), *given))
-        for m, x in enumerate(slopes):
-            code.store(code.operand(x, DOUBLE), g, m)
-        for j, row in enumerate(hessian):
-            for k, x in enumerate(row):
-                if not is_zero(x):
-                    code.store(code.operand(x, DOUBLE), S, j * n + k)
-
-    def _fill_sizes(self, code: Code, state: Value, K: Value, M: Value, sizes: Value) -> None:
-        """The reciprocal size of each unknown: of its variable, or of the largest of its kind where that is 0."""
-        n, d, N, wide, zero = self.n_out, self.ndof, self.unknowns, self._wide, code.constant(0.0)
-        for part in range(2):
-
-            def own(m: Value, values: list[Value], part: int = part) -> list[Value]:
-                def largest(i: Value, values: list[Value]) -> list[Value]:
-                    row = i * n + m + part * d
-                    return [_larger(_larger(values[0], abs(code.load(K, row))), abs(code.load(M, row * wide + N)))]
-
-                (size,) = code.loop(self.stages, [abs(code.load(state, m + part * d))], largest)
-                code.store(size, sizes, m + part * d)
-                return [_larger(values[0], size)]
-
-            (top,) = code.loop(d, [zero], own)
-            top = where(top > 0.0, top, 1.0)
-            with code.over(d) as m:
-                size = code.load(sizes, m + part * d)
-                size = 1.0 / _larger(where(size > 0.0, size, top), code.constant(SMALLEST))
-                with code.over(self.stages) as i:
-                    code.store(size, sizes, i * n + m + part * d)
-
-    def _relative_size_in_memory(self, code: Code, state: Value, K: Value, M: Value) -> Value:
-        """The same as `_relative_size`."""
-        n, d, N, wide, zero = self.n_out, self.ndof, self.unknowns, self._wide, code.constant(0.0)
-        ratios = []
-        for part in range(2):
-
-            def variable(m: Value, values: list[Value], part: int = part) -> list[Value]:
-                def stage(i: Value, values: list[Value]) -> list[Value]:
-                    row = i * n + m + part * d
-                    change, size = abs(code.load(M, row * wide + N)), abs(code.load(K, row))
-                    return [where(change <= values[0], values[0], change), _larger(values[1], size)]
-
-                top, largest = code.loop(self.stages, [values[0], zero], stage)
-                return [top, _larger(values[1], abs(code.load(state, m + part * d)) + largest)]
-
-            top, scale = code.loop(d, [zero, zero], variable)
-            ratios.append(where(top > 0.0, top / scale, top))
-        return where(ratios[1] <= ratios[0], ratios[0], ratios[1])
-
-    def _solve(self, M: Value, sizes: Value) -> None:
-        """Eliminate the unknowns in place: the last column of M becomes the solution.
-
-        Pivots are the largest of their column in units of the sizes of the unknowns, whose reciprocals `sizes` go
-        along.
-        """
-        code, N, wide, type = M.code, self.unknowns, self._wide, Type("double", ABREAST)
-        with code.over(N) as k:
-            row = code.at(M, k * wide)
-
-            def better(i: Value, values: list[Value], k: Value = k) -> list[Value]:
-                i = i + k + 1
-                size = abs(code.load(M, i * wide + k)) * code.load(sizes, i)
-                larger = values[0] < size
-                return [code.select(larger, size, values[0]), code.select(larger, i, values[1])]
-
-            _, best = code.loop((N - 1) - k, [abs(code.load(row, k)) * code.load(sizes, k), k], better)
-            start = k >> 2
-            with code.given(k < best):
-                other = code.at(M, best * wide)
-                with code.over((wide // ABREAST) - start) as j:
-                    place = (j + start) * ABREAST
-                    a, b = code.load(row, place, type), code.load(other, place, type)
-                    code.store(b, row, place)
-                    code.store(a, other, place)
-                a, b = code.load(sizes, k), code.load(sizes, best)
-                code.store(b, sizes, k)
-                code.store(a, sizes, best)
-            inverse = 1.0 / code.load(row, k)
-            code.store(inverse, row, k)
-            start = (k + 1) >> 2
-            with code.over((N - 1) - k) as i:
-                other = code.at(M, (i + k + 1) * wide)
-                factor = code.load(other, k) * -inverse
-                groups = (
-                    code.select(code.apply("eq", (factor, 0.0)), start, code.constant(wide // ABREAST, INT)) - start
-                )
-                with code.over(groups) as j:
-                    place = (j + start) * ABREAST
-                    x = code.fma(
-                        code.splat(factor, ABREAST), code.load(row, place, type), code.load(other, place, type)
-                    )
-                    code.store(x, other, place)
-        with code.over(N) as i:
-            k = (N - 1) - i
-            row = code.at(M, k * wide)
-            x = code.load(row, N) * code.load(row, k)
-            code.store(x, row, N)
-            with code.over(k) as j:
-                other = code.at(M, j * wide)
-                code.store(code.fma(-code.load(other, k), x, code.load(other, N)), other, N)
+        _, best = code.loop((N - 1) - k, [abs(code.load(row, k)) * code.load(sizes, k), k], better)
+        start = k >> 2
+        with code.given(k < best):
+            other = code.at(M, best * wide)
+            with code.over((wide // ABREAST) - start) as j:
+                place = (j + start) * ABREAST
+                a, b = code.load(row, place, type), code.load(other, place, type)
+                code.store(b, row, place)
+                code.store(a, other, place)
+            a, b = code.load(sizes, k), code.load(sizes, best)
+            code.store(b, sizes, k)
+            code.store(a, sizes, best)
+        inverse = 1.0 / code.load(row, k)
+        code.store(inverse, row, k)
+        start = (k + 1) >> 2
+        with code.over((N - 1) - k) as i:
+            other = code.at(M, (i + k + 1) * wide)
+            factor = code.load(other, k) * -inverse
+            groups = code.select(code.apply("eq", (factor, 0.0)), start, code.constant(wide // ABREAST, INT)) - start
+            with code.over(groups) as j:
+                place = (j + start) * ABREAST
+                x = code.fma(code.splat(factor, ABREAST), code.load(row, place, type), code.load(other, place, type))
+                code.store(x, other, place)
+    with code.over(N) as i:
+        k = (N - 1) - i
+        row = code.at(M, k * wide)
+        x = code.load(row, N) * code.load(row, k)
+        code.store(x, row, N)
+        with code.over(k) as j:
+            other = code.at(M, j * wide)
+            code.store(code.fma(-code.load(other, k), x, code.load(other, N)), other, N)
 
 
 def _eliminated(M: list[list[Any]], x: Sequence[Any], weights: Sequence[Any]) -> list[Any]:
@@ -676,27 +626,9 @@ def _total(terms: Sequence[Any]) -> Any:
 
 
 def _larger(a: Any, b: Any) -> Any:
-    return where(a < b, b, a)
+    return b if is_zero(a) else a if is_zero(b) else where(a < b, b, a)
 
 
-def _largest(values: Sequence[Any]) -> Any:
-    """The largest absolute value."""
-    moving = [abs(x) for x in values if not is_zero(x)]
-    return reduce(_larger, moving) if moving else 0.0
-
-
-def _fill(code: Code, place: Value, count: int) -> None:
-    with code.over(count) as i:
-        code.store(code.constant(0.0), place, i)
-
-
-def _scale_slopes(code: Code, d: int, grown: Value, shrunk: Value, g: Value, S: Value) -> None:
-    """∇H and ∇²H at (q, p) into those of [q, P]: rows e^{γτ} ∂H/∂q, columns ∂p/∂P."""
-    n = 2 * d
-    with code.over(d) as m:
-        up = code.load(grown, m)
-        code.store(code.load(g, m) * up, g, m)
-        with code.over(d) as k:
-            down = code.load(shrunk, k)
-            for place, factor in ((m * n + k, up), (m * n + k + d, up * down), ((m + d) * n + k + d, down)):
-                code.store(code.load(S, place) * factor, S, place)
+def _top(a: Any, b: Any) -> Any:
+    """The larger of two that are not negative, NaN if the second is."""
+    return b if is_zero(a) else where(b <= a, a, b)

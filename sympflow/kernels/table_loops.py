@@ -64,8 +64,8 @@ class TableLoops:
         assert mass is not None
         self._inverse_mass = np.array([[mass[i, j] for j in range(d)] for i in range(d)], dtype=np.float64)
         damping = tuple(tuple(map(float, row)) for row in friction.matrix(d)) if friction else None
-        self._maps = _maps(form, level, monomials, damping)
-        sizes = [self._maps.terms if kick else 1 for kick in kicks]
+        self.maps = _maps(form, level, monomials, damping)
+        sizes = [self.maps.terms if kick else 1 for kick in kicks]
         self.drifts = (np.cumsum(sizes) - sizes)[self.kicks == 0]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -80,13 +80,6 @@ class TableLoops:
         zero, no_slope = np.zeros((n_rows, len(c) * y.shape[1])), np.empty((0, len(c) * y.shape[1]))
         errors = LabelErrors(self, y, t0, zero, zero + 1.0, no_slope, np.empty((*c.shape, 0)))
         return errors(c)[0].reshape(len(c), n_rows, y.shape[1])
-
-    def function(self, linearized: bool) -> Callable[..., None]:
-        """The compiled function: see `_Errors`."""
-        return self._maps.function(linearized)
-
-    def memory(self, n_numbers: int) -> np.ndarray:
-        return aligned(self._maps.memory(len(self.kicks), n_numbers))
 
     def opened(self, y: np.ndarray, t0: np.ndarray | None) -> np.ndarray:
         """States (2d, N) with the times (N,) of a driven system after the positions, and its work after the momenta."""
@@ -159,7 +152,8 @@ class LabelErrors:
         """
         loops, (times, _, n) = self._loops, self._shape
         r, J = np.empty(self._shape), np.empty((self.matrices.shape[1] if linearized else 0, *self._shape))
-        memory, function = loops.memory(c.shape[1]), loops.function(linearized)
+        maps = loops.maps
+        memory, function = aligned(maps.memory(len(loops.kicks), c.shape[1])), maps.function(linearized)
         arrays = self._plan, np.ascontiguousarray(c), loops.motions(c), r, J, memory
         addresses, n_blocks = [address(a) for a in arrays], times * -(-n // LANES)
         for first in range(0, n_blocks, BLOCKS):
@@ -207,16 +201,6 @@ def table_loops(
         return None
 
 
-@lru_cache(maxsize=64)
-def _maps(
-    form: SymbolicHamiltonian | TracedHamiltonian,
-    level: int,
-    monomials: Monomials,
-    friction: tuple[tuple[float, ...], ...] | None,
-) -> _Maps:
-    return _Maps(form, level, monomials, friction)
-
-
 class _Maps:
     """The kicks and drifts of a system, with what their derivatives need, and the functions that are made of them."""
 
@@ -238,7 +222,6 @@ class _Maps:
         numbers = [f"x_{i}" for i in range(n_symbols)] + [f"c_{k}" for k in range(self.terms)]
         self.kick = fused(traced(self._kick, *numbers))
         _check_length(len(self.kick))
-        self._functions: dict[bool, Callable[..., None]] = {}
 
     def _kick(self, *numbers: Any) -> list[Any]:
         """The change of p, then the forces of each term, then the upper triangle of the slope of the change."""
@@ -277,10 +260,13 @@ class _Maps:
     def memory(self, n_stages: int, n_numbers: int) -> int:
         return LANES * (4 * self.width + n_numbers + n_stages * self.tape)
 
+    @lru_cache(maxsize=128)  # noqa: B019  (of as many maps as are kept)
     def function(self, linearized: bool) -> Callable[..., None]:
-        if linearized not in self._functions:
-            self._functions[linearized] = _Errors(self, linearized).compiled()
-        return self._functions[linearized]
+        """The compiled function: see `_Errors`."""
+        return _Errors(self, linearized).compiled()
+
+
+_maps = lru_cache(maxsize=64)(_Maps)
 
 
 def _check_length(n: int) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_counts, check_positive, plain, real_number
+from sympflow.arguments import check_counts, check_one_of, check_positive, plain, real_number
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.mlp import MLPFlow, matching_widths
 from sympflow.flow.primed import PrimedFlow
@@ -50,12 +50,6 @@ def check_weights(**weights: Any) -> None:
         raise ValueError(f"{', '.join(most)} and {last} are all 0: give one of them a positive value.")
 
 
-def check_of(name: str, value: Any, known: Iterable[str]) -> None:
-    """One of the known names."""
-    if value not in known:
-        raise ValueError(f"`{name}` {value!r} is unknown: choose one of {', '.join(known)}.")
-
-
 Check = Callable[[str, Any], None]
 """Raises an error unless an option of that name may have the value."""
 
@@ -65,7 +59,7 @@ def count(name: str, value: Any) -> None:
 
 
 def one_of(*known: str) -> Check:
-    return lambda name, value: check_of(name, value, known)
+    return lambda name, value: check_one_of(name, value, known)
 
 
 def weight(name: str, value: Any, what: str = "loss") -> None:
@@ -665,7 +659,7 @@ def from_keywords(options: Mapping[str, Any], kind: str, by: str | None, flow: F
         made = LossFit
     search = issubclass(made, PrimedFit | SplitFit)
     name = by or (GaussNewton.name if search else Adam.name)
-    check_of("optimizer", name, SOLVERS)
+    check_one_of("optimizer", name, SOLVERS)
     solver = SOLVERS[name]
     of_solver = ["steps", "restarts"] if search else [n for n in solver.names() if n != "restarts"]
     of_fit = [n for n in made.names() if n != "baseline"]

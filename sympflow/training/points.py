@@ -108,7 +108,7 @@ def start_times(
     system: HamiltonianSystem, dt: float, n: int, seed: int, stream: Stream, block: int = 0
 ) -> np.ndarray | None:
     """Random times (n,) at which steps of a driven system begin; None for another."""
-    if system.autonomous:
+    if Drive.of(system) is None:
         return None
     low, high = times_of(system, dt)
     rng = np.random.default_rng([stream_seed(seed, stream, block), int(Stream.TIMES)])

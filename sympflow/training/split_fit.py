@@ -11,7 +11,7 @@ Gauss–Newton steps do not see.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,6 +99,35 @@ class AtEnd(Problem):
     def minimize(self, theta: np.ndarray, iterations: int, deadline: Deadline, thorough: bool = False) -> Minimum:
         """The minimum from the numbers θ = u; none of the searches is thorough."""
         return self.problem.minimize(theta, len(self.problem.t) - 1, iterations, deadline.over)
+
+
+class Pulled:
+    """Weighted residuals at some of the times, of numbers affine in θ, and a pull of these towards equal steps."""
+
+    def __init__(
+        self,
+        problem: SplitProblem,
+        at: Sequence[int],
+        offsets: np.ndarray,
+        designs: np.ndarray,
+        weights: np.ndarray,
+        pulls: np.ndarray,
+    ) -> None:
+        self.problem, self.offsets, self.designs = problem, offsets, designs
+        self.times = list(zip(weights, at, strict=True))
+        self.equal = np.array([problem.equal(problem.t[j]) for j in at])
+        self.pulled = (weights * pulls)[:, None] / np.array([problem.units(problem.t[j]) for j in at])
+
+    def residuals(self, theta: np.ndarray) -> np.ndarray:
+        u = self.offsets + self.designs @ theta
+        data = [w * self.problem.residuals(v, j) for (w, j), v in zip(self.times, u, strict=True)]
+        return np.concatenate([*data, *(self.pulled * (u - self.equal))])
+
+    def linearized(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        u = self.offsets + self.designs @ theta
+        each = zip(self.times, u, self.designs, strict=True)
+        data = [w * self.problem.jacobian(v, j) @ design for (w, j), v, design in each]
+        return self.residuals(theta), np.concatenate([*data, *(self.pulled[..., None] * self.designs)])
 
 
 def _phases(share: np.ndarray) -> np.ndarray:
@@ -189,7 +218,7 @@ class SplitProblem:
 
     def frozen(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Offset (n,) and design (n, f) of numbers that are bound by Σ s = t alone, in their units."""
-        bare = [Column(c.n, 1, t, c.power, c.total if c.total == "always" else None) for c in self.columns]
+        bare = [Column(c.n, (0,), c.power, total="always" if c.total == "always" else None, dt=t) for c in self.columns]
         affine = [c.affine(np.array([t])) for c in bare]
         offset = np.concatenate([own[0, : (c.n + 1) // 2] for c, (own, _) in zip(bare, affine, strict=True)])
         blocks = [d[0, : (c.n + 1) // 2] / t**c.power for c, (_, d) in zip(bare, affine, strict=True)]
@@ -198,18 +227,10 @@ class SplitProblem:
     def minimize(self, u: np.ndarray, j: int, iterations: int, stop: Stop, pull: float = 0.0) -> Minimum:
         """The numbers at the j-th time that fit the labels best, pulled towards equal steps."""
         offset, design = self.frozen(self.t[j])
-        unit, equal = self.units(self.t[j]), self.equal(self.t[j])
-
-        def residuals(theta: np.ndarray) -> np.ndarray:
-            u = offset + design @ theta
-            return np.concatenate([self.residuals(u, j), pull * (u - equal) / unit])
-
-        def linearized(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            J = self.jacobian(offset + design @ theta, j) @ design
-            return residuals(theta), np.concatenate([J, pull * design / unit[:, None]])
-
+        unit, one = self.units(self.t[j]), np.ones(1)
         theta = np.linalg.lstsq(design / unit[:, None], (u - offset) / unit, rcond=None)[0]
-        m = levenberg_marquardt(residuals, linearized, theta, iterations=iterations, stop=stop)
+        fit = Pulled(self, [j], offset[None], design[None], one, pull * one)
+        m = levenberg_marquardt(fit.residuals, fit.linearized, theta, iterations=iterations, stop=stop)
         return Minimum(offset + design @ m.x, m.cost, m.iterations, m.reason)
 
     def pull(self, u: np.ndarray, j: int) -> float:
@@ -252,21 +273,8 @@ class SplitProblem:
         A = np.concatenate([A, ROUGHNESS * np.eye(A.shape[1])])
         theta = np.linalg.lstsq(A, np.concatenate([b, np.zeros(A.shape[1])]), rcond=None)[0]
         weight = np.where(np.arange(len(self.t)) == len(self.t) - 1, self.fit.frozen_weight, 1.0)
-        weight /= math.sqrt(len(self.t))
-
-        equal, pulled = np.array([self.equal(t) for t in self.t]), (weight * pulls)[:, None] / scale
-
-        def residuals(theta: np.ndarray) -> np.ndarray:
-            u = offsets + designs @ theta
-            data = [weight[j] * self.residuals(u[j], j) for j in range(len(self.t))]
-            return np.concatenate([*data, *(pulled * (u - equal))])
-
-        def linearized(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            u = offsets + designs @ theta
-            data = [weight[j] * self.jacobian(u[j], j) @ designs[j] for j in range(len(self.t))]
-            return residuals(theta), np.concatenate([*data, *(pulled[..., None] * designs)])
-
-        m = levenberg_marquardt(residuals, linearized, theta, iterations=self.solver.steps, stop=stop)
+        fit = Pulled(self, range(len(self.t)), offsets, designs, weight / math.sqrt(len(self.t)), pulls)
+        m = levenberg_marquardt(fit.residuals, fit.linearized, theta, iterations=self.solver.steps, stop=stop)
         self.assign(m.x)
         return m
 

@@ -566,14 +566,13 @@ class Table:
         """The columns of `frozen`."""
         return [
             Coefficients(
-                c.offset.shape[0],
+                c.n,
                 (0,),
-                self.dt,
                 c.power,
                 self.flow.palindromic and j < self._kernel,
-                1.0 if c.always else None,
-                always=c.always,
-                present=c.present,
+                "always" if c.total == "always" else None,
+                c.present,
+                dt=self.dt,
             )
             for j, c in enumerate(self.columns)
         ]

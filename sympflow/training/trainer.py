@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sympflow.arguments import plain, real_number
+from sympflow.arguments import check_one_of, plain, real_number
 from sympflow.arrays import is_tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
@@ -43,7 +43,6 @@ from sympflow.training.fits import (
     PrimedFit,
     Solver,
     SplitFit,
-    check_of,
     from_keywords,
     keywords,
     said,
@@ -357,7 +356,7 @@ def _described(
     else:
         named = ["kind"] * (kind is not None) + [n for n in options if n in (*OF_PRIMED, *OF_SEARCHES)]
         kind = _meant(system, options, searches) if kind is None else kind
-        check_of("kind", kind, KINDS)
+        check_one_of("kind", kind, KINDS)
         for name in (n for n in options if n in (OF_NETWORKS if kind == "primed" else OF_PRIMED)):
             raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
         if kind == "primed":
