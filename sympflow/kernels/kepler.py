@@ -34,6 +34,7 @@ from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_state
 from sympflow.kernels.rollouts import Columns, Rollouts, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.tangents import EVERY, TangentKernel, exponent_of
+from sympflow.kernels.threads import run_in_threads, threads_for
 from sympflow.schemes import Substeps
 
 __all__ = ["KeplerFlowKernel", "KeplerKernel", "KeplerLoops", "KeplerTangents", "kepler_loops"]
@@ -87,8 +88,8 @@ class KeplerCode(Rollouts):
 
     lanes, fewest = 1, 1
 
-    def __init__(self, frame: Frame, form: Form) -> None:
-        self.light = places_of_light(frame)
+    def __init__(self, frame: Frame, form: Form, part: slice = slice(None)) -> None:
+        self.light = places_of_light(frame)[part]
         self.groups = -(-(len(frame.order) + bool(self.light)) // LANES)  # with one lane behind all planets
         self.form, self.whole = form, NUMBERS * (self.groups + len(self.light))
         n_values = self.whole * (1 + form.vectors + form.compensated) + form.vectors * form.grows
@@ -523,7 +524,8 @@ class KeplerLoops:
                 f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}: use "
                 "backend='array'."
             )
-        self.frame, self._light, self._codes = frame, bool(light), dict[Form, KeplerCode]()
+        self.frame, self._groups, self._light = frame, light, bool(light)
+        self._codes: dict[tuple[Form, int, int], KeplerCode] = {}
         groups = self.code(Form()).groups
         spare = LANES * groups - n
         self._spare = np.zeros((spare, 2 * AXES))
@@ -553,9 +555,28 @@ class KeplerLoops:
                 "`system` has bodies without mass, and compiled deviation vectors and force gradients are for bodies "
                 "with mass: use backend='array'."
             )
-        if form not in self._codes:
-            self._codes[form] = KeplerCode(self.frame, form)
-        return self._codes[form]
+        return self._made(form, 0, 1)
+
+    def parts(self, form: Form, threads: int) -> list[tuple[KeplerCode, np.ndarray]]:
+        """Codes of parts of the bodies without mass, all with the planets, and the places of their running states."""
+        found, start = [], NUMBERS * self.code(form).groups
+        for k in range(threads):
+            code = self._made(form, k, threads)
+            places = np.concatenate(
+                [np.arange(start), start + NUMBERS * self._ends(k, threads)[0] + np.arange(code.whole - start)]
+            )
+            whole = self.code(form).whole
+            found.append((code, np.concatenate([places, whole + places]) if form.compensated else places))
+        return found
+
+    def _ends(self, k: int, threads: int) -> tuple[int, int]:
+        n = len(self._groups)
+        return n * k // threads, n * (k + 1) // threads
+
+    def _made(self, form: Form, k: int, threads: int) -> KeplerCode:
+        if (form, k, threads) not in self._codes:
+            self._codes[form, k, threads] = KeplerCode(self.frame, form, slice(*self._ends(k, threads)))
+        return self._codes[form, k, threads]
 
     def rows(self, y: np.ndarray, spare: float = 1.0) -> np.ndarray:
         """The running states (..., n_values) of states (..., 2d); of deviation vectors with a `spare` of 0."""
@@ -641,15 +662,50 @@ class KeplerKernel(Kernel):
         return partial(code.run_processed, self._table(h, (), self.before), columns, after)
 
     def runs(self, task: Task) -> Run:
-        loops, start = self.loops, self.loops.rows(task.y0)
-        run, work = self.rollout(self.code, task.h), WORK * len(self.columns)
-        rows, n_finite, _ = run_states(run, task._replace(y0=start), self.code.n_values, work)
-        self.remark = self._pair() if len(start) == 1 and n_finite[0] < task.n_steps else ""
+        loops, code, start = self.loops, self.code, self.loops.rows(task.y0)
+        light = len(code.light)
+        work = WORK * len(self.columns) * (code.groups + light)
+        threads = threads_for(light, (task.n_steps - (task.carry.steps if task.carry else 0)) * work, task.threads)
+        given = task._replace(y0=start)
+        if len(start) == 1 < threads:
+            rows, n_finite, code = self._in_parts(given, threads)
+        else:
+            rows, n_finite, _ = run_states(self.rollout(code, task.h), given, code.n_values, work)
+        self.remark = self._pair(code) if len(start) == 1 and n_finite[0] < task.n_steps else ""
         return Run(loops.states(rows, task.y0, task.save * task.h), n_finite)
 
-    def _pair(self) -> str:
+    def _in_parts(self, task: Task, threads: int) -> tuple[np.ndarray, np.ndarray, KeplerCode]:
+        """A run of one state by threads that share the bodies without mass, with the code that ended first."""
+        carry, whole = task.carry, self.code.whole
+        save = np.ascontiguousarray(task.save, dtype=np.int64)
+        parts = self.loops.parts(self.form, threads)
+        running = np.zeros((1, self.code.n_values)) if carry is None or carry.running is None else carry.running
+        running = running.reshape(1, -1)
+        batches = []
+        for code, places in parts:
+            own = Batch.whole(task.y0[:, places[: code.whole]], task.n_steps, save, code.n_out)
+            if carry is not None:
+                own = own._replace(first=carry.steps, running=running[:, places])
+            batches.append(own)
+
+        def run(code: KeplerCode, own: Batch, stop: np.ndarray) -> None:
+            self.rollout(code, task.h)(own._replace(stop=stop))
+
+        run_in_threads([partial(run, code, own) for (code, _), own in zip(parts, batches, strict=True)])
+        rows, new = np.empty((1, len(save), whole)), np.empty_like(running)
+        for (code, places), own in zip(parts, batches, strict=True):
+            rows[..., places[: code.whole]] = own.out
+            if carry is not None:
+                new[:, places] = own.running
+        ended = [int(own.n_finite[0]) for own in batches]
+        rows[:, save > min(ended)] = np.nan
+        if carry is not None:
+            carry.advance(task.n_steps, new)
+        return rows, np.array([min(ended)]), parts[int(np.argmin(ended))][0]
+
+    def _pair(self, code: KeplerCode) -> str:
         """A sentence on the bodies that met."""
-        frame, code = self.loops.frame, self.code
+        frame = self.loops.frame
         if frame.encounter is None or not code.report.any():
             return ""
         *places, group = code.report

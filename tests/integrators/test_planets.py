@@ -7,6 +7,7 @@ import torch
 import sympflow
 from sympflow import HamiltonianSystem, compare, ensemble, gali, lyapunov, solve, splitting_method, systems
 from sympflow.arrays import jvp
+from sympflow.kernels.protocol import RunCheckpoint
 from sympflow.schemes import CORRECTORS, corrector_maps
 from sympflow.systems.planets import SUN_OVER_PLANET, TABLE
 from sympflow.testing import check_integrator
@@ -595,6 +596,23 @@ def test_bodies_without_mass_are_compiled(planets, coordinates):
     alone = HamiltonianSystem.planets([1.0, *[1e-5] * planets], elements=few, **given)
     d = 3 * (1 + planets)
     assert np.abs(solve(alone, "wisdom_holman", (0, 12.0), dt=0.3).y[:d] - runs[0][:d]).max() < 1e-11
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+def test_threads_share_bodies_without_mass(compensated):
+    rng, n = np.random.default_rng(0), 50
+    orbits = {"a": [5.2, 9.55, *rng.uniform(2.0, 4.0, n)], "e": 0.05, "M": rng.uniform(0, 6, n + 2)}
+    for encounter in (None, 1.0):
+        system = HamiltonianSystem.planets([1.0, 1e-3, 3e-4, *[0.0] * n], elements=orbits, G=GAUSS, encounter=encounter)
+        kernel = sympflow.get("wisdom_holman")(dt=40.0).composed(system).kernel(compensated)
+        runs = []
+        for threads in (1, 3):
+            carry = RunCheckpoint()
+            first = kernel.run(40.0, system.y0, 300, np.arange(0, 300, 50), carry, threads=threads)
+            last = kernel.run(40.0, system.y0, 600, np.arange(300, 600, 50), carry, threads=threads)
+            runs.append((first.states, last.states, last.n_finite, kernel.remark))
+        for one, other in zip(*runs, strict=True):
+            assert np.array_equal(one, other, equal_nan=not isinstance(one, str))
 
 
 def test_a_body_without_mass_that_meets_a_planet():
