@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Container, Iterable
 from functools import wraps
 from importlib import import_module
+from math import inf
 from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
@@ -17,10 +18,11 @@ if TYPE_CHECKING:
 K = TypeVar("K")
 P = ParamSpec("P")
 T = TypeVar("T")
+MOST_KEPT = 64
 
 
-def kept(make: Callable[Concatenate[K, P], T]) -> Callable[Concatenate[K, P], T]:
-    """Make a function of an object, and of what is hashable, keep its values as long as that object lives."""
+def kept(make: Callable[Concatenate[K, P], T], most: float = inf) -> Callable[Concatenate[K, P], T]:
+    """Make a function of an object, and of what is hashable, keep `most` values as long as that object lives."""
     known: WeakKeyDictionary[K, dict[Any, T]] = WeakKeyDictionary()
 
     @wraps(make)
@@ -29,10 +31,17 @@ def kept(make: Callable[Concatenate[K, P], T]) -> Callable[Concatenate[K, P], T]
         if values is None:
             values = known[owner] = {}
         if args not in values:
+            if len(values) >= most:
+                values.clear()
             values[args] = make(owner, *args, **options)
         return values[args]
 
     return found
+
+
+def lately_kept(make: Callable[Concatenate[K, P], T]) -> Callable[Concatenate[K, P], T]:
+    """Make a function keep a few of its values, those of states for instance, of which there may be any number."""
+    return kept(make, MOST_KEPT)
 
 
 def needed(library: str, extra: str) -> str:

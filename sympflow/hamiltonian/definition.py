@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from math import inf
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -23,25 +22,6 @@ def bare_copy(x: Any) -> Any:
     for name in [name for name in vars(other) if isinstance(getattr(type(x), name, None), cached_property)]:
         del vars(other)[name]
     return other
-
-
-class Found(WeakKeyDictionary[Any, dict[Any, Any]]):
-    """What was found of objects, once for each key, as long as they live; of each `most` things at a time."""
-
-    def __init__(self, most: float = inf) -> None:
-        super().__init__()
-        self.most = most
-
-    def of(self, x: Any, key: Any, make: Callable[[], Any]) -> Any:
-        """Return what `make` finds of x, the first time."""
-        known = self.get(x)
-        if known is None:
-            known = self[x] = {}
-        if key not in known:
-            if len(known) >= self.most:
-                known.clear()
-            known[key] = make()
-        return known[key]
 
 
 class Definition:

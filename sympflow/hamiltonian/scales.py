@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sympflow.hamiltonian.definition import Found, bare_copy
+from sympflow.hamiltonian.definition import bare_copy
+from sympflow.lazy import kept, lately_kept
 
 STATES = 64
 """States of a domain at which Hessians are taken, where there is no y0."""
@@ -24,25 +25,20 @@ SMALLEST_SCALE = 1e-3
 """The scale of energy errors, at least, in units of the size of the terms of H along an orbit."""
 
 
-_KNOWN = Found()
-_STARTED = Found(most=64)
-"""What was found at states: by these default steps, and by one of these and a step the system that starts there."""
-
-
 def natural_scale(scene: Any) -> np.ndarray:
     """Factors s (d,) such that s q and p/s are of one size: for an oscillator of frequency ω and mass m, s = √(mω)."""
-    system = scene.between_impulses
+    return _natural_scale(scene.between_impulses).copy()
 
-    def found() -> np.ndarray:
-        with np.errstate(all="ignore"):
-            try:
-                large = system.local is not None and system.ndof > MOST_DENSE
-                s = _of_large(system) if large else _of_hessians(system)
-            except (ArithmeticError, ValueError, TypeError):  # singular at the origin, or no second derivatives
-                s = np.ones(system.ndof)
-            return np.where(np.isfinite(s) & (s > 0), s, 1.0)
 
-    return _KNOWN.of(system, "", found).copy()
+@kept
+def _natural_scale(system: Any) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        try:
+            large = system.local is not None and system.ndof > MOST_DENSE
+            s = _of_large(system) if large else _of_hessians(system)
+        except (ArithmeticError, ValueError, TypeError):  # singular at the origin, or no second derivatives
+            s = np.ones(system.ndof)
+        return np.where(np.isfinite(s) & (s > 0), s, 1.0)
 
 
 def weights(system: Any) -> np.ndarray:
@@ -109,10 +105,7 @@ def fastest_rate(system: Any) -> float | None:
 
 def default_step(scene: Any, y: np.ndarray | None = None) -> float:
     """`STEP` over the largest rate at states y (..., 2d), by default y0 or those of the domain, to two digits."""
-    if y is not None:
-        y = _few(y)
-        return _STARTED.of(scene, y.tobytes(), lambda: _step_at(scene.between_impulses, y))
-    return _step_at(scene.between_impulses, None)
+    return _step_at(scene.between_impulses, None if y is None else _few(y).tobytes())
 
 
 def _few(y: np.ndarray) -> np.ndarray:
@@ -121,7 +114,9 @@ def _few(y: np.ndarray) -> np.ndarray:
     return rows[:: max(1, len(rows) // MOST_RATES)].astype(float)
 
 
-def _step_at(system: Any, y: np.ndarray | None) -> float:
+@lately_kept
+def _step_at(system: Any, states: bytes | None) -> float:
+    y = None if states is None else np.frombuffer(states).reshape(-1, 2 * system.ndof)
     rate = max(fastest_at(system, t, y) for t in system.probe_times())
     return float(f"{STEP / rate:.2g}") if 0 < STEP / max(rate, 1e-300) < 1e100 and np.isfinite(rate) else STEP
 
@@ -164,13 +159,14 @@ def started(system: Any, y0: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
             H = system.between_impulses.hamiltonian(rows, system.t_span[0])
             highest = int(np.argmax(np.nan_to_num(H, nan=-np.inf, posinf=-np.inf)))
+    return _started(system, dt, rows[highest].tobytes())
 
-    def other() -> Any:
-        made = bare_copy(system)
-        made.dt, made.y0 = dt, rows[highest]
-        return made
 
-    return _STARTED.of(system, (dt, rows[highest].tobytes()), other)
+@lately_kept
+def _started(system: Any, dt: float, y0: bytes) -> Any:
+    other = bare_copy(system)
+    other.dt, other.y0 = dt, np.frombuffer(y0).copy()
+    return other
 
 
 def size_of_terms(system: Any, y: np.ndarray, t: Any) -> np.ndarray:

@@ -17,7 +17,6 @@ import numpy as np
 
 from sympflow.arguments import check_array
 from sympflow.arrays import Array, to_numpy
-from sympflow.hamiltonian.definition import Found
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps, finished
@@ -26,6 +25,7 @@ from sympflow.integrators.grid_runs import Run, broken_off
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper
 from sympflow.kernels.protocol import RunCheckpoint
+from sympflow.lazy import kept
 
 LARGEST_CHUNK = 2**20  # numbers in one chunk of states
 FIRST_CHUNK = 2**16  # steps, at most, before it is known how fast time goes
@@ -36,18 +36,15 @@ EVALUATIONS_EACH = 50  # and these for each step of the physical length dt withi
 STEPS_EACH = 6  # or as many as so many steps take
 COMPILED_FOR_ONE = 10  # compiled evaluations that are allowed for one on arrays, which takes a thousand times longer
 
-_TRANSFORMED, _SCALES = Found(), Found()
+_transformed = kept(time_transformed)
+scale_of = kept(time_scale)
+"""ds/dt where the kinetic energy is c − E, at the energy E of the system's y0, of a system and c."""
 
 
 def transformed_system(system: HamiltonianSystem, shift: float | None) -> HamiltonianSystem:
     """Return the transformed system, made once for each c."""
     c = default_shift(system) if shift is None else float(shift)
-    return _TRANSFORMED.of(system, c, lambda: time_transformed(system, c))
-
-
-def scale_of(system: HamiltonianSystem, c: float) -> float:
-    """Return ds/dt where the kinetic energy is c − E, at the energy E of the system's y0; worked out once."""
-    return _SCALES.of(system, c, lambda: time_scale(system, c))
+    return _transformed(system, c)
 
 
 ARRAYS_ONLY = (

@@ -18,13 +18,13 @@ import numpy as np
 
 from sympflow.arrays import Array, as_array, concatenate, library, like, per_state, to_numpy
 from sympflow.compiler import NotCompiled
-from sympflow.hamiltonian.definition import Found
 from sympflow.hamiltonian.monomials import Monomials, gradient
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.contract import Failure
 from sympflow.integrators.steppers import ArraySteps, rollout
+from sympflow.lazy import kept
 from sympflow.schemes import (
     FORCE_GRADIENT,
     Scheme,
@@ -44,7 +44,33 @@ if TYPE_CHECKING:
     from sympflow.kernels.splitting_loops import SplittingLoops
     from sympflow.kernels.tangents import TangentKernel
 
-_PARTS = Found()
+
+@kept
+def _linear_and_rest(system: HamiltonianSystem) -> ExactParts:
+    from sympflow.hamiltonian.parts import linear_and_rest
+
+    return linear_and_rest(system)
+
+
+@kept
+def _exact_parts(system: HamiltonianSystem, parts: Any) -> ExactParts:
+    from sympflow.hamiltonian.parts import exact_parts
+
+    return exact_parts(system, parts)
+
+
+@kept
+def _two_copies(system: HamiltonianSystem, omega: float | None) -> ExactParts:
+    from sympflow.hamiltonian.copies import coupling_strength, two_copies
+
+    return two_copies(system, coupling_strength(system) if omega is None else float(omega))
+
+
+@kept
+def _frame(system: HamiltonianSystem) -> Frame | None:
+    from sympflow.hamiltonian.planets import frame_of
+
+    return frame_of(system.local, system.y0)
 
 
 class Composition(ABC, ArraySteps):
@@ -406,9 +432,8 @@ class LinearRest(ExactMaps):
 
     def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem) -> None:
         super().__init__(method, scheme, system)
-        from sympflow.hamiltonian.parts import linear_and_rest
 
-        self.parts = _PARTS.of(system, "linear", lambda: linear_and_rest(system))
+        self.parts = _linear_and_rest(system)
         if scheme.nystrom and any(part.turns for part in self.parts.rest):
             raise ValueError(
                 f"`method` {method!r} has a Nyström scheme, which needs a rest of H that is a potential U(q), and that "
@@ -505,10 +530,8 @@ class SolvableParts(ExactMaps):
         self.parts = self._parts(system, parts)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
-        """The parts of a system, found once."""
-        from sympflow.hamiltonian.parts import exact_parts
-
-        return _PARTS.of(system, parts, lambda: exact_parts(system, parts))
+        """The parts of a system."""
+        return _exact_parts(system, parts)
 
     def maps(self, h: Any) -> list[SubFlow]:
         *others, innermost = self.parts.sequence
@@ -542,12 +565,7 @@ class TwoCopies(SolvableParts):
         super().__init__(method, scheme, system)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
-        from sympflow.hamiltonian.copies import coupling_strength, two_copies
-
-        def make() -> ExactParts:
-            return two_copies(system, coupling_strength(system) if self.omega is None else float(self.omega))
-
-        return _PARTS.of(system, ("copies", self.omega), make)
+        return _two_copies(system, self.omega)
 
     def lift(self, y: Array) -> Array:
         from sympflow.hamiltonian.copies import both
@@ -586,7 +604,14 @@ class KeplerInteraction(Composition):
             )
         if system.friction:
             raise ValueError(f"`method` {method!r} does not take friction: use the splitting 'kinetic'.")
-        self.frame: Frame = _PARTS.of(system, "kepler", lambda: _frame_of(system, method))
+        frame = _frame(system)
+        if frame is None:
+            raise ValueError(
+                f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
+                "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
+            )
+        frame.check(method)
+        self.frame: Frame = frame
         if scheme.level and not self.frame.jacobi:
             raise ValueError(
                 f"`method` {method!r} has force gradients, which the interaction has in Jacobi's coordinates only: "
@@ -672,19 +697,6 @@ class KeplerInteraction(Composition):
         processed = (n_saved if backend == "compiled" else 2 * n_steps) + 2 * n_extra
         counts["force_evaluations"] += sum(kick != 0 for kick, *_ in self.before) * processed
         return counts
-
-
-def _frame_of(system: HamiltonianSystem, method: str) -> Frame:
-    from sympflow.hamiltonian.planets import frame_of
-
-    frame = frame_of(system.local, system.y0)
-    if frame is None:
-        raise ValueError(
-            f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "
-            "HamiltonianSystem.planets, or take the splitting 'kinetic', such as 'srkn11b'."
-        )
-    frame.check(method)
-    return frame
 
 
 SPLITTINGS: dict[str, type[Composition]] = {

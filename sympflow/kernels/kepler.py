@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,6 +34,7 @@ from sympflow.kernels.rollouts import Columns, Rollouts, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.tangents import EVERY, TangentKernel, exponent_of
 from sympflow.kernels.threads import run_in_threads, threads_for
+from sympflow.lazy import kept
 from sympflow.schemes import Substeps
 
 __all__ = ["KeplerFlowKernel", "KeplerKernel", "KeplerLoops", "KeplerTangents", "kepler_loops"]
@@ -604,14 +604,10 @@ class KeplerLoops:
         return self.frame.out(planets[..., :AXES], planets[..., AXES:], centre, size * U + 0 * centre)
 
 
-_LOOPS: WeakKeyDictionary[Frame, KeplerLoops] = WeakKeyDictionary()
-
-
+@kept
 def kepler_loops(frame: Frame) -> KeplerLoops:
     """Return the loops of a frame, made once."""
-    if frame not in _LOOPS:
-        _LOOPS[frame] = KeplerLoops(frame)
-    return _LOOPS[frame]
+    return KeplerLoops(frame)
 
 
 class KeplerKernel(Kernel):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.lazy import kept
 from sympflow.solution import Solution, check_solution, gathered
 from sympflow.solver import solve
 
@@ -19,8 +19,6 @@ __all__ = ["energy_balance_error"]
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(6)
 """Gauss–Legendre quadrature of the integral over a step, where the method cannot run on the extended system."""
-
-_EXTENDED: WeakKeyDictionary[HamiltonianSystem, HamiltonianSystem] = WeakKeyDictionary()
 
 
 def energy_balance_error(sol: Solution, relative: bool = False) -> np.ndarray:
@@ -104,33 +102,31 @@ def _balanced(sol: Solution) -> tuple[np.ndarray, np.ndarray]:
     start = np.concatenate([y0[..., :d], zero, y0[..., d:], zero], axis=-1)
     run = solve(extended, integrator, sol.t_span, start, t_eval=sol.t)
     states = np.moveaxis(run.y, -2, -1)
-    n, kept = len(run.t), [i for i in range(2 * d + 2) if i not in (d, 2 * d + 1)]
-    H[..., :n] = system.hamiltonian(states[..., kept], np.broadcast_to(run.t, states.shape[:-1]))
+    n, own = len(run.t), [i for i in range(2 * d + 2) if i not in (d, 2 * d + 1)]
+    H[..., :n] = system.hamiltonian(states[..., own], np.broadcast_to(run.t, states.shape[:-1]))
     work = np.full(H.shape, np.nan)
     work[..., :n] = -states[..., -1]
     return H, work
 
 
+@kept
 def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
     """H(t + s, q, p) in [q, s, p, E], in which s stays 0 and E' = −∂H/∂t; None where it cannot be written so."""
     symbols = system.symbols
     if symbols is None or symbols.samples or system.kinetic_timed:
         return None
-    if system not in _EXTENDED:
-        d, time = system.ndof, symbols.time
-        s = _symbol(f"q{d + 1}", time)
-        H, values = symbols.written
-        params = {symbol.name: system.params[symbol.name] for symbol in values}
-        _EXTENDED[system] = HamiltonianSystem.from_sympy(
-            H.xreplace({time: time + s}),
-            params=params,
-            time=time,
-            name=f"{system.name} with the work of the drive",
-            y0=np.zeros(2 * d + 2),
-            t_span=system.t_span,
-            dt=system.dt,
-        )
-    return _EXTENDED[system]
+    d, time = system.ndof, symbols.time
+    s = _symbol(f"q{d + 1}", time)
+    H, values = symbols.written
+    return HamiltonianSystem.from_sympy(
+        H.xreplace({time: time + s}),
+        params={symbol.name: system.params[symbol.name] for symbol in values},
+        time=time,
+        name=f"{system.name} with the work of the drive",
+        y0=np.zeros(2 * d + 2),
+        t_span=system.t_span,
+        dt=system.dt,
+    )
 
 
 def _symbol(name: str, like: sympy.Symbol) -> sympy.Symbol:

@@ -5,6 +5,7 @@ import pytest
 
 import sympflow
 from sympflow import HamiltonianSystem, choose_step, solve, systems
+from sympflow.hamiltonian.scales import started
 
 text = HamiltonianSystem.from_sympy
 KEPLER = "p1**2/2 + p2**2/2 - 1.1/sqrt(q1**2 + q2**2)"
@@ -172,3 +173,14 @@ def test_a_missed_tolerance_is_told(monkeypatch):
     with pytest.warns(RuntimeWarning, match="more than `tol` 1e-06: pass a smaller one"):
         sol = solve(text(KEPLER, y0=[1, 0, 0, 0.4]), "verlet", (0, 20), tol=1e-6)
     assert "more than `tol`" in sol.message
+
+
+def test_a_start_is_looked_at_once():
+    """Of a system without a y0 the steps and scales of a run are those of its states, which are found once."""
+    system, y0 = text(KEPLER), np.array([[1.0, 0.0, 0.0, 0.8], [1.0, 0.0, 0.0, 0.9]])
+    found = started(system, y0)
+    assert found is started(system, y0.copy())
+    assert found.y0.tolist() == y0[1].tolist()  # the highest energy
+    assert found.dt == solve(system, "verlet", (0, 0.1), y0).stats["dt"]
+    assert started(system, 2 * y0) is not found
+    assert started(found, 2 * y0) is found
