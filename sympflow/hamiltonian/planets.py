@@ -284,8 +284,9 @@ class Frame:
                 "take the splitting 'kinetic', such as 'srkn11b'."
             )
         one, other = self.pairs
-        x, v = states_of(self.elements, self.G * (masses[0] + masses[1:]))
-        d, u = (y[one - 1] - y[other - 1] for y in (x, v))
+        felt = states_of(self.elements[self.order - 1], self.G * (masses[0] + masses[self.order]))
+        i, j = np.triu_indices(len(self.order), 1)
+        d, u = (y[i] - y[j] for y in felt)
         r = np.linalg.norm(d, axis=-1)
         close = r < MOON * np.maximum(self.hill_radii(one, one, 0.0), self.hill_radii(other, other, 0.0))
         bound = close & ((u * u).sum(-1) / 2 < self.G * (masses[one] + masses[other]) / r)
