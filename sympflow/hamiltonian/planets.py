@@ -285,8 +285,8 @@ class Frame:
             )
         one, other = self.pairs
         felt = states_of(self.elements[self.order - 1], self.G * (masses[0] + masses[self.order]))
-        i, j = np.triu_indices(len(self.order), 1)
-        d, u = (y[i] - y[j] for y in felt)
+        near, far = np.triu_indices(len(self.order), 1)
+        d, u = (y[near] - y[far] for y in felt)
         r = np.linalg.norm(d, axis=-1)
         close = r < MOON * np.maximum(self.hill_radii(one, one, 0.0), self.hill_radii(other, other, 0.0))
         bound = close & ((u * u).sum(-1) / 2 < self.G * (masses[one] + masses[other]) / r)
