@@ -25,7 +25,7 @@ CHOSEN = {
     "softened": (lambda: text("p1**2/2 + p2**2/2 + log(q1**2 + q2**2 + 1)"), [1, 0, 0, 0.01], {}, "srkn11b"),
     "bodies that attract each other": (
         lambda: HamiltonianSystem.pairs("-1/r", masses=[1.0, 0.5], dim=2),
-        [0, 1, 0, 0, 0, 0, 0, 0.5],
+        [0, 1, 0, 0, 0.5, 0, -0.5, 0],
         {},
         "srkn11b",
     ),
