@@ -15,6 +15,11 @@ from sympflow.compiler.numbers import Number
 __all__ = ["Program", "Traced", "adjoint", "derivatives", "fused", "gradient", "tangent", "traced"]
 
 
+_LOGICAL = {"and", "or", "not"}
+CONDITIONS = {"lt", "le", "eq", *_LOGICAL}
+"""Operations whose value is true or false."""
+
+
 class Traced(Number):
     """A number that is known by its operation only; it can be combined with others of its recording."""
 
@@ -31,6 +36,10 @@ class Traced(Number):
 
     def __repr__(self) -> str:
         return str(self.args[0]) if self.name == "input" else f"v{self.order}"
+
+
+def _is_condition(x: Any) -> bool:
+    return isinstance(x, Traced) and x.name in CONDITIONS
 
 
 class Recording:
@@ -52,6 +61,12 @@ class Recording:
         for x in args:
             if isinstance(x, Traced) and x.recording is not self:
                 raise ValueError("numbers of two recordings cannot be combined: trace the functions together.")
+        if name == "where" and all(map(_is_condition, args[1:])):
+            c, x, y = args
+            return self.record("or", (self.record("and", (c, x)), self.record("and", (self.record("not", (c,)), y))))
+        if name not in _LOGICAL:  # a condition is calculated with as 1 or 0
+            first = name == "where"
+            args = (*args[:first], *(self._as_number(x) for x in args[first:]))
         if not any(isinstance(x, Traced) for x in args):
             with np.errstate(all="ignore"):
                 return float(FUNCTIONS[name].numpy(*args))
@@ -63,6 +78,9 @@ class Recording:
         if name in _COMMUTE:
             args = tuple(sorted(args, key=_place))
         return self._number(name, args)
+
+    def _as_number(self, x: Any) -> Any:
+        return self.record("where", (x, 1.0, 0.0)) if _is_condition(x) else x
 
     def _number(self, name: str, args: tuple[Any, ...]) -> Traced:
         key = name, *(x.order if isinstance(x, Traced) else (x, math.copysign(1.0, x) if x == 0 else 0) for x in args)

@@ -152,6 +152,19 @@ class CallableHamiltonian(Definition):
     def poles(self) -> TracedPoles | None:  # type: ignore[override]
         return None if self.form is None else TracedPoles(self.form) or None
 
+    @cached_property
+    def _jumping(self) -> Definition:
+        """The form in symbols, whose jumps in t are known, of functions that may jump."""
+        written = self.form.written if self.timed and self.form is not None and self.form.may_jump else None
+        return Definition() if written is None else written
+
+    @property
+    def may_jump(self) -> bool:  # type: ignore[override]
+        return self._jumping.may_jump
+
+    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
+        return self._jumping.jump_times(low, high, step)
+
     @property
     def has_hessian_vector(self) -> bool:  # type: ignore[override]
         *_, gradient, product = self._functions
@@ -298,7 +311,7 @@ class CallableHamiltonian(Definition):
                 return False
         return _alike(found, self.form.gradient(state, *times))
 
-    _generated = ("form", "poles", "takes_tensors", "_follows_tensors")
+    _generated = ("form", "_jumping", "poles", "takes_tensors", "_follows_tensors")
 
     def learns(self, y: Array) -> bool:
         if self.numba_functions is not None or (self.form is not None and self.library == "numpy"):

@@ -41,7 +41,8 @@ SPECIAL = (
 # fmt: on
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: getattr(sp, name) for name in (*ELEMENTARY, *SPECIAL, "Abs", "Rational", "DiracDelta")},
-    **{"Max": Max, "Min": Min, "max": Max, "min": Min},
+    **{"Max": Max, "Min": Min, "max": Max, "min": Min, "floor": sp.floor, "ceiling": sp.ceiling, "Mod": sp.Mod},
+    "frac": sp.frac,
     "ln": sp.log,
     "log10": lambda x: sp.log(x) / sp.log(10),
     "log2": lambda x: sp.log(x) / sp.log(2),

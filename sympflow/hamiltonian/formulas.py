@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sympflow.arrays import Array, assemble, is_tensor
-from sympflow.compiler.functions import apply
-from sympflow.compiler.program import Program, Recording, Traced, gradient, tangent, traced
+from sympflow.compiler.functions import apply, where
+from sympflow.compiler.program import CONDITIONS, Program, Recording, Traced, gradient, tangent, traced
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
@@ -150,9 +150,14 @@ class TracedHamiltonian:
     def parametric(self) -> TracedHamiltonian:
         return self
 
+    @property
+    def may_jump(self) -> bool:
+        """True if some operation jumps."""
+        return any(x.name in _JUMPING for x in self.program.operations)
+
     def check_continuous(self, argument: str) -> None:
         """Refuse a function that jumps in q or p."""
-        if not any(x.name in _JUMPING for x in self.program.operations) or len(self.program) > MOST_IN_SYMBOLS:
+        if not self.may_jump or len(self.program) > MOST_IN_SYMBOLS:
             return
         from sympflow.hamiltonian.jumps import check_continuous
         from sympflow.hamiltonian.recorded import NotRecorded, in_symbols
@@ -445,22 +450,24 @@ def _without_time(f: Formula, time: Variable, found: dict[Variable, Formula]) ->
             moving.add(x.order)
     used = [a for x in program.operations if x.order in moving for a in x.args] + list(program.outputs)
     own: dict[int, Variable] = {}
+    conditions = {a.order for a in used if isinstance(a, Traced) and a.name in CONDITIONS}
     for a in used:
         if isinstance(a, Traced) and a.order not in moving and a.order not in own:
             own[a.order] = Variable(f"letter_{len(found)}")
-            found[own[a.order]] = Formula(Program([t], [a]), (time,))
+            number = where(a, 1.0, 0.0) if a.order in conditions else a
+            found[own[a.order]] = Formula(Program([t], [number]), (time,))
     others = [(s, x) for s, x in zip(f.variables, program.inputs, strict=True) if x is not t]
     recording = Recording()
     inputs = [recording.input(s.name) for s, _ in others]
     of: dict[int, Any] = {x.order: new for (_, x), new in zip(others, inputs, strict=True)}
-    of |= {order: recording.input(coefficient.name) for order, coefficient in own.items()}
+    letters = {order: recording.input(coefficient.name) for order, coefficient in own.items()}
+    of |= {order: letter > 0.5 if order in conditions else letter for order, letter in letters.items()}
     for x in program.operations:
         if x.order in moving:
             of[x.order] = apply(x.name, *(of[a.order] if isinstance(a, Traced) else a for a in x.args))
     (y,) = program.outputs
-    coefficients = [of[order] for order in own]
     return Formula(
-        Program([*inputs, *coefficients], [of[y.order] if isinstance(y, Traced) else y]),
+        Program([*inputs, *letters.values()], [of[y.order] if isinstance(y, Traced) else y]),
         (*(s for s, _ in others), *own.values()),
     )
 

@@ -133,6 +133,11 @@ def _sides(a: sp.Basic) -> tuple[sp.Expr, Any, Any]:
 
 def _sides_of_quotient(a: sp.Function) -> Iterator[tuple[sp.Function, sp.Expr, sp.Expr, sp.Expr]]:
     """The function itself, g and the two limits of a function such as atan(1/g), where they are finite."""
+    places = {b: (sp.cos if isinstance(b, sp.tan) else sp.sin)(b.args[0]) for b in a.atoms(sp.tan, sp.cot)}
+    for wave, g in places.items():
+        values = [a.xreplace({wave: infinity}) for infinity in (sp.oo, -sp.oo)]
+        if wave != a and all(value.is_finite for value in values):
+            yield a, g, *values
     for power in {b for x in a.args for b in x.atoms(sp.Pow)}:
         if power.exp.is_negative and power.exp.is_odd:
             values = [a.xreplace({power: infinity}) for infinity in (sp.oo, -sp.oo)]

@@ -7,7 +7,7 @@ import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from itertools import product
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import sympy as sp
@@ -16,13 +16,10 @@ from sympflow.arguments import plain
 from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
-from sympflow.hamiltonian.linear_part import RestOfPotential, quadratic_terms
+from sympflow.hamiltonian.linear_part import RestOfPotential, SpectralPart, Transform, dispersion, quadratic_terms
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, numbered, parsed
 from sympflow.hamiltonian.poles import LatticePoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, exact
-
-if TYPE_CHECKING:
-    from sympflow.hamiltonian.normal_modes import SpectralPart
 
 Expressions = Callable[[], Sequence[sp.Expr]]
 """Expressions that are made when a function of them is generated, not in each call of it."""
@@ -328,8 +325,6 @@ class LatticeHamiltonian(LocalHamiltonian):
 
     def linear_and_rest(self, interval: float) -> tuple[SpectralPart, list[Any]]:
         """The quadratic terms of sites and bonds as they are written, in normal modes, and U(q), the rest of V."""
-        from sympflow.hamiltonian.normal_modes import SpectralPart, Transform, dispersion
-
         F, n_sites = len(self.fields), math.prod(self.shape)
         inverse_mass = np.ones(F)
         if self.inverse_mass is not None:

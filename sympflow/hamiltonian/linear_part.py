@@ -1,15 +1,18 @@
-"""The quadratic part of a Hamiltonian, whose flow is known exactly, and its normal modes."""
+"""The linear algebra of H: the matrices that a user gives, its quadratic part, and normal modes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from sympflow.arrays import Array, concatenate, like
+from sympflow.arguments import real_array
+from sympflow.arrays import Array, concatenate, is_tensor, like, moveaxis
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -216,7 +219,7 @@ def linear_part(system: Any) -> LinearPart:
     part: LinearPart | None
     if system.stiffness_matrix is not None:
         K = system.stiffness_matrix
-        part = LinearPart(inverse_mass(system), K, _equilibrium(system, K), None, _interval(system))
+        part = LinearPart(_inverse_mass(system), K, _equilibrium(system, K), None, _interval(system))
     elif system.local is not None:
         return system.local.linear_and_rest(_interval(system))[0]
     elif system.written is not None:
@@ -361,7 +364,7 @@ GAP = 10.0  # between the curvatures of a stiff direction and of the others
 TURN = 0.1  # radians by which a stiff direction may turn and still count as constant
 
 
-def inverse_mass(system: Any) -> np.ndarray:
+def _inverse_mass(system: Any) -> np.ndarray:
     """M⁻¹ (d, d)."""
     if not system.quadratic_kinetic:
         raise ValueError("`stiffness_matrix` needs a kinetic energy ½ pᵀM⁻¹p: leave it out.")
@@ -387,7 +390,7 @@ def turning(system: Any, part: LinearPart | None) -> str | None:
     if len(hessians) < 2:
         return None
     try:
-        L = np.linalg.cholesky(inverse_mass(system))
+        L = np.linalg.cholesky(_inverse_mass(system))
     except np.linalg.LinAlgError:  # of coordinates without a kinetic energy
         return None
     curvature, directions = np.linalg.eigh(L.T @ hessians @ L)
@@ -438,3 +441,305 @@ def _positions(system: Any) -> np.ndarray | None:
     with np.errstate(all="ignore"):
         V = np.asarray(system.potential(q, float(system.t_span[0])))
     return q[np.argsort(np.where(np.isfinite(V), V, np.inf))[:SAMPLES]]
+
+
+# matrices that a user gives ----------------------------------------------------------------------------------------
+
+
+def checked_inverse_mass(mass: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
+    """M⁻¹ in its simplest form for a mass M: a number, (d,) or (d, d)."""
+    M = real_array("mass", 1.0 if mass is None else mass)
+    if M.shape not in ((), (ndof,), (ndof, ndof)):
+        raise ValueError(f"`mass` must be a number or have shape ({ndof},) or ({ndof}, {ndof}); got {M.shape}.")
+    if M.ndim < 2:
+        M = np.broadcast_to(M, ndof)
+        if not (np.isfinite(M).all() and (M > 0).all()):
+            raise ValueError(f"`mass` must be finite, symmetric and positive definite; got {mass!r}.")
+        return None if (M == 1).all() else 1 / M
+    _check_symmetric("mass", M)
+    smallest = np.linalg.eigvalsh(M)[0]
+    if not smallest > 0:
+        raise ValueError(
+            f"`mass` must be finite, symmetric and positive definite; its smallest eigenvalue is {smallest:g}."
+        )
+    return simplest(np.linalg.inv(M))
+
+
+def checked_stiffness(matrix: ArrayLike, ndof: int) -> np.ndarray:
+    """K (d, d), exactly symmetric."""
+    K = real_array("stiffness_matrix", matrix)
+    if K.shape != (ndof, ndof):
+        raise ValueError(
+            f"`stiffness_matrix` must be finite, symmetric and of shape ({ndof}, {ndof}); got shape {K.shape}."
+        )
+    _check_symmetric("stiffness_matrix", K)
+    return (K + K.T) / 2
+
+
+def checked_damping(values: float | ArrayLike | None, ndof: int) -> np.ndarray | None:
+    """Γ in its simplest form, () for one rate, (d,) or (d, d), of a number, (d,) or (d, d); None for no friction."""
+    if values is None:
+        return None
+    if isinstance(values, bool | np.bool_):
+        raise TypeError(f"`damping` must be a rate, or several; got {values!r}: pass a number such as 0.1.")
+    G = real_array("damping", values)
+    if G.shape not in ((), (ndof,), (ndof, ndof)):
+        raise ValueError(
+            f"`damping` must be a number, one for each p, of shape ({ndof},), or a matrix of shape ({ndof}, {ndof}); "
+            f"got shape {G.shape}."
+        )
+    if G.ndim < 2:
+        if not (np.isfinite(G).all() and (G >= 0).all()):
+            raise ValueError(
+                f"`damping` must be finite and not negative, for friction takes energy away; got {values!r}."
+            )
+    else:
+        _check_symmetric("damping", G)
+        G = (G + G.T) / 2
+        rates = np.linalg.eigvalsh(G)
+        if rates[0] < -8 * ndof * np.finfo(float).eps * abs(rates).max():
+            raise ValueError(
+                "`damping` must be a positive semi-definite matrix, for friction takes energy away; its smallest "
+                f"eigenvalue is {rates[0]:g}."
+            )
+        if np.array_equal(G, np.diag(np.diag(G))):
+            G = np.diag(G).copy()
+    if G.ndim == 1 and (G[0] == G).all():
+        G = np.array(G[0])
+    if not G.any():
+        return None
+    return np.array(abs(G)) if G.ndim < 2 else G  # −0.0 is 0
+
+
+def _check_symmetric(name: str, matrix: np.ndarray) -> None:
+    """Raise with the first entry that is not finite, or differs from its mirror image."""
+    for wrong in (~np.isfinite(matrix), ~np.isclose(matrix, matrix.T)):
+        if wrong.any():
+            i, j = np.argwhere(wrong)[0].tolist()
+            mirror = f", [{j}, {i}] is {matrix[j, i]:g}" if np.isfinite(matrix[i, j]) else ""
+            raise ValueError(f"`{name}` must be finite, symmetric; its entry [{i}, {j}] is {matrix[i, j]:g}{mirror}.")
+
+
+def numeric(matrix: sp.Matrix) -> np.ndarray | None:
+    """The numbers of a matrix of SymPy, in its simplest form."""
+    found = np.zeros(matrix.shape)
+    for place, entry in matrix.todok().items():
+        found[place] = float(entry)
+    return simplest(found)
+
+
+def simplest(inverse: np.ndarray) -> np.ndarray | None:
+    """None for the identity, the diagonal for a diagonal matrix, else the matrix."""
+    if np.array_equal(inverse, np.eye(len(inverse))):
+        return None
+    diagonal = np.diag(inverse).copy()
+    return diagonal if np.array_equal(inverse, np.diag(diagonal)) else inverse
+
+
+# normal modes of lattices, by fast transforms -----------------------------------------------------------------------
+
+
+class Transform:
+    """The orthonormal transform W of fields on a lattice to its plane or standing waves, axis by axis."""
+
+    def __init__(self, shape: tuple[int, ...], boundary: tuple[str, ...]) -> None:
+        self.shape, self.boundary = shape, boundary
+
+    def angles(self, axis: int) -> np.ndarray:
+        """θ of the waves along an axis, the phase from one site to the next: (n,), in 0 … π."""
+        n = self.shape[axis]
+        k = np.arange(n)
+        return {
+            "periodic": 2 * np.pi * ((k + 1) // 2) / n,
+            "fixed": np.pi * (k + 1) / (n + 1),
+            "free": np.pi * k / n,
+        }[self.boundary[axis]]
+
+    def total(self, per_axis: Sequence[np.ndarray]) -> np.ndarray:
+        """The sum of values by the waves of each axis, (n, …) each: (*shape, …)."""
+        total: Any = 0.0
+        for axis, values in enumerate(per_axis):
+            places = [-1 if a == axis else 1 for a in range(len(self.shape))]
+            total = total + values.reshape(*places, *values.shape[1:])
+        return np.broadcast_to(total, (*self.shape, *per_axis[0].shape[1:]))
+
+    def forth(self, x: Array) -> Array:
+        """W x: (..., *shape), each."""
+        for axis, kind in enumerate(self.boundary):
+            x = self._one(x, axis, kind, False)
+        return x
+
+    def back(self, x: Array) -> Array:
+        """Wᵀx: (..., *shape), each."""
+        for axis, kind in enumerate(self.boundary):
+            x = self._one(x, axis, kind, True)
+        return x
+
+    def _one(self, x: Array, axis: int, kind: str, back: bool) -> Array:
+        at = axis - len(self.shape)
+        if is_tensor(x):
+            x = x.movedim(at, -1)
+            return (_backwards if back else _forwards)(x, kind).movedim(-1, at)
+        from scipy import fft, fftpack
+
+        if kind == "fixed":
+            return fft.dst(x, 1, axis=at, norm="ortho")
+        if kind == "free":
+            return (fft.idct if back else fft.dct)(x, 2, axis=at, norm="ortho")
+        scale = self._scales[axis].astype(x.dtype, copy=False)
+        return fftpack.irfft(x / scale, axis=at) if back else fftpack.rfft(x, axis=at) * scale
+
+    @cached_property
+    def _scales(self) -> list[np.ndarray]:
+        """The norms that `fftpack.rfft` leaves out, for each axis."""
+        scales = []
+        for axis, n in enumerate(self.shape):
+            scale = np.full(n, math.sqrt(2 / n))
+            scale[0] = math.sqrt(1 / n)
+            if n % 2 == 0:
+                scale[-1] = math.sqrt(1 / n)
+            scales.append(scale.reshape([-1] + [1] * (len(self.shape) - 1 - axis)))
+        return scales
+
+
+def _forwards(x: Any, kind: str) -> Any:
+    """W along the last axis of a tensor."""
+    import torch
+
+    n = x.shape[-1]
+    if kind == "fixed":
+        nothing = x.new_zeros((*x.shape[:-1], 1))
+        odd = torch.cat([nothing, x, nothing, -x.flip(-1)], -1)
+        return -torch.fft.rfft(odd).imag[..., 1 : n + 1] * math.sqrt(1 / (2 * (n + 1)))
+    if kind == "free":
+        even = torch.fft.rfft(torch.cat([x, x.flip(-1)], -1))[..., :n]
+        return (even * _half_shift(x, -1)).real * _cosine_norms(x) / 2
+    F = torch.fft.rfft(x)
+    pairs = torch.view_as_real(F[..., 1 : (n + 1) // 2]).flatten(-2) * math.sqrt(2 / n)
+    last = [F[..., n // 2 :].real * math.sqrt(1 / n)] if n % 2 == 0 else []
+    return torch.cat([F[..., :1].real * math.sqrt(1 / n), pairs, *last], -1)
+
+
+def _backwards(x: Any, kind: str) -> Any:
+    """Wᵀ along the last axis of a tensor."""
+    import torch
+
+    n = x.shape[-1]
+    if kind == "fixed":
+        return _forwards(x, kind)
+    if kind == "free":
+        F = 2 * (x / _cosine_norms(x)) * _half_shift(x, 1)
+        return torch.fft.irfft(torch.cat([F, 0 * F[..., :1]], -1), n=2 * n)[..., :n]
+    pairs = x[..., 1 : 1 + 2 * ((n - 1) // 2)] * math.sqrt(n / 2)
+    F = torch.view_as_complex(pairs.unflatten(-1, (-1, 2)).contiguous())
+    ends = [x[..., n - 1 :] * math.sqrt(n)] if n % 2 == 0 else []
+    return torch.fft.irfft(torch.cat([x[..., :1] * math.sqrt(n) + 0j, F, *(e + 0j for e in ends)], -1), n=n)
+
+
+def _half_shift(x: Any, sign: int) -> Any:
+    """e^{±iθ/2} of standing waves between free ends."""
+    import torch
+
+    n = x.shape[-1]
+    return torch.exp(0.5j * sign * math.pi / n * torch.arange(n, dtype=x.dtype, device=x.device))
+
+
+def _cosine_norms(x: Any) -> Any:
+    n = x.shape[-1]
+    norms = x.new_full((n,), math.sqrt(2 / n))
+    norms[0] = math.sqrt(1 / n)
+    return norms
+
+
+class SpectralPart(NormalModes):
+    """A quadratic H of fields on a lattice, diagonal by a `Transform` and a small matrix for each wave."""
+
+    dense = diagonal = False
+
+    def __init__(
+        self,
+        transform: Transform,
+        rates: np.ndarray,
+        kinds: np.ndarray,
+        matrices: np.ndarray | None = None,
+        interval: float = 0.0,
+    ) -> None:
+        self.transform, self.interval = transform, interval
+        self.fields = len(rates)
+        self.rates, self.kinds = rates.ravel(), kinds.ravel()
+        self.ndof = self.rates.size
+        self.center = np.zeros(self.ndof)
+        self._matrices = matrices
+        self._inverses = None if matrices is None else np.linalg.inv(matrices)
+
+    @classmethod
+    def of_matrices(
+        cls, transform: Transform, inverse_mass: np.ndarray, stiffness: np.ndarray, interval: float = 0.0
+    ) -> SpectralPart:
+        """The part ½ pᵀBp + ½ qᵀKq."""
+        L = np.sqrt(inverse_mass)
+        squares, V = np.linalg.eigh(L[:, None] * stiffness * L)
+        squares[abs(squares) <= ZERO * abs(squares).max(initial=0.0)] = 0.0
+        unit = np.where(squares != 0, abs(squares) ** 0.25, 1.0)
+        kinds = np.where(squares > 0, "oscillator", np.where(squares < 0, "hyperbolic", "free"))
+        rates = np.where(squares != 0, np.sqrt(abs(squares)), 1.0)
+        matrices = L[:, None] * V / unit[..., None, :]
+        return cls(transform, np.moveaxis(rates, -1, 0), np.moveaxis(kinds, -1, 0), matrices, interval)
+
+    @cached_property
+    def modes(self) -> np.ndarray:
+        """C, dense: (d, d)."""
+        return self.positions(np.eye(self.ndof)).T
+
+    @cached_property
+    def inverse_modes(self) -> np.ndarray:
+        """C⁻¹, dense: (d, d)."""
+        return self.coordinates(np.eye(self.ndof)).T
+
+    @cached_property
+    def classes(self) -> np.ndarray:  # type: ignore[override]
+        """To which of the distinct frequencies a mode belongs: (d,) int."""
+        keys = np.rec.fromarrays([self.kinds, self.rates])
+        return np.unique(keys, return_inverse=True)[1].reshape(-1)
+
+    # C and its inverse, on (..., d)
+
+    def positions(self, X: Array) -> Array:
+        """C X."""
+        return self._flat(self.transform.back(self._mixed(self._matrices, self._on_waves(X), False)))
+
+    def coordinates(self, x: Array) -> Array:
+        """C⁻¹x."""
+        return self._flat(self._mixed(self._inverses, self.transform.forth(self._on_waves(x)), False))
+
+    def momenta(self, Y: Array) -> Array:
+        """C⁻ᵀY."""
+        return self._flat(self.transform.back(self._mixed(self._inverses, self._on_waves(Y), True)))
+
+    def slopes(self, g: Array) -> Array:
+        """Cᵀg."""
+        return self._flat(self._mixed(self._matrices, self.transform.forth(self._on_waves(g)), True))
+
+    def _on_waves(self, x: Array) -> Array:
+        return x.reshape(*x.shape[:-1], self.fields, *self.transform.shape)
+
+    def _flat(self, x: Array) -> Array:
+        return x.reshape(*x.shape[: x.ndim - 1 - len(self.transform.shape)], self.ndof)
+
+    def _mixed(self, matrices: np.ndarray | None, x: Array, transposed: bool) -> Array:
+        """The matrix of each wave times the fields (..., F, *shape)."""
+        if matrices is None:
+            return x
+        A = like(matrices.swapaxes(-1, -2) if transposed else matrices, x)
+        if self.fields == 1:
+            return x * A[..., 0, 0]
+        axis = -1 - len(self.transform.shape)
+        return moveaxis((A @ moveaxis(x, axis, -1)[..., None])[..., 0], -1, axis)
+
+
+def dispersion(couplings: Mapping[int, np.ndarray], angles: np.ndarray) -> np.ndarray:
+    """Σ_k κ_k (2 − 2 cos kθ), of bonds ½ rᵀκ_k r over k sites: (n,) to (n, F, F)."""
+    total: Any = 0.0
+    for k, kappa in couplings.items():
+        total = total + (4 * np.sin(k * angles / 2) ** 2)[:, None, None] * kappa
+    return total

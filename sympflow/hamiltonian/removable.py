@@ -119,7 +119,9 @@ class Min(_Extremum, sp.Min):
 
 
 def with_own_functions(f: sp.Expr) -> sp.Expr:
-    """An expression by `Max`, `Min` and `sinc`."""
+    """An expression by `Max`, `Min`, `sinc` and, of functions that round, floor and Mod."""
+    if f.has(sp.ceiling, sp.frac):
+        f = f.replace(sp.frac, lambda x: x - sp.floor(x)).replace(sp.ceiling, lambda x: -sp.floor(-x))
     return _with_sinc(_with_extrema(f))
 
 

@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_flag, check_positive, checked_count, warn
 from sympflow.arrays import Array, one_lane
-from sympflow.hamiltonian import matrices
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
 from sympflow.hamiltonian.friction import Friction
 from sympflow.hamiltonian.hamiltonian import Hamiltonian
+from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
 from sympflow.hamiltonian.scene import UNNAMED, Scene, SceneOptions
 from sympflow.hamiltonian.times import check_period, probe_times
 from sympflow.show.cards import Card, Shown, cut, numbers
@@ -178,7 +178,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         check_flag("time", time)
         definition = CallableHamiltonian(d, potential, hamiltonian, gradient, hessian_vector, check, bool(time))
         if definition.separable:
-            super().__init__(settled.name, definition, matrices.inverse_mass(mass, d), True)
+            super().__init__(settled.name, definition, checked_inverse_mass(mass, d), True)
         elif mass is not None:
             raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
         else:
@@ -186,7 +186,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         if stiffness_matrix is not None:
             if not definition.separable:
                 raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
-            self.stiffness_matrix = matrices.stiffness_matrix(stiffness_matrix, definition.ndof)
+            self.stiffness_matrix = checked_stiffness(stiffness_matrix, definition.ndof)
             self.stiffness_matrix.setflags(write=False)
         self._set_friction(damping)
         self._set_scene({}, settled)
@@ -253,8 +253,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
             )
         self = cls.__new__(cls)
         M = symbols.inverse_mass
-        inverse_mass = None if M is None else matrices.simplest(matrices.from_entries(M.shape, M.todok()))
-        Hamiltonian.__init__(self, settled.name, symbols, inverse_mass, M is not None)
+        Hamiltonian.__init__(self, settled.name, symbols, None if M is None else numeric(M), M is not None)
         self._set_friction(damping)
         self._set_scene(params, settled)
         self._set_period(period)
@@ -592,7 +591,7 @@ class HamiltonianSystem(Hamiltonian, Shown):
         return self
 
     def _set_friction(self, damping: float | ArrayLike | None) -> None:
-        G = matrices.damping(damping, self.ndof)
+        G = checked_damping(damping, self.ndof)
         self.friction = Friction(G)
 
     def _set_period(self, period: float | None) -> None:

@@ -15,8 +15,8 @@ from sympflow.arrays import Array, concatenate, library, like
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.lattice import checked_shape
+from sympflow.hamiltonian.linear_part import SpectralPart, Transform
 from sympflow.hamiltonian.local import MOST_DENSE, LocalHamiltonian, check_memory, checked_params, numbered, parsed
-from sympflow.hamiltonian.normal_modes import SpectralPart, Transform
 
 
 class WaveFunctionHamiltonian(LocalHamiltonian):

@@ -20,7 +20,7 @@ from sympflow.compiler.functions import added, fma
 from sympflow.compiler.program import gradient, traced
 from sympflow.hamiltonian.formulas import Variable
 from sympflow.hamiltonian.monomials import Monomials
-from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.runs import Room
 from sympflow.kernels.splittings import Splitting, SplittingCode
 
 if TYPE_CHECKING:
@@ -214,11 +214,6 @@ class ArrayCode(SplittingCode):
         names = self._splitting.numbers
         same = traced(lambda *x: x, *names)
         return [Arranged(same, same) for _ in self._splitting.terms]
-
-    def stage(self, room: Room, numbers: Numbers, kind: Value, step: Value) -> None:  # type: ignore[override]
-        for k in range(len(self._kinds)):
-            with room.code.given(room.code.apply("eq", (kind, k))):
-                self._executed(k, room, self._column(k, room.type, numbers, step))
 
     def _executed(self, k: int, room: Room, column: Sequence[Any]) -> None:
         self.kicked(room, self._splitting.terms[k], column)

@@ -15,7 +15,7 @@ from sympflow.compiler.program import Program, adjoint, gradient, traced
 from sympflow.hamiltonian.formulas import Variable, recorded
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import OneStep, OneStepKernel, is_large, lettered, parametric, terms_of
-from sympflow.kernels.runs import Numbers, Room, begun, finished
+from sympflow.kernels.runs import Numbers, Room, Values, begun, finished
 from sympflow.lazy import kept
 
 __all__ = ["CompiledField", "compiled_field", "explicit_kernel"]
@@ -189,15 +189,8 @@ class _InRegisters(_Explicit):
         return len(self.field.program) * len(self.A) <= MOST_REVERSED
 
     def adjoint(
-        self,
-        values: list[Value],
-        cotangents: list[Value],
-        numbers: Numbers,
-        kind: Value,
-        step: Value,
-        slopes: bool,
-        *room: Room,
-    ) -> tuple[list[Value], list[Value]]:
+        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
+    ) -> tuple[Values, Values]:
         n, program = self.n_out, self._reverse
         program = Program(program.inputs, program.outputs[: n + (1 + self.parameters) * slopes])
         found = program(*values, *self._numbers(numbers, step.code, step), *cotangents)

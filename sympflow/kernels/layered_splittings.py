@@ -23,7 +23,7 @@ from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program
 from sympflow.hamiltonian.layered import LayeredPotential
 from sympflow.kernels.rollouts import LINE, Columns, SplittingRollouts, zeros
-from sympflow.kernels.runs import Numbers, Room, step_function
+from sympflow.kernels.runs import Numbers, Room, Values, step_function
 
 __all__ = ["LayeredCode"]
 
@@ -77,15 +77,8 @@ class LayeredCode(SplittingRollouts):
         return [fma(a, dot(row, p), x) for row, x in zip(self._potential.inverse_mass.tolist(), q, strict=True)]
 
     def adjoint(
-        self,
-        values: list[Value],
-        cotangents: list[Value],
-        numbers: Numbers,
-        kind: Value,
-        step: Value,
-        slopes: bool,
-        *room: Room,
-    ) -> tuple[list[Value], list[Value]]:
+        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
+    ) -> tuple[Values, Values]:
         """The reverse of `stage`, which adds up the derivatives by the weights with `slopes`."""
         d = self._potential.ndof
         of_q, a, b = cotangents[:d], numbers(0), numbers(1)

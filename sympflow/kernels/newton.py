@@ -27,7 +27,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.one_steps import Lettered, OneStep, OneStepKernel, is_large, parametric, terms_of
 from sympflow.kernels.one_steps import lettered as with_letters
 from sympflow.kernels.rollouts import Rollouts
-from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.runs import Numbers, Room, Values
 from sympflow.lazy import kept
 
 __all__ = ["implicit_kernel", "newton_code"]
@@ -404,15 +404,8 @@ class _InRegisters(NewtonCode):
         return found, taken, solved
 
     def adjoint(
-        self,
-        values: list[Value],
-        cotangents: list[Value],
-        numbers: Numbers,
-        kind: Value,
-        step: Value,
-        slopes: bool,
-        *room: Room,
-    ) -> tuple[list[Value], list[Value]]:
+        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
+    ) -> tuple[Values, Values]:
         code, type, n = step.code, values[0].type, self.n_out
         found, *_ = self._solved(values[:n], numbers, step)
         given = [*found.y, *found.column, *found.K, *cotangents[:n]]
@@ -519,15 +512,8 @@ class _InMemory(NewtonCode):
         return found, taken, small
 
     def adjoint(
-        self,
-        values: list[Value],
-        cotangents: list[Value],
-        numbers: Numbers,
-        kind: Value,
-        step: Value,
-        slopes: bool,
-        *room: Room,
-    ) -> tuple[list[Value], list[Value]]:
+        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
+    ) -> tuple[Values, Values]:
         n, zero = self.n_out, step.code.constant(0.0)
         for k, x in enumerate(values[:n]):
             room[0].store(x, k)

@@ -14,7 +14,7 @@ from sympflow.compiler import NotCompiled
 from sympflow.compiler.control import Value
 from sympflow.compiler.machine import address
 from sympflow.kernels.protocol import Batch
-from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, map_function, reverse_function, run_function
+from sympflow.kernels.runs import BLOCK, Memory, Numbers, Room, Values, map_function, reverse_function, run_function
 from sympflow.kernels.threads import NEVER
 
 __all__ = ["Columns", "Rollouts", "SplittingRollouts", "aligned", "filled", "zeros"]
@@ -119,15 +119,8 @@ class Rollouts(ABC):
         """The values after one column: see `sympflow.kernels.runs.Stage`."""
 
     def adjoint(
-        self,
-        values: list[Value],
-        cotangents: list[Value],
-        numbers: Numbers,
-        kind: Value,
-        step: Value,
-        slopes: bool,
-        *room: Room,
-    ) -> tuple[list[Value], list[Value]]:
+        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
+    ) -> tuple[Values, Values]:
         """The reverse of `stage`, where there is one: see `sympflow.kernels.runs.Adjoint`."""
         raise NotImplementedError
 

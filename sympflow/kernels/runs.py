@@ -23,6 +23,7 @@ __all__ = [
     "Memory",
     "Numbers",
     "Room",
+    "Values",
     "assign",
     "begun",
     "finished",
@@ -38,6 +39,7 @@ FAST_MEMORY = 16_384  # bytes of the states of a chunk after the other, and of t
 MOST_CHUNKS = 32
 BLOCK = 1024  # steps between two looks for a state that is not finite, where nothing is saved
 
+Values = list[Value]
 Numbers = Callable[..., Any]
 """``numbers(i, lone=False)``: number i of one column, in all lanes; `lone`, as a scalar if the lanes share it."""
 Stage = Callable[[list[Value], Numbers, Value, Value], list[Value]]

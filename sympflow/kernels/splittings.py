@@ -22,7 +22,7 @@ from sympflow.compiler.program import Program, Traced, adjoint, derivatives, gra
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.monomials import Monomials
 from sympflow.kernels.rollouts import Columns, SplittingRollouts
-from sympflow.kernels.runs import Numbers, Room, step_function
+from sympflow.kernels.runs import Numbers, Room, Values, step_function
 from sympflow.kernels.stages import kicks_of
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
@@ -172,13 +172,12 @@ class Stage(NamedTuple):
 class Shape:
     """One way to write a stage: products of sums multiplied out, or left."""
 
-    def __init__(self, splitting: Splitting, terms: int, expand: bool, vectors: int = 0) -> None:
+    def __init__(self, splitting: Splitting, terms: int, expand: bool) -> None:
         symbols = splitting.symbols
         self.splitting, self.symbols, self.terms, self.d = splitting, symbols, terms, symbols.ndof
         names = [(s.name, 0) for s in symbols.q] + [(s.name, EARLY) for s in symbols.p]
-        states = [(f"{name}_{i}" if i else name, ready) for i in range(1 + vectors) for name, ready in names]
-        states += [(f"error_{name}", EARLY) for name, _ in names if splitting.compensated]
-        self.made = made = Arrangement(states, splitting.numbers, expand)
+        errors = [(f"error_{name}", EARLY) for name, _ in names if splitting.compensated]
+        self.made = made = Arrangement([*names, *errors], splitting.numbers, expand)
         self.q, self.p, self.more = made.states[: self.d], made.states[self.d : 2 * self.d], made.states[2 * self.d :]
         self.number = dict(zip(splitting.numbers, made.constants, strict=True))
         self.values = [self.number[s.name] for s in symbols.parameters]
@@ -401,8 +400,13 @@ class SplittingCode(SplittingRollouts):
             return len(self._splitting.numbers) - letters + CLOCK
         return max(len(kind.table.outputs) for kind in self._kinds)
 
-    def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
-        """A kick and a drift, of the kind that a column has."""
+    def stage(self, values: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
+        """A kick and a drift, of the kind that a column has, of values or of a state in memory."""
+        if isinstance(values, Room):
+            for k in range(len(self._kinds)):
+                with values.code.given(values.code.apply("eq", (kind, k))):
+                    self._executed(k, values, self._column(k, values.type, numbers, step))
+            return None
         if len(self._kinds) == 1:
             return self._executed(0, values, self._column(0, values[0].type, numbers, step))
         code = values[0].code
@@ -469,15 +473,8 @@ class SplittingCode(SplittingRollouts):
         self._adjoints  # noqa: B018
 
     def adjoint(
-        self,
-        values: list[Value],
-        cotangents: list[Value],
-        numbers: Numbers,
-        kind: Value,
-        step: Value,
-        slopes: bool,
-        *room: Room,
-    ) -> tuple[list[Value], list[Value]]:
+        self, values: Values, cotangents: Values, numbers: Numbers, kind: Value, step: Value, slopes: bool, *room: Room
+    ) -> tuple[Values, Values]:
         code, type = step.code, values[0].type
         zero = code.constant(0.0, type)
         found: list[Variable] = [code.variable(zero) for _ in range(self.n_values + self.size)]

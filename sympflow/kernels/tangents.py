@@ -23,7 +23,7 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Batch, RunCheckpoint, Task, run_states
 from sympflow.kernels.rollouts import Rollouts
-from sympflow.kernels.runs import Numbers, Room
+from sympflow.kernels.runs import Room
 from sympflow.kernels.splitting_loops import splitting_loops
 from sympflow.kernels.splittings import Shape, Splitting, SplittingCode, shared
 from sympflow.kernels.stages import StageTable, run_table
@@ -36,7 +36,7 @@ __all__ = ["TangentCode", "TangentKernel", "TangentRun", "step_tangents", "tange
 EVERY = 256  # steps after which vectors are rescaled
 AT_ONCE = 1 << 20  # numbers of outputs
 LOOKS = 1 << 14  # at all orbits, before those that have ended are left out
-MOST_WRITTEN_OUT = 160  # products of all vectors in one stage; more are a loop over the vectors
+MOST_WRITTEN_OUT = 64  # products of all vectors in one stage; more are a loop over the vectors
 LOG_2 = float(np.log(2.0))
 
 
@@ -56,14 +56,11 @@ class TangentRun(NamedTuple):
 
 
 class Linearised(Shape):
-    """A stage with its derivatives, and what these do to a vector; or with some vectors, moved in their place.
+    """A stage with its derivatives, which move vectors.
 
     The outputs are q' and p', then ∇k, row by row to the diagonal, the derivative of q' by the momenta after the kick,
     and, with friction, that of p' by these.
     """
-
-    def __init__(self, splitting: Splitting, terms: int, vectors: int) -> None:
-        super().__init__(splitting, terms, True, vectors)
 
     def linearised(self) -> Arranged:
         """The programs of the stage."""
@@ -89,21 +86,7 @@ class Linearised(Shape):
             positions = [made.written(x + y) for x, y in zip(q, moves, strict=True)]
         else:
             positions = self._moved_by(q, slants, after)
-        outputs = [*positions, *momenta]
-        if not self.more:
-            return made.finish([*outputs, *bends, *slants, *ends])
-        for k in range(0, len(self.more), 2 * d):
-            x = self.more[k : k + 2 * d]
-            kicked = [
-                made.letter(made.written(y + dot([made.letter(bends[_place(i, j)]) for j in range(d)], x[:d])))
-                for i, y in enumerate(x[d:])
-            ]
-            outputs += self._moved_by(x[:d], slants, kicked)
-            if ends:
-                rows = [[made.letter(y) for y in ends[d * i : d * (i + 1)]] for i in range(d)]
-                kicked = [dot(row, kicked) for row in rows]
-            outputs += [made.written(made.number(y)) for y in kicked]
-        return made.finish(outputs)
+        return made.finish([*positions, *momenta, *bends, *slants, *ends])
 
     def _moved_by(self, q: Sequence[Any], slants: Sequence[Any], p: Sequence[Any]) -> list[Any]:
         """q + ∇²T p, a number of the body for each."""
@@ -164,22 +147,18 @@ class TangentCode(SplittingCode):
 
     @cached_property
     def _kinds(self) -> list[Arranged]:
-        vectors = self.vectors if self.room is None else 0
-        return [Linearised(self._splitting, terms, vectors).linearised() for terms in self._splitting.terms]
+        return [Linearised(self._splitting, terms, True).linearised() for terms in self._splitting.terms]
 
-    def stage(self, values: Any, numbers: Numbers, kind: Value, step: Value) -> Any:
+    def _executed(self, kind: int, values: Any, column: Sequence[Value]) -> Any:
+        d, body = self._d, self._kinds[kind].body
         if not isinstance(values, Room):
-            return super().stage(values, numbers, kind, step)
-        for k in range(len(self._kinds)):
-            with values.code.given(values.code.apply("eq", (kind, k))):
-                self._executed(k, values, self._column(k, values.type, numbers, step))
-        return None
-
-    def _executed(self, k: int, values: Any, column: Sequence[Value]) -> Any:
-        d, body = self._d, self._kinds[k].body
-        if not isinstance(values, Room):
-            n = 2 * d * (1 + self.vectors)
-            return [*body(*values[:n], *column), *values[n:]]
+            found = body(*values[: 2 * d], *column)
+            moved = found[: 2 * d]
+            for k in range(1, 1 + self.vectors):
+                w = values[2 * d * k :][: 2 * d]
+                q, p = _vector_moved(d, found[2 * d :], w[:d], w[d:])
+                moved += [*q, *p]
+            return [*moved, *values[len(moved) :]]
         room = values
         found = body(*(room.load(i) for i in range(2 * d)), *column)
         for m, x in enumerate(found[: 2 * d]):

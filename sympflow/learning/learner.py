@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sympflow.arguments import check_dt, check_flag, checked_count, floats, plain
-from sympflow.hamiltonian import matrices
+from sympflow.hamiltonian.linear_part import checked_inverse_mass
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.learning.families import Constraints, families
 from sympflow.learning.fitting import LAG, Setting, limit_of, noise_of
@@ -227,7 +227,7 @@ def _constraints(data: Trajectories, separable: Any, mass: Any, damping: Any, pe
     d = data.ndof
     inverse = None
     if mass is not None:
-        found = matrices.inverse_mass(mass, d)
+        found = checked_inverse_mass(mass, d)
         inverse = np.eye(d) if found is None else np.diag(found) if found.ndim == 1 else found
     parts = () if known is None else _formulas(known, d)
     if inverse is not None and any(part.of != "q" for part in parts):

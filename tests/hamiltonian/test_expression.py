@@ -26,6 +26,8 @@ UNDERSTOOD = {
     "Rational(1, 3)*q\n + pi": q / 3 + sp.pi,
     "E**q + ln(q2)": sp.exp(q) + sp.log(q2),
     "max(q, 0) + abs(p)": Max(q, 0) + sp.Abs(p),
+    "frac(q) + ceiling(p)": sp.frac(q) + sp.ceiling(p),
+    "floor(q)*Mod(p, 2)": sp.floor(q) * sp.Mod(p, 2),
     "besselj(0, q)*gamma(5)": 24 * sp.besselj(0, q),
     "Piecewise((q, q > 0), (0, True))": sp.Piecewise((q, q > 0), (0, True)),
 }

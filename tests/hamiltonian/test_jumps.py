@@ -323,6 +323,7 @@ def test_jumps_of_lattices_pairs_and_parameters():
         (sp.Heaviside(t**3 - 8), [2]),
         (sp.sign((t - 1) ** 2 * (t - 3)), [3]),
         (sp.cos(t), []),
+        (sp.atan(sp.tan(t)), [PI / 2, 3 * PI / 2]),
     ],
 )
 def test_jumps_are_read_from_the_expression(drive, times):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sympflow import HamiltonianSystem, get, solve, symplecticity_defect, systems
-from sympflow.hamiltonian.normal_modes import Transform
+from sympflow.hamiltonian.linear_part import Transform
 from sympflow.hamiltonian.parts import exact_parts
 
 RNG = np.random.default_rng(7)

@@ -413,3 +413,39 @@ def test_a_sum_in_one_function_is_told_from_what_cannot_be_separated():
 def test_functions_take_their_arguments(given, message):
     with pytest.raises(TypeError, match=message):
         HamiltonianSystem(**given, ndof=1)
+
+
+CONDITIONS = {
+    "product": lambda q: q[..., 0] ** 2 / 2 * (q[..., 0] > 0),
+    "and": lambda q: q[..., 0] ** 2 / 2 * ((q[..., 0] > 0) & (q[..., 0] > -1)),
+    "not": lambda q: q[..., 0] ** 2 / 2 * ~(q[..., 0] <= 0),
+    "choice": lambda q: q[..., 0] ** 2 / 2 * np.where(q[..., 0] > 5, q[..., 0] > 4, q[..., 0] > 0),
+    "sum": lambda q: (q**2 / 2 * (q > 0)).sum(-1),
+}
+
+
+@pytest.mark.parametrize("name", CONDITIONS)
+@pytest.mark.parametrize("method", ["kahan_li8", "gauss_legendre6", "chin4a"])
+def test_conditions_are_calculated_with_as_one_and_zero(method, name):
+    """A spring that pulls on one side alone: from 1 to 0 in π/2, then free."""
+    system = HamiltonianSystem(CONDITIONS[name], ndof=1, y0=[1.0, 0.0])
+    sol = solve(system, method, (0, 3), dt=np.pi / 200)
+    assert sol.stats["backend"] == "compiled"
+    np.testing.assert_allclose(sol.y[:, -1], [np.pi / 2 - 3, -1], atol=1e-4)
+
+
+DRIVES = {
+    "product": lambda t, q: -q[..., 0] * (t > 1.003),
+    "choice": lambda t, q: np.where(t > 1.003, -q[..., 0], 0 * q[..., 0]),
+    "sign": lambda t, q: -q[..., 0] * (np.sign(t - 1.003) + 1) / 2,
+    "and": lambda t, q: -q[..., 0] * ((t > 1.003) & (t < 100)),
+}
+
+
+@pytest.mark.parametrize("name", DRIVES)
+@pytest.mark.parametrize("method", ["verlet", "kahan_li8", "gauss_legendre6", "rk4", "dop853", "dopri5"])
+def test_functions_of_the_time_that_jump_are_landed_on(method, name):
+    system = HamiltonianSystem(DRIVES[name], ndof=1, time=True, y0=[0.0, 0.0])
+    options = {} if method.startswith("dop") else {"dt": 0.1}
+    sol = solve(system, method, (0, 3), **options)
+    np.testing.assert_allclose(sol.y[:, -1], [(3 - 1.003) ** 2 / 2, 3 - 1.003], atol=1e-6)
