@@ -163,15 +163,14 @@ def values(x: Any) -> np.ndarray | None:
 
     None where there are none to be read, in a graph that `torch.compile` traces.
     """
-    if is_tensor(x) and _is_plain(x):
-        return x.detach().cpu().numpy()
-    plain, order = _behind(x)
+    plain, order = (x, None) if is_tensor(x) and _is_plain(x) else _behind(x)
     if plain is None or isinstance(plain, np.ndarray):
         return plain
     import torch
 
     with torch._C._DisableFuncTorch():
-        return plain.cpu().numpy().transpose(order)
+        found = plain.detach().cpu().numpy()
+        return found if order is None else found.transpose(order)
 
 
 def values_of_times(t: Any, remedy: str) -> np.ndarray:
@@ -245,8 +244,8 @@ def _is_plain(x: Any) -> bool:
     """True of a tensor that stands for itself alone, as nearly all do."""
     import torch
 
-    is_wrapped = torch._C._functorch.is_functorch_wrapped_tensor
-    return type(x) is torch.Tensor and not is_wrapped(x) and not torch.compiler.is_dynamo_compiling()
+    alone = torch._C._functorch.peek_interpreter_stack() is None  # else a function of x would be wrapped
+    return type(x) is torch.Tensor and alone and not torch.compiler.is_dynamo_compiling()
 
 
 def _behind(x: Any) -> tuple[Any, Sequence[int]]:

@@ -27,6 +27,7 @@ from sympflow.arrays import (
     Array,
     as_tensor,
     concatenate,
+    differentiable,
     finite_states,
     full_of_nan,
     known_finite,
@@ -104,7 +105,8 @@ def solve(
         "log_kahan_li8" where V falls without bound towards q = 0; "srkn11b" where T = ½ pᵀM⁻¹p; "kahan_li8" where H is
         separable; "gauss_legendre6"; "dop853". The message and `stats["chosen"]` say which, and why.
     t_span : (float, float), optional
-        Start and end; the end may lie before the start. The default is the system's. With a terminal event the end may
+        Start and end; the end may lie before the start. The default is the system's. Gradients flow to tensors, here
+        and in `t_eval`, by the field at the start and at the outputs. With a terminal event the end may
         be infinite: without the event the run ends after a million steps, with status −1.
     y0 : array_like or tensor of shape (..., 2d), optional
         Initial state [q, p], or a batch of them. The default is the system's. A NumPy array gives float64 (integers are
@@ -205,6 +207,15 @@ def solve(
         check_tolerance(tol, tol_of)
     integrator = None if method is None else build(method, given)
     search = check_events(events, event_step)
+    moving = _moving_times(t_span, t_eval)
+    if moving is not None:
+        if events is not None or dense_output or store is not None or params is not None:
+            raise ValueError(
+                "`t_span` or `t_eval` requires gradients, which flow through no `events`, `dense_output`, `store` or "
+                "`params`: pass `.detach()`, or leave these out; of values for all trajectories make the system, by "
+                "system.with_params(...)."
+            )
+        t_span, t_eval = moving.numbers
     t0, t1 = check_t_span(system.t_span if t_span is None else t_span, search is not None and search.may_end_run)
     y_start = check_y0(system, system.y0 if y0 is None else y0, dtype)
     system.check_times(t0, t1)
@@ -225,6 +236,8 @@ def solve(
             y_start = as_tensor(y_start)
         if rows.uniform:
             system = rows.system_of(0)
+    if moving is not None:
+        y_start = moving.started(system, y_start, t0)
     times = None if t_eval is None else check_t_eval(t_eval, t0, t1)
     every = check_save_every(save_every, times)
     check_backend(backend, integrator)
@@ -262,12 +275,24 @@ def solve(
     elif system.step_is_open and readable(y_start):
         integrator = with_step(integrator, system, to_numpy(y_start))
     sol = _shown(integrator, problem, action, rows, progress)
+    if moving is not None:
+        sol.y = moving.ended(system, sol.y, sol.t)
     if tol is not None and steps_chosen and store is None and tol_of == "energy" and system.shows_energy:
         _check_tolerance_met(sol, tol)
     if chosen is not None:
         sol.stats["chosen"] = f"{sol.integrator.label}: {chosen}"
         sol.message += f" Method {sol.integrator.label!r} was chosen: {chosen}."
     return sol
+
+
+def _moving_times(t_span: Any, t_eval: Any) -> Any:
+    """The times that torch follows, where there are some."""
+    listed = [t for times in (t_span, t_eval) if isinstance(times, tuple | list) for t in times if type(t) is not float]
+    if not differentiable(t_eval, *listed):
+        return None
+    from sympflow.integrators.tensors import MovingTimes
+
+    return MovingTimes(t_span, t_eval)
 
 
 def _shown(

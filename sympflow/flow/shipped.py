@@ -13,10 +13,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
-from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sympflow.arguments import real_number
 from sympflow.hamiltonian.fingerprint import Identity, recognised, without_friction
 
 if TYPE_CHECKING:
@@ -223,6 +223,13 @@ def shipped_flows(system: GivenSystem | None = None, kind: str | None = None) ->
     return ShippedFlows(sorted(found, key=lambda f: (f.system, math.inf if f.cost is None else f.cost)))
 
 
+def check_tol(tol: Any) -> None:
+    if tol is not None and not (real_number(tol) and 0 < tol < math.inf):
+        raise ValueError(
+            f"`tol` must be a positive number, a relative energy error; got {tol!r}: take 1e-6, for instance."
+        )
+
+
 def choose(
     system: HamiltonianSystem, kind: str = "sympflow", tol: float | None = None, transformed: bool = False
 ) -> ShippedFlow:
@@ -236,10 +243,7 @@ def choose(
     ValueError
         If there is none; the message lists those there are.
     """
-    if tol is not None and not (isinstance(tol, Real) and not isinstance(tol, bool) and 0 < tol < math.inf):
-        raise ValueError(
-            f"`tol` must be a positive number, a relative energy error; got {tol!r}: take 1e-6, for instance."
-        )
+    check_tol(tol)
     own = ShippedFlows([f for f in shipped_flows(system, kind) if transformed or f.shift is None])
     if not own:
         fits = [f for f in shipped_flows(kind=kind) if f.is_without_friction_of(system)]

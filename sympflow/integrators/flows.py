@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
@@ -13,10 +12,10 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sympflow.arguments import as_float, check_flag
+from sympflow.arguments import check_flag
 from sympflow.arrays import Array, is_tensor, to_numpy, transformed, untransformed
-from sympflow.flow.known import KnownFlow
-from sympflow.flow.shipped import choose, forces_saved, named, shipped_flows
+from sympflow.flow.known import UNCOMPENSATED, KnownFlow
+from sympflow.flow.shipped import check_tol, choose, forces_saved, named, shipped_flows
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
@@ -76,9 +75,17 @@ def is_flow(flow: Any) -> bool:
     return flows is not None and isinstance(flow, flows.FlowMap)
 
 
-def flow_named(name: str) -> FlowMap:
-    """The flow that ships under a name, read once."""
-    return known((name,), lambda: named(name).load())
+def checked_flow(flow: Any, kind: str, what: str) -> Any:
+    """The flow that was given, or the one that ships under the name that was given; a TypeError if it is none."""
+    if isinstance(flow, str):
+        name = flow
+        flow = known((name,), lambda: named(name).load())
+    if flow is not None and not (is_flow(flow) and flow.kind == kind):
+        raise TypeError(
+            f"`flow` must be {what}; got {type(flow).__name__}. Load one with sympflow.load or train one with "
+            "sympflow.train."
+        )
+    return flow
 
 
 @dataclass(frozen=True)
@@ -101,16 +108,9 @@ class FlowIntegrator(FixedStep):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.flow is None:
-            return
-        if isinstance(self.flow, str):
-            object.__setattr__(self, "flow", flow_named(self.flow))
-        if not is_flow(self.flow) or self.flow.kind != self.name:
-            raise TypeError(
-                f"`flow` must be a trained flow of kind {self.name!r}; got {type(self.flow).__name__}. Load one with "
-                "sympflow.load or train one with sympflow.train."
-            )
-        self._check_dt(self.flow)
+        object.__setattr__(self, "flow", checked_flow(self.flow, self.name, f"a trained flow of kind {self.name!r}"))
+        if self.flow is not None:
+            self._check_dt(self.flow)
 
     def _check_dt(self, flow: KnownFlow) -> None:
         if self.dt is not None and self.dt > flow.dt * (1 + 1e-12):
@@ -326,10 +326,7 @@ class SympFlowIntegrator(FlowIntegrator):
         check_flag("compensated", self.compensated)
         if self.tol is None:
             return
-        if not 0 < as_float(self.tol) < math.inf:
-            raise ValueError(
-                f"`tol` must be a positive number, a relative energy error; got {self.tol!r}: take 1e-6, for instance."
-            )
+        check_tol(self.tol)
         for name in ("flow", "dt"):
             if getattr(self, name) is not None:
                 raise ValueError(f"`tol` chooses the flow and its Δt, but `{name}` is given: leave out one of them.")
@@ -374,10 +371,7 @@ class SympFlowIntegrator(FlowIntegrator):
             return super().kernel(flow, problem)
         kernel = compiled_loops(lambda: flow.kernel_for(problem.system, True), problem.y0, problem.backend)
         if kernel is None:
-            raise ValueError(
-                "`compensated` sums need the compiled loops of a primed flow, on NumPy float64 states: leave "
-                "it out, or take a flow of SympFlow.primed."
-            )
+            raise ValueError(UNCOMPENSATED)
         return kernel
 
 
@@ -463,15 +457,8 @@ class LogSympFlow(FixedStep):
         super().__post_init__()
         if self.shift is not None:
             checked_shift(self.shift)
-        if isinstance(self.flow, str):
-            object.__setattr__(self, "flow", flow_named(self.flow))
-        flow = self.flow
-        if flow is None:
-            return
-        if not is_flow(flow) or flow.kind != "sympflow":
-            raise TypeError(
-                f"`flow` must be a SympFlow of the transformed system, or the name of one; got {type(flow).__name__}."
-            )
+        what = "a SympFlow of the transformed system, or the name of one"
+        object.__setattr__(self, "flow", checked_flow(self.flow, "sympflow", what))
 
     @property
     def clock_shift(self) -> float | None:

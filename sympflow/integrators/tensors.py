@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.arrays import differentiable, to_numpy, transformed
+from sympflow.arrays import detached, differentiable, to_numpy, transformed
 from sympflow.kernels.protocol import RunCheckpoint, Task
 
-__all__ = ["rolled_out", "stepped"]
+__all__ = ["MovingTimes", "rolled_out", "stepped"]
 
 
 def rolled_out(
@@ -40,6 +40,52 @@ def stepped(stepper: Any, y: Tensor, h: Any, t: Any) -> Tensor:
         return stepped(stepper, y.double(), h, t).to(y.dtype)
     h = torch.as_tensor(h, dtype=y.dtype).expand(y.shape[:-1])
     return _Step.apply(stepper, t, y, h, *stepper.followed)
+
+
+class MovingTimes:
+    """Times of a run that torch follows: outputs move along the field with them, and starts against it.
+
+    That is the derivative of the solution, and of a step of a method of order p up to O(hᵖ).
+    """
+
+    def __init__(self, t_span: Any, t_eval: Any) -> None:
+        self._ends = (None, None) if t_span is None else tuple(t_span)
+        listed = isinstance(t_eval, list | tuple)
+        self._times = torch.stack([torch.as_tensor(t, dtype=torch.float64) for t in t_eval]) if listed else t_eval
+        for name, times in (("t_span", self._ends), ("t_eval", (self._times,))):
+            if transformed(*times):
+                raise TypeError(
+                    f"`{name}` is followed by torch.func, forward mode or torch.compile, which solve does not take: "
+                    "use torch.autograd.grad, or pass `.detach()`."
+                )
+
+    @property
+    def numbers(self) -> tuple[Any, Any]:
+        """The ends and the times of outputs, as numbers."""
+        ends = None if self._ends[0] is None else tuple(detached(t) for t in self._ends)
+        return ends, None if self._times is None else to_numpy(self._times)
+
+    def started(self, system: Any, y0: Any, t0: float) -> Tensor:
+        """The initial states, which move with the start."""
+        y0, start = torch.as_tensor(y0), self._ends[0]
+        return _moved(system, y0, start, t0, -1.0) if differentiable(start) else y0
+
+    def ended(self, system: Any, y: Tensor, t: np.ndarray) -> Tensor:
+        """The outputs (..., 2d, n) at times t, which move with these."""
+        states, times = y.movedim(-1, 0), self._times
+        if times is None:  # the grid moves with the start, but for the end
+            start, end = (torch.as_tensor(t, dtype=torch.float64).reshape(1) for t in self._ends)
+            times = torch.cat([start.expand(max(len(t) - 1, 0)), end if t[-1] == to_numpy(end) else start])
+        if not differentiable(times):
+            return y
+        at = t.reshape(-1, *[1] * (states.ndim - 2))
+        return _moved(system, states, times[: len(t)].reshape(at.shape), at).movedim(0, -1)
+
+
+def _moved(system: Any, y: Tensor, t: Tensor, at: Any, sign: float = 1.0) -> Tensor:
+    """The same states y (..., 2d) at times t, whose values are `at`, with the derivative by these, or less that."""
+    field = system.vector_field(y, None if system.autonomous else torch.as_tensor(at).expand(y.shape[:-1]))
+    return y + sign * field * (t - t.detach()).to(y)[..., None]
 
 
 class _Rolled:

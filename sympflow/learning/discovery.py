@@ -22,14 +22,13 @@ from sympflow.arguments import check_positive, checked_count, checked_number, pl
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning import diagnosis
+from sympflow.learning.diagnosis import POINTS, Reading, best_by_increments, hint
 from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.orbits import Method
 from sympflow.learning.reading import Run
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import Smooth
-from sympflow.learning.symplecticity import POINTS, Reading, best_by_increments
 from sympflow.learning.trajectories import Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.show.style import new_figure
@@ -809,15 +808,14 @@ class _Search:
                 f"But without any model the data show noise of up to {self.smooth.sigma[worst]:.2g} there: leave "
                 "`noise` out, or give that."
             )
-        hint = diagnosis.hint(self.library, self.smooth, self.data)
-        if hint is None and self.doubt is not None:
-            hint = (
-                f"Of increments of trajectories {self.doubt.cause.said} leaves {self.doubt.share:.1e} of the squares."
-            )
+        found = hint(self.library, self.smooth, self.data)
+        if found is None and self.doubt is not None:
+            said, share = self.doubt.cause.said, self.doubt.share
+            found = f"Of increments of trajectories {said} leaves {share:.1e} of the squares."
         return (
             f"No sparse Hamiltonian of the library's {len(self.library)} terms explains the data: of "
             f"{self.data.names[worst]} it leaves {noise[worst]:.3g}, {excess[worst]:.1f} times the noise. "
-            f"{hint or otherwise} The best model and the path to it are in `system.discovery`."
+            f"{found or otherwise} The best model and the path to it are in `system.discovery`."
         )
 
 

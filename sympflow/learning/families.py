@@ -131,36 +131,55 @@ class Candidate:
 T = "T = ½ pᵀM⁻¹p"
 
 
-def _few(degrees: Sequence[int], of: str, scales: np.ndarray) -> Iterator[tuple[int, Polynomial]]:
-    """Polynomials of these degrees with not too many terms."""
-    for degree in degrees:
-        if math.comb(len(scales) + degree, degree) <= MOST_TERMS:
-            yield degree, Polynomial.up_to(degree, of, scales)
+@dataclass(frozen=True)
+class Form:
+    """A function of some coordinates in several sizes."""
+
+    said: str
+    sizes: Sequence[int]  # Of V(q)
+    whole_sizes: Sequence[int]  # Of H(q, p)
+    parts: Callable[[int, str, np.ndarray, np.ndarray], Sequence[Part]]  # By size, coordinates, scales and periods
+
+    def of(self, constraints: Constraints, coordinates: str) -> Iterator[tuple[str, Sequence[Part]]]:
+        """The functions of "q" or "y" with not too many numbers, in words and as parts of H."""
+        own = slice(constraints.ndof if coordinates == "q" else None)
+        for size in self.sizes if coordinates == "q" else self.whole_sizes:
+            parts = self.parts(size, coordinates, constraints.scales[own], constraints.periods[own])
+            if parts and sum(part.n for part in parts) <= MOST_TERMS:
+                yield self.said.format(size), parts
+
+    def potentials(self, constraints: Constraints) -> Iterator[Candidate]:
+        """T(p) + V(q)."""
+        for said, parts in self.of(constraints, "q"):
+            yield Candidate(f"{T}, V {said}", constraints.separated(*parts))
+
+    def hamiltonians(self, constraints: Constraints) -> Iterator[Candidate]:
+        """H(q, p)."""
+        for said, parts in self.of(constraints, "y"):
+            yield Candidate(f"H(q, p) {said}", constraints.whole(*parts))
 
 
-def _polynomials(constraints: Constraints) -> Iterator[Candidate]:
-    for degree, V in _few(DEGREES, "q", constraints.scales[: constraints.ndof]):
-        yield Candidate(f"{T}, V a polynomial of degree {degree}", constraints.separated(V))
+def _polynomial(degree: int, of: str, scales: np.ndarray, periods: np.ndarray) -> Sequence[Part]:
+    few = math.comb(len(scales) + degree, degree) <= MOST_TERMS
+    return (Polynomial.up_to(degree, of, scales),) if few else ()
 
 
-def _whole_polynomials(constraints: Constraints) -> Iterator[Candidate]:
-    for degree, H in _few(DEGREES, "y", constraints.scales):
-        yield Candidate(f"H(q, p) a polynomial of degree {degree}", constraints.whole(H))
+def _series(harmonics: int, of: str, scales: np.ndarray, periods: np.ndarray) -> Sequence[Part]:
+    """A Fourier series, of degree 2 at least in what is no angle; of p of degree 2."""
+    degree = max(harmonics, 2) if of == "q" else 2
+    return (Waves.up_to(harmonics, degree, of, scales, periods),) if np.isfinite(periods).any() else ()
 
 
-def _waves(constraints: Constraints) -> Iterator[Candidate]:
-    q = slice(0, constraints.ndof)
-    for harmonics in HARMONICS if constraints.angles else ():
-        V = Waves.up_to(harmonics, max(harmonics, 2), "q", constraints.scales[q], constraints.periods[q])
-        if V.n <= MOST_TERMS:
-            yield Candidate(f"{T}, V a Fourier series of {harmonics} harmonics", constraints.separated(V))
+def _network(width: int, of: str, scales: np.ndarray, periods: np.ndarray) -> Sequence[Part]:
+    """A network beside the quadratic polynomials of the coordinates that are no angles."""
+    whole = Polynomial.up_to(2, of, scales)
+    quadratic = whole.subset((whole.exponents[:, np.isfinite(periods)] == 0).all(axis=1))
+    return quadratic, Network(of, width, scales, periods)
 
 
-def _whole_waves(constraints: Constraints) -> Iterator[Candidate]:
-    for harmonics in HARMONICS[1:] if constraints.angles else ():
-        H = Waves.up_to(harmonics, 2, "y", constraints.scales, constraints.periods)
-        if H.n <= MOST_TERMS:
-            yield Candidate(f"H(q, p) quadratic in p, a Fourier series of {harmonics} harmonics", constraints.whole(H))
+POLYNOMIALS = Form("a polynomial of degree {}", DEGREES, DEGREES, _polynomial)
+SERIES = Form("a Fourier series of {} harmonics", HARMONICS, HARMONICS[1:], _series)
+NETWORKS = Form("a network of {} neurons", WIDTHS, WHOLE_WIDTHS, _network)
 
 
 def _inertia(constraints: Constraints) -> Iterator[Candidate]:
@@ -177,11 +196,9 @@ def _inertia(constraints: Constraints) -> Iterator[Candidate]:
 def _magnetic(constraints: Constraints) -> Iterator[Candidate]:
     d = constraints.ndof
     exponents = [np.eye(2 * d, dtype=int)[[i, d + j]].sum(axis=0) for i, j in combinations(range(d), 2)]
-    for degree, V in _few(DEGREES, "q", constraints.scales[:d]) if exponents else ():
-        turn = Polynomial("y", exponents, constraints.scales)
-        yield Candidate(
-            f"H = ½ pᵀM⁻¹p + Σ b_ij q_i p_j + V, V a polynomial of degree {degree}", constraints.separated(turn, V)
-        )
+    turn = Polynomial("y", exponents, constraints.scales)
+    for said, parts in POLYNOMIALS.of(constraints, "q") if exponents else ():
+        yield Candidate(f"H = ½ pᵀM⁻¹p + Σ b_ij q_i p_j + V, V {said}", constraints.separated(turn, *parts))
 
 
 def _central(constraints: Constraints) -> Iterator[Candidate]:
@@ -219,23 +236,6 @@ def _pairs(constraints: Constraints) -> Iterator[Candidate]:
                 yield Candidate(name, constraints.separated(Distances.between(bodies, powers, size, central)))
 
 
-def _networks(constraints: Constraints) -> Iterator[Candidate]:
-    q = slice(0, constraints.ndof)
-    for width in WIDTHS:
-        network = Network("q", width, constraints.scales[q], constraints.periods[q])
-        name = f"{T}, V a network of {width} neurons"
-        yield Candidate(
-            name, constraints.separated(_quadratic("q", constraints.scales[q], constraints.periods[q]), network)
-        )
-
-
-def _whole_networks(constraints: Constraints) -> Iterator[Candidate]:
-    for width in WHOLE_WIDTHS:
-        network = Network("y", width, constraints.scales, constraints.periods)
-        name = f"H(q, p) a network of {width} neurons"
-        yield Candidate(name, constraints.whole(_quadratic("y", constraints.scales, constraints.periods), network))
-
-
 def _flows(constraints: Constraints) -> Iterator[Candidate]:
     scaling = constraints.flow_scaling
     told = (
@@ -251,12 +251,6 @@ def _flows(constraints: Constraints) -> Iterator[Candidate]:
         kind, all_pairs = ("palindromic SympFlow", 2 * pairs) if palindromic else ("SympFlow", pairs)
         name = f"{kind} of {all_pairs} pairs of layers of {width} neurons, Δt = {scaling.t:.3g}"
         yield Candidate(name, NetworkFlow(scaling, pairs, width, palindromic))
-
-
-def _quadratic(of: str, scales: np.ndarray, periods: np.ndarray) -> Polynomial:
-    """The quadratic polynomials of the coordinates that are no angles."""
-    whole = Polynomial.up_to(2, of, scales)
-    return whole.subset((whole.exponents[:, np.isfinite(periods)] == 0).all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -288,14 +282,14 @@ class Group(NamedTuple):
 FAMILIES = {
     "central": Family(True, _central),
     "pairs": Family(True, _pairs),
-    "waves": Family(True, _waves, angular=True),
-    "polynomial": Family(True, _polynomials),
-    "network": Family(True, _networks, linear=False),
+    "waves": Family(True, SERIES.potentials, angular=True),
+    "polynomial": Family(True, POLYNOMIALS.potentials),
+    "network": Family(True, NETWORKS.potentials, linear=False),
     "inertia": Family(False, _inertia, linear=False, angular=True),
     "magnetic": Family(False, _magnetic, observed="qv"),
-    "whole-waves": Family(False, _whole_waves, angular=True, observed="qp"),
-    "whole-polynomial": Family(False, _whole_polynomials, observed="qp"),
-    "whole-network": Family(False, _whole_networks, linear=False, observed="qp"),
+    "whole-waves": Family(False, SERIES.hamiltonians, angular=True, observed="qp"),
+    "whole-polynomial": Family(False, POLYNOMIALS.hamiltonians, observed="qp"),
+    "whole-network": Family(False, NETWORKS.hamiltonians, linear=False, observed="qp"),
     "sympflow": Family(False, _flows, linear=False, observed="qp"),
 }
 """In the order in which they are tried: potentials of the distance from the origin, and of distances of bodies; Fourier

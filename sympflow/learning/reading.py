@@ -197,17 +197,10 @@ def of_dataset(data: Any) -> list[Found]:
         _numbers((part if DOF in part.dims else part.expand_dims(DOF)).transpose(*outer, DOF, TIME).values, "states")
         for part in (data.q, data.p)
     )
-    lengths = q.shape[:-2]
     times = data[TIME].transpose(*[dim for dim in outer if dim in data[TIME].dims], ...).values
-    times = np.broadcast_to(_numbers(times, "times"), (*lengths, q.shape[-1])).reshape(-1, q.shape[-1])
-    y = np.concatenate([q, p], axis=-2)
-    y = y.reshape(-1, *y.shape[-2:])
-    labels = [", ".join(f"{dim} {k}" for dim, k in zip(outer, at, strict=True)) for at in np.ndindex(*lengths)]
-    found = []
-    for label, t, one in zip(labels, times, y, strict=True):
-        kept = np.isfinite(t)  # ragged trajectories are padded
-        found.append((label or "the trajectory", t[kept], one[:, kept]))
-    return found
+    each = (-1, *q.shape[-2:])
+    times = np.broadcast_to(_numbers(times, "times"), (*q.shape[:-2], q.shape[-1])).reshape(-1, q.shape[-1])
+    return [*_of_pair(times, np.concatenate([q.reshape(each), p.reshape(each)], axis=1))]
 
 
 def opened(path: Path) -> Any:

@@ -20,7 +20,20 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
 from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning.diagnosis import MOST_SLOPES, drive_frequency, driven, fields_of, hint
+from sympflow.learning.diagnosis import (
+    DAMPED,
+    MOST_SLOPES,
+    Reading,
+    affords,
+    best_by_increments,
+    drive_frequency,
+    driven,
+    fields_of,
+    forced,
+    free_reading,
+    hint,
+    sample,
+)
 from sympflow.learning.families import MOST_TERMS, Candidate, Constraints, Group, pruned, with_unit_mass
 from sympflow.learning.fitting import (
     SILENT,
@@ -42,7 +55,6 @@ from sympflow.learning.orbits import Field, Method
 from sympflow.learning.parts import Distances, Drive, Part, Polynomial
 from sympflow.learning.reading import Run
 from sympflow.learning.smoothing import Smooth
-from sympflow.learning.symplecticity import DAMPED, Reading, affords, best_by_increments, forced, free_reading, sample
 from sympflow.learning.trajectories import Trajectories
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.training import checkpoint as checkpoints
@@ -197,19 +209,14 @@ class Search:
     identity: dict[str, Any] = field(default_factory=dict)
     done: dict[str, dict[str, Any]] = field(default_factory=dict)
     """The numbers of the models that were fitted, by their names."""
-    cut: bool = False
-    """True if the time was up before the search came to its end."""
+    cut: bool = False  # True if the time was up before the search came to its end
     bar: Silent = field(default_factory=Silent)
-    reading: Reading | None = None
-    """Another explanation of the data, where increments make any H doubtful."""
+    reading: Reading | None = None  # Another explanation of the data, where increments make any H doubtful
     tested: list[Freedom | None] = field(default_factory=list)
     """The comparison with a vector field that need not be Hamiltonian, once it was made; None where H does as well."""
-    whole: Trajectories | None = None
-    """The trajectories as they were before they were cut; None if they were not."""
-    final: Fitted = field(init=False)
-    """The chosen model, fitted to all trajectories."""
-    late: Callable[[], bool] = lambda: False
-    """True once there is no time for another model."""
+    whole: Trajectories | None = None  # The trajectories as they were before they were cut; None if they were not
+    final: Fitted = field(init=False)  # The chosen model, fitted to all trajectories
+    late: Callable[[], bool] = lambda: False  # True once there is no time for another model
 
     @property
     def data(self) -> Trajectories:

@@ -89,13 +89,3 @@ def test_flows_without_the_friction_are_refused(system, flow, conservative):
             use()
     with pytest.raises(ValueError, match=r"^`compensated`"):
         solve(system, "sympflow", flow=flow, compensated=True)
-
-
-def test_a_driven_system_is_none_of_a_flow(conservative):
-    driven = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + 0.3*cos(1.7*t))", time="t", y0=[1.0, 0.0])
-    same = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + 0.3*cos(1.7*t))", time="t", y0=[1.0, 0.0])
-    other = HamiltonianSystem.from_sympy("p**2/2 - cos(q)*(1 + 0.3*cos(1.8*t))", time="t", y0=[1.0, 0.0])
-    assert driven.fingerprint == same.fingerprint
-    assert not sympflow.hamiltonian.fingerprint.same_system(driven.fingerprint, other.fingerprint)
-    assert not conservative.matches(driven)
-    assert len(sympflow.shipped_flows(driven)) == 0

@@ -327,20 +327,9 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
         rows += [f"{i},{1000 * a},{q},{p}" for a, q, p in zip(t, *y, strict=True)]
     (tmp_path / "data.csv").write_text("\n".join(rows))
     to, plot = tmp_path / "flow.safetensors", tmp_path / "report.png"
-    arguments = [
-        "learn",
-        str(tmp_path / "data.csv"),
-        "--unit",
-        "t=ms",
-        "--damping",
-        "--separable",
-        *("--mass", "2.5", "--known", "pendulum", "--family", "polynomial"),
-        "--out",
-        str(to),
-        "--plot",
-        str(plot),
-    ]
-    found = CliRunner().invoke(app, arguments)
+    known = ["--mass", "2.5", "--known", "pendulum", "--family", "polynomial"]
+    arguments = ["learn", str(tmp_path / "data.csv"), "--unit", "t=ms", "--out", str(to)]
+    found = CliRunner().invoke(app, [*arguments, "--damping", "--separable", *known, "--plot", str(plot)])
     assert found.exit_code == 0, found.output
     assert "3 trajectories, 18 points" in found.output
     assert "noise = 0.0" in found.output
@@ -352,28 +341,16 @@ def test_the_command_reports_what_was_learned(noisy, tmp_path, monkeypatch):
     assert plot.stat().st_size > 10_000
     assert CliRunner().invoke(app, [*arguments, "--mass", "1,2", "--not-separable"]).exit_code == 0
     assert (asked["separable"], asked["mass"]) == (False, [1.0, 2.0])
-    for observed, letters in (("qv", "q,v"), ("q", "q")):
-        table = "\n".join(
-            [f"orbit,t,{letters}", *(row.rsplit(",", 1)[0] if observed == "q" else row for row in rows[1:])]
-        )
-        (tmp_path / "seen.csv").write_text(table)
-        seen = [
-            "learn",
-            str(tmp_path / "seen.csv"),
-            "--observed",
-            observed,
-            "--out",
-            str(to),
-            "--drive",
-            "1.5",
-            "--drag",
-        ]
-        found = CliRunner().invoke(app, seen)
+    for observed, letters, columns in (("qv", "q,v", 4), ("q", "q", 3)):
+        table = [f"orbit,t,{letters}", *(",".join(row.split(",")[:columns]) for row in rows[1:])]
+        (tmp_path / "seen.csv").write_text("\n".join(table))
+        seen = ["learn", str(tmp_path / "seen.csv"), "--out", str(to), "--drive", "1.5", "--drag", "--observed"]
+        found = CliRunner().invoke(app, [*seen, observed])
         assert found.exit_code == 0, found.output
         assert asked["velocities"]
         assert asked["missing"] == (observed == "q")
         assert (asked["drive"], asked["damping"]) == (1.5, "quadratic")
-    found = CliRunner().invoke(app, [*seen, "--observed", "p"])
+    found = CliRunner().invoke(app, [*seen, "p"])
     assert found.exit_code == 2
     assert "`--observed` must be one of qp, qv, q" in " ".join(found.output.split())
     for option, message in (
@@ -503,9 +480,10 @@ CLOCKS = {
 }
 
 
-@pytest.fixture(
-    scope="module", params=["drive", pytest.param("stiffness", marks=pytest.mark.slow), "two drives", "drag"]
-)
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("stiffness", "two drives")]
+
+
+@pytest.fixture(scope="module", params=["drive", *SLOW, "drag"])
 def forced(request):
     """Noisy trajectories of what no H(q, p) explains, with the remedy that a warning names."""
     field, remedy, options = CLOCKS[request.param]

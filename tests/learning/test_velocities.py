@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import sympflow
-from sympflow.learning.families import FAMILIES, Constraints, families
+from sympflow.learning.families import FAMILIES, Constraints, families, pruned
 from sympflow.learning.fitting import Setting, fitted
-from sympflow.learning.lagrangian import lagrangian_start
+from sympflow.learning.lagrangian import lagrangian_start, told
 from sympflow.learning.learner import _constraints
 from sympflow.learning.models import Model, friction
 from sympflow.learning.orbits import first_states
@@ -57,6 +57,31 @@ def test_lagranges_equations_give_the_masses_of_a_double_pendulum(observed):
     right = np.gradient(v[:2], t, axis=1)[:, 5:-5]
     found = accelerations(model, theta, seen)[:, 5:-5]
     assert np.sqrt(np.mean((found - right) ** 2)) < 0.01 * right.std()
+
+
+@pytest.mark.parametrize("observed", ["qp", "qv"])
+def test_terms_that_smooth_curves_do_not_ask_for_are_left_out(observed):
+    """Of 51 numbers a dozen are kept, with accelerations to 1 %: those of all numbers are worthless elsewhere."""
+    data, y = observations(double_pendulum(), observed, noise=1e-3)
+    kept = [*FAMILIES["inertia"].models(_constraints(data, None, None, False, 2 * np.pi, None))][1]
+    for _ in range(3):
+        kept = pruned(kept, *told(kept.model, data), data.n_values) or kept
+    assert kept.model.n < 13
+    v = double_pendulum().vector_field(y[0].T).T
+    right = np.einsum("nij,nj->in", double_pendulum().field_jacobian(y[0].T), v.T)[:2]
+    seen = y[0] if observed == "qp" else np.concatenate([y[0, :2], v[:2]])
+    found = accelerations(kept.model, told(kept.model, data)[0], seen)
+    assert np.sqrt(np.mean((found - right) ** 2)) < 0.01 * right.std()
+
+
+@pytest.mark.parametrize(("period", "spread", "names"), [(None, 1.0, ["radians"]), (None, 50.0, ["degrees"]),
+                                                         (None, 1e-3, []), (np.inf, 1.0, [])])  # fmt: skip
+def test_angles_that_nobody_told_of_are_tried(period, spread, names):
+    data = Trajectories.read([(t, spread * np.stack([np.cos(t + k), -np.sin(t + k)])) for k in range(3)])
+    first, *assumed = _constraints(data, None, None, False, period, None).groups("waves")
+    assert not first.models
+    assert [group.models[0].name.split()[-1] for group in assumed] == names
+    assert all(group.assumed for group in assumed)
 
 
 @pytest.mark.parametrize("force", [None, friction])

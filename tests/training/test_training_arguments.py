@@ -283,6 +283,7 @@ class Started(Exception):
 def test_a_run_of_trials_is_resumed_whatever_else_is_said_now(monkeypatch, tmp_path):
     """A short budget, and the default of its fit, say nothing of its flow."""
     path, start = tmp_path / "run.ckpt", trials.tried_starts(HH, HH.domain)[-1]
+    assert start.curvature
 
     def kill(*_):
         raise Started

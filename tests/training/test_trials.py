@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sympflow import SympFlow, max_energy_error, solve, systems, train
+from sympflow import max_energy_error, solve, systems, train
 from sympflow.kernels.splitting_loops import splitting_loops
-from sympflow.training import checkpoint as checkpoints
 from sympflow.training import trials
 from sympflow.training.least_squares import Minimum
 from sympflow.training.points import Stream, states
@@ -205,24 +204,3 @@ def test_only_where_nothing_is_said_there_are_trials(monkeypatch, tmp_path):
     for options in ({"dt": 1.0}, {"restarts": 2}, {"points": 60}, {"time_budget": 5.0}, {"stages": 2}):
         assert flow_of(**options).curvatures is None
     assert made == [HH]
-
-
-def test_a_run_is_resumed_without_trials(monkeypatch, tmp_path):
-    """The checkpoint says which of the flows that are tried it is of."""
-    path, start = tmp_path / "run.ckpt", trials.tried_starts(HH, HH.domain)[-1]
-    assert start.curvature
-    monkeypatch.setattr(trials, "chosen_trial", lambda *_: trials.Trial(start, 1e-6))
-
-    def kill(*_):
-        raise Started
-
-    with pytest.raises(Started):
-        train(HH, checkpoint=path, callback=kill, progress=False)
-    assert checkpoints.read(path)["step"] == 0
-    monkeypatch.setattr(trials, "chosen_trial", None)
-    monkeypatch.setattr(TableRun, "complete", lambda self, session: kill())
-    monkeypatch.setattr(TableRun, "SEARCH_SHARE", 0.0)
-    with pytest.raises(Started):
-        train(HH, resume=path, time_budget=100.0, progress=False)
-    with pytest.raises(ValueError, match="`resume` is a run with another architecture"):
-        train(HH, flow=SympFlow.primed(HH, 4), resume=path, progress=False)

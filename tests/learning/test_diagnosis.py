@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import sympflow
-from sympflow.learning.diagnosis import hint
+from sympflow.learning.diagnosis import Cause, best_by_increments, hint
 from sympflow.learning.families import FAMILIES
 from sympflow.learning.fitting import Setting
 from sympflow.learning.learner import _constraints
@@ -15,7 +15,6 @@ from sympflow.learning.library import library_for
 from sympflow.learning.models import drags, frictions
 from sympflow.learning.parts import Drive, Polynomial
 from sympflow.learning.search import Search
-from sympflow.learning.symplecticity import Cause, best_by_increments
 from sympflow.learning.trajectories import Trajectories
 from sympflow.training.session import Session
 
@@ -135,6 +134,16 @@ def test_hints_name_the_reason_and_its_size(field, d, known, said):
     assert re.search(rf"{re.escape(said)}\d?", str(found)), found
     one = data.subset([0])
     assert "driven" not in str(hint(library_for(None, d, 4, one.smooth.points)[0], one.smooth, data, **known))
+
+
+def test_reasons_are_looked_for_by_some_of_the_points():
+    """So that the time does not grow with the data: points, slopes and times stay together."""
+    smooth = Trajectories.read(runs(driven, 1, n=12, noise=0.0)).smooth
+    some = smooth.some(100)
+    assert len(some.points) == 100
+    right = np.stack([some.points[:, 1], -np.sin(some.points[:, 0]) + 0.3 * np.cos(1.7 * some.times)], axis=1)
+    assert np.abs(some.slopes - right).max() < 0.02
+    assert smooth.some(10_000) is smooth
 
 
 def test_friction_of_one_percent_is_named():
