@@ -519,6 +519,9 @@ def test_methods_of_torchdiffeq_end_their_steps_at_jumps(method, back):
     T = ends[1].item()
     exact = height * ((T - a) ** 2 - (T - b) ** 2) / 2 * (-1 if back else 1)
     assert found == pytest.approx(exact, rel=1e-9)
+    before = torch.tensor([100.0, b + 1e-3] if back else [0.0, a - 1e-3], dtype=torch.float64)
+    still = odeint(system, torch.zeros(2, dtype=torch.float64), before, method=method, options=options)
+    assert not still.any()
 
 
 @pytest.mark.parametrize(
