@@ -2,6 +2,8 @@
 
     python benchmarks/planets.py                                   1,000 years, a minute
     python benchmarks/planets.py --years 1e5                       the comparison at length
+    python benchmarks/planets.py --long                            states after 100,000 years, and trained flows
+    python benchmarks/planets.py --asteroids                       bodies without mass, on all cores
     python benchmarks/planets.py --figure docs/figures/planets.png eccentricities over 200,000 years
     python benchmarks/planets.py --belt docs/figures/belt.png      asteroids over 100,000 years, four minutes
 
@@ -9,23 +11,26 @@ The energy error is the largest of 40 outputs, relative to |H(y0)|; times are pr
 the least of the repeats, on one thread. REBOUND runs from the same state, without safe mode, alternating with ours.
 """
 
-# ruff: noqa: E402
-
 from __future__ import annotations
 
 import argparse
+import os
+import sys
+import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from measuring.machine import least, pin_to_one_thread
 
-pin_to_one_thread()
+if "--asteroids" not in sys.argv:
+    pin_to_one_thread()
 
 import numpy as np
 from measuring import fragments
 
-from sympflow import HamiltonianSystem, elements, solve
+from sympflow import HamiltonianSystem, KeplerFit, elements, solve, train
 from sympflow.show.style import dress, new_figure
 from sympflow.systems import solar_system
 from sympflow.systems.planets import UNITS
@@ -159,18 +164,30 @@ def asteroids(n: int = 100_000, days: float = 40.0) -> str:
     system = belt(n)
 
     def run(steps: int) -> float:
-        return least(lambda: solve(system, "wisdom_holman", (0.0, steps * days), dt=days, save_every=steps), 2)[0]
+        return shortest(lambda: solve(system, "wisdom_holman", (0.0, steps * days), dt=days, save_every=steps))
 
     mine = (run(150) - run(50)) / 100
-    text = f"{n:,} asteroids among four planets: {1e9 * mine / n:.1f} ns a step and asteroid"
+    cores = len(os.sched_getaffinity(0)) if "--asteroids" in sys.argv else 1
+    what = f"{n:,} asteroids among four planets, on {cores} core{'s' * (cores > 1)}"
+    text = f"{what}: {1e9 * mine / n:.1f} ns a step and asteroid"
     try:
         import rebound
     except ImportError:
         return f"{text}."
     sim = simulated(rebound, system, days, "whfast")
     sim.integrate(sim.dt, exact_finish_time=0)
-    theirs = least(lambda: sim.integrate(sim.t + 10 * sim.dt, exact_finish_time=0), 2)[0] / 10
-    return f"{text}, REBOUND {1e9 * theirs / n:.1f} ns."
+    theirs = shortest(lambda: sim.integrate(sim.t + 10 * sim.dt, exact_finish_time=0), 2) / 10
+    return f"{text}, REBOUND on one core {1e9 * theirs / n:.1f} ns."
+
+
+def shortest(run: Callable[[], Any], repeats: int = 5) -> float:
+    """The least time in seconds of several runs, as a clock shows it."""
+    times = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        run()
+        times.append(time.perf_counter() - begun)
+    return min(times)
 
 
 def belt_figure(path: Path, n: int = 8000, years: float = 100_000.0) -> None:
@@ -218,6 +235,91 @@ def batch(systems: int = 1000, steps: int = 2000) -> str:
     return f"{systems} systems at once: {1e6 * seconds / systems / steps:.3f} µs a step and system."
 
 
+LONG_DAYS = 36_528_000.0  # 100,000 years, so many whole steps of each length between outputs
+LONG = {"wisdom_holman, corrector 17": 6.0, "kepler_aba1064": 8.0}
+"""Methods and steps of the long comparison."""
+
+
+def phases(y: np.ndarray, right: np.ndarray) -> float:
+    """The largest angle between a planet of one state and that of another, as seen from the Sun."""
+    one, other = (q[1:] - q[:1] for q in (x[: x.size // 2].reshape(-1, 3) for x in (y, right)))
+    size = np.linalg.norm(one, axis=-1) * np.linalg.norm(other, axis=-1)
+    return float((np.linalg.norm(np.cross(one, other), axis=-1) / size).max())
+
+
+def long_runs(days: float = LONG_DAYS) -> str:
+    """Energy errors and phases after 100,000 years, beside REBOUND's."""
+    system, lines = solar_system(), []
+    given = {"t_span": (0.0, days), "on_domain_exit": "ignore"}
+    right = solve(system, "kepler_aba1064", dt=4.0, compensated=True, t_eval=[days], **given).y[:, -1]
+    for name, step in LONG.items():
+        method, options, (peer, more) = METHODS[name]
+        n = round(days / step)
+        mine = {"dt": step, "save_every": n // OUTPUTS, **options, **given}
+        seconds, sol = least(lambda m=method, mine=mine: solve(system, m, **mine), 1)
+        rows = [[f"`{name}`", sol.y[:, -1], float(np.abs(sol.energy_error()).max()), seconds]]
+        try:
+            import rebound
+
+            sim = simulated(rebound, system, step, peer)
+            for option, value in more.items():
+                setattr(sim.integrator, option, value)
+            seconds, (y, worst) = least(lambda s=sim, k=n: _stepped(s, k), 1)
+            rows.append([f"REBOUND, {peer}", y, worst, seconds])
+        except ImportError:
+            pass
+        lines += [
+            [name, f"{step:g} d", f"{error:.1e}", f"{phases(y, right):.1e}", f"{seconds:.2f} s"]
+            for name, y, error, seconds in rows
+        ]
+        print(*lines[-len(rows) :], sep="\n", flush=True)
+    return fragments.table(["method", "step", "energy error", "error of a phase", "time"], lines)
+
+
+def _stepped(sim: Any, n: int) -> tuple[np.ndarray, float]:
+    """The places of bodies after n steps of REBOUND, and the largest energy error of the outputs."""
+    E, worst = sim.energy(), 0.0
+    for _ in range(OUTPUTS):
+        sim.steps(n // OUTPUTS)
+        sim.synchronize()
+        worst = max(worst, abs(sim.energy() / E - 1))
+    q = np.array([p.xyz for p in sim.particles])
+    return np.concatenate([q.ravel(), q.ravel()]), worst
+
+
+TRAINED = {1e-8: KeplerFit(334.0, reach=128, gradients=0), 1e-9: KeplerFit(213.0)}
+STEPS = np.geomspace(400.0, 60.0, 96)  # days between kicks of the methods that these are compared with
+
+
+def trained(years: float = 1e5) -> str:
+    """The outer planets: a simulated day by trained flows and by other methods, each with its longest step."""
+    system, lines = solar_system(("Jupiter", "Saturn", "Uranus", "Neptune")), []
+    others = {"wisdom_holman": {"corrector": 17}, "kepler_takahashi_imada": {"corrector": 17}, "kepler_aba1064": {}}
+
+    def error(method: Any, dt: float, options: dict[str, Any]) -> float:
+        n = 1000 * round(years * YEAR / dt / 1000)
+        given = {"dt": dt, "save_every": n // 1000, "on_domain_exit": "ignore"}
+        return float(np.abs(solve(system, method, (0.0, n * dt), **given, **options).energy_error()).max())
+
+    def cost(method: Any, dt: float, options: dict[str, Any], n: int = 200_000) -> float:
+        given = {"dt": dt, "save_every": n, "on_domain_exit": "ignore"}
+        return least(lambda: solve(system, method, (0.0, n * dt), **given, **options), 3)[0] / (n * dt) * 1e9
+
+    for target, fit in TRAINED.items():
+        rows = []
+        for name, options in others.items():
+            steps = 8 * STEPS if name == "kepler_aba1064" else STEPS
+            dt = next(h for h in steps.tolist() if error(name, h, options) <= target)
+            rows.append((f"`{name}`" + ", corrector 17" * bool(options), name, dt, options))
+        flow = train(system, fit)
+        rows.append((f"trained, over {fit.reach} steps to either side", flow, flow.dt, {}))
+        for title, *given in rows:
+            found = error(*given), cost(*given)
+            lines.append([f"{target:g}", title, f"{given[1]:.0f} d", f"{found[0]:.1e}", f"{found[1]:.2f} ns"])
+            print(*lines[-1], flush=True)
+    return fragments.table(["asked", "method", "step", "energy error", "a simulated day"], lines)
+
+
 def figure(path: Path) -> None:
     """Eccentricities of the outer planets over 200,000 years."""
     import matplotlib
@@ -245,11 +347,22 @@ def main() -> None:
     parser.add_argument("--years", type=float, default=1000.0)
     parser.add_argument("--steps", type=float, nargs="+", default=[4.0, 6.0, 8.0, 12.0, 20.0])
     parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--asteroids", action="store_true", help="measure bodies without mass on all cores")
+    parser.add_argument("--long", action="store_true", help="compare states after 100,000 years, and trained flows")
     parser.add_argument("--figure", type=Path, help="draw this picture, and nothing else")
     parser.add_argument("--belt", type=Path, help="draw that of asteroids, and nothing else")
     fragments.add_out(parser)
     given = parser.parse_args()
     warnings.filterwarnings("ignore", "`dt` .* is long for method")
+    if given.asteroids:
+        text = asteroids()
+        print(text)
+        fragments.write(given.out, "planets-asteroids", text)
+        return
+    if given.long:
+        fragments.write(given.out, "planets-trained", trained())
+        fragments.write(given.out, "planets-long", long_runs())
+        return
     if given.figure:
         figure(given.figure)
         return

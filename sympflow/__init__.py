@@ -38,6 +38,7 @@ _HOME = {
     "NetworkFit": "training.fits",
     "LossFit": "training.fits",
     "ClockedFit": "training.fits",
+    "KeplerFit": "training.fits",
     "GaussNewton": "training.fits",
     "Adam": "training.fits",
     "BFGS": "training.fits",
@@ -150,6 +151,7 @@ if TYPE_CHECKING:
     from sympflow.training.fits import Adam as Adam
     from sympflow.training.fits import ClockedFit as ClockedFit
     from sympflow.training.fits import GaussNewton as GaussNewton
+    from sympflow.training.fits import KeplerFit as KeplerFit
     from sympflow.training.fits import LossFit as LossFit
     from sympflow.training.fits import NetworkFit as NetworkFit
     from sympflow.training.fits import PrimedFit as PrimedFit

@@ -22,7 +22,7 @@ In place of these two a kick may carry a polynomial in q, which no order conditi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache, cached_property, lru_cache
@@ -704,6 +704,31 @@ def _costs(scheme: Scheme) -> tuple[tuple[str, int, int, int], ...]:
         (name, of_a_step, sum(kick[i] for kick in kicks), int(shared and kicks[-1][i]))
         for i, (name, of_a_step) in enumerate(counts)
     )
+
+
+# pairs of a kick and a drift -----------------------------------------------------------------------------------------
+
+Substeps = Sequence[tuple[float, float, float]]
+"""Kicks, the drifts after them, and the force gradients of the kicks, one after the other, of a step of length 1."""
+
+
+def paired(maps: Sequence[tuple[str, float, float]]) -> Substeps:
+    """Kicks, each with the drift after it, and its force gradient, of maps of these kinds."""
+    pairs: list[tuple[float, float, float]] = []
+    for kind, c, third in maps:
+        if kind == "kick":
+            pairs.append((c, 0.0, third))
+        elif pairs and not pairs[-1][1]:
+            pairs[-1] = pairs[-1][0], c, pairs[-1][2]
+        else:
+            pairs.append((0.0, c, 0.0))
+    return pairs
+
+
+def reversed_substeps(substeps: Substeps) -> Substeps:
+    """The inverse of substeps, for steps of the same length."""
+    kicks, drifts = [(-b, -c) for b, _, c in substeps[::-1]], [-a for _, a, _ in substeps[::-1]]
+    return [(b, a, c) for (b, c), a in zip([(0.0, 0.0), *kicks], [*drifts, 0.0], strict=True)]
 
 
 # symplectic correctors ---------------------------------------------------------------------------------------------

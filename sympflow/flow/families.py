@@ -16,6 +16,7 @@ FAMILIES = {
     "primed": "sympflow.flow.primed:PrimedFlow",
     "split": "sympflow.flow.split:SplitFlow",
     "clocked": "sympflow.flow.clocked:ClockedFlow",
+    "kepler": "sympflow.flow.planetary:KeplerFlow",
     "collocated": "sympflow.flow.collocated:CollocatedFlow",
     "mlp": "sympflow.flow.mlp:MLPFlow",
 }
@@ -24,7 +25,7 @@ FAMILIES = {
 KINDS = ("sympflow", "mlp")
 """The kinds that files name, which are the methods that run the flows: SympFlows, and their baseline."""
 
-_OF_SYMPFLOW = ("split", "clocked", "collocated", "primed")
+_OF_SYMPFLOW = ("split", "clocked", "kepler", "collocated", "primed")
 
 
 def family(name: str) -> Any:

@@ -189,7 +189,7 @@ class PairsHamiltonian(LocalHamiltonian):
         q, p = (sp.symbols(f"{name}1:{self.ndof + 1}", real=True) for name in "qp")
         masses = np.repeat(self.masses, self.dim).tolist()
         T = sp.Add(*(x**2 / sp.Float(2 * m) for x, m in zip(p, masses, strict=True)))
-        named = {c: sp.Symbol(f"{name}_", real=True) for c, name in zip(self.c, self.params, strict=True)}
+        named = {c: sp.Symbol(f"{name}_", real=True) for c, name in zip(self.c, self.params, strict=False)}
         columns = [[sp.Float(x) for x in column] for column in self.columns.tolist()]
         V = self.written_potential(q, sp.Float(self.softening**2), columns, named)
         return SymbolicHamiltonian(T + V, {f"{name}_": value for name, value in self.params.items()})

@@ -7,7 +7,7 @@ which its motion is Kepler's with μ, and the rest of H, the interaction: a pote
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Self
 
@@ -18,12 +18,13 @@ from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, concatenate, like, masked, stack, to_numpy
 from sympflow.compiler.functions import apply
 from sympflow.compiler.program import Program, gradient, tangent, traced
-from sympflow.hamiltonian.bodies import Pairs, PairsHamiltonian, checked_column
+from sympflow.hamiltonian.bodies import MOST_SPELLED_PAIRS, Pairs, PairsHamiltonian, checked_column
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
-from sympflow.hamiltonian.local import checked_params, numbered, parsed
+from sympflow.hamiltonian.local import MOST_SPELLED, checked_params, numbered, parsed
 from sympflow.hamiltonian.recorded import NotRecorded
+from sympflow.schemes import Substeps
 
 COORDINATES = ("jacobi", "democratic")
 ELEMENTS = ("a", "e", "inc", "node", "peri", "M")
@@ -203,6 +204,29 @@ class Frame:
             x = masked(x, near.any(-1)[..., None, None], math.nan)
         return x, v
 
+    def moved(self, y: Array, passed: Any, *pieces: tuple[Substeps, Any]) -> Array:
+        """States after substeps of so long a step (...) each; the centre moves for the time that has `passed`."""
+        x, v, Q, U = self.into(y)
+        for substeps, h in pieces:
+            for kick, drift, third in substeps:
+                if kick or third:
+                    x, v = self.kick(x, v, kick * h, third * h**3 if third else None)
+                if drift:
+                    x, v = self.drift(x, v, drift * h)
+        return self.out(x, v, Q + passed[..., None] * U, U)
+
+    def kepler_energy(self, y: Array) -> Array:
+        """The part (...) of H that drifts conserve, in Jacobi's coordinates."""
+        x, v, _, U = self.into(y)
+        n, sums = len(self.order), self.sums
+        x, v, mu = x[..., :n, :], v[..., :n, :], like(self.mu[:n], y)
+        each = (v * v).sum(-1) / 2 - mu / (x * x).sum(-1) ** 0.5
+        return (like(self.masses[self.order] * sums[:-1] / sums[1:], y) * each).sum(-1) + sums[-1] * (U * U).sum(-1) / 2
+
+    def interaction(self, x: Array, along: Array | None = None) -> Array:
+        """Accelerations of planets at x by the interaction; along vectors of theirs, the derivative."""
+        return self._accelerations(self._placed(x), x, along)
+
     def _placed(self, x: Array) -> Array:
         """Places of the bodies, but for that of the centre, or vectors of these, of those of the planets."""
         if self.jacobi:
@@ -260,8 +284,9 @@ class Frame:
                 "take the splitting 'kinetic', such as 'srkn11b'."
             )
         one, other = self.pairs
-        x, v = states_of(self.elements, self.G * (masses[0] + masses[1:]))
-        d, u = (y[one - 1] - y[other - 1] for y in (x, v))
+        felt = states_of(self.elements[self.order - 1], self.G * (masses[0] + masses[self.order]))
+        near, far = np.triu_indices(len(self.order), 1)
+        d, u = (y[near] - y[far] for y in felt)
         r = np.linalg.norm(d, axis=-1)
         close = r < MOON * np.maximum(self.hill_radii(one, one, 0.0), self.hill_radii(other, other, 0.0))
         bound = close & ((u * u).sum(-1) / 2 < self.G * (masses[one] + masses[other]) / r)
@@ -430,11 +455,35 @@ class PlanetsHamiltonian(PairsHamiltonian):
         """The reason why methods of other splittings have no compiled kicks; "" if they have."""
         if self.felt is not None:
             return "bodies without mass"
-        return "" if self.extra is None else "an `extra` potential"
+        few = self.ndof <= MOST_SPELLED and self.n_bodies * (self.n_bodies - 1) // 2 <= MOST_SPELLED_PAIRS
+        return "" if self.extra is None or few else "an `extra` potential of many bodies"
+
+    @property
+    def in_terms(self) -> bool:  # type: ignore[override]
+        return self.extra is not None
 
     @property
     def is_few(self) -> bool:
-        return not self.arrays_only and super().is_few
+        return self.felt is None and self.extra is None and super().is_few
+
+    def written_potential(
+        self,
+        q: Sequence[sp.Expr],
+        softening: sp.Expr,
+        columns: Sequence[Sequence[sp.Expr]],
+        c: Mapping[sp.Symbol, sp.Expr],
+        box: Sequence[sp.Expr] = (),
+    ) -> sp.Expr:
+        V = super().written_potential(q, softening, columns, c, box)
+        if self.extra is None:
+            return V
+        own = {letter: sp.Symbol(f"{name}_", real=True) for name, letter in self._letters.items()}
+        own |= {self._letters["G"]: c[self.c[0]], self._letters["m"]: columns[0][0]}
+        for i in range(1, self.n_bodies):
+            x = [q[3 * i + k] - q[k] for k in range(3)]
+            put = dict(zip(self._places, (*x, sp.sqrt(sp.Add(*(y**2 for y in x)))), strict=True))
+            V += columns[0][i] * self.extra.xreplace({**own, **put})
+        return V
 
     @property
     def _all_at_once(self) -> bool:

@@ -81,12 +81,12 @@ def _candidates(
         return
     if flows and "dt" not in options and _flow_holds(system, y0, tol):
         yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
+    if system.local is not None and system.local.frame is not None and system.local.frame.crossing() is None:
+        yield "wisdom_holman", "planets move about a star"
     place, steep = _attractive_pole(system, y0) if plain and y0.dtype == np.float64 else ("", False)
     if place and (steep or tol is None):
         name = "log_kahan_li8" if steep else "dop853"
         yield name, f"V falls without bound at {place}, where its steps become shorter"
-    if system.local is not None and system.local.frame is not None and system.local.frame.crossing() is None:
-        yield "wisdom_holman", "planets move about a star"
     if system.separable and system.quadratic_kinetic:
         yield "srkn11b", "the kinetic energy is ½ pᵀM⁻¹p"
     if system.separable:

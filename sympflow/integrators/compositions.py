@@ -25,7 +25,16 @@ from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.contract import Failure
 from sympflow.integrators.steppers import ArraySteps, rollout
 from sympflow.lazy import kept
-from sympflow.schemes import FORCE_GRADIENT, Scheme, Substep, corrector_maps, scheme_evaluations
+from sympflow.schemes import (
+    FORCE_GRADIENT,
+    Scheme,
+    Substep,
+    Substeps,
+    corrector_maps,
+    paired,
+    reversed_substeps,
+    scheme_evaluations,
+)
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parts import ExactParts, SubFlow
@@ -62,13 +71,6 @@ def _frame(system: HamiltonianSystem) -> Frame | None:
     from sympflow.hamiltonian.planets import frame_of
 
     return frame_of(system.local, system.y0)
-
-
-@kept
-def _kepler_loops(frame: Frame) -> Any:
-    from sympflow.kernels.kepler import KeplerLoops
-
-    return KeplerLoops(frame)
 
 
 class Composition(ABC, ArraySteps):
@@ -615,9 +617,9 @@ class KeplerInteraction(Composition):
                 f"`method` {method!r} has force gradients, which the interaction has in Jacobi's coordinates only: "
                 "make the system with coordinates='jacobi'."
             )
-        self.substeps = _paired([(s.kind, s.one, s.three) for s in scheme.substeps])
-        self.before: list[tuple[float, float, float]] = []
-        self.after: list[tuple[float, float, float]] = []
+        self.substeps = paired([(s.kind, s.one, s.three) for s in scheme.substeps])
+        self.before: Substeps = ()
+        self.after: Substeps = ()
         if corrector is not None:
             if [s[:2] for s in scheme.substeps] != [("drift", 0.5), ("kick", 1.0), ("drift", 0.5)]:
                 raise ValueError(
@@ -625,30 +627,22 @@ class KeplerInteraction(Composition):
                     f"{method!r} makes other ones: leave it out."
                 )
             maps = (corrector_maps(corrector, sign, bool(scheme.level)) for sign in (1, -1))
-            self.before, self.after = (_paired([(*m, 0.0) for m in each]) for each in maps)
+            self.before, self.after = (paired([(*m, 0.0) for m in each]) for each in maps)
 
     def force_times(self) -> list[float]:
         return []
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        return self._moved(y, h, [*self.before, *self.substeps, *self.after])
+        return self._moved(y, h, self.substeps)
 
     def inverse(self, y: Array, h: Any, t: Any = 0.0) -> Array:
-        maps = [*self.before, *self.substeps, *self.after]
-        kicks, drifts = [(-b, -c) for b, _, c in maps[::-1]], [-a for _, a, _ in maps[::-1]]
-        back = [(b, a, c) for (b, c), a in zip([(0.0, 0.0), *kicks], [*drifts, 0.0], strict=True)]
-        return self._moved(y, h, back, -1.0)
+        return self._moved(y, h, reversed_substeps(self.substeps), -1.0)
 
-    def _moved(self, y: Array, h: Any, maps: Sequence[tuple[float, float, float]], sign: float = 1.0) -> Array:
-        frame = self.frame
+    def _moved(self, y: Array, h: Any, substeps: Substeps, sign: float = 1.0) -> Array:
+        """States after substeps in the coordinates of the processor, which are those of a step forwards."""
         h = like(np.asarray(h, dtype=float), y) if isinstance(h, int | float) else h
-        x, v, Q, U = frame.into(y)
-        for kick, drift, third in maps:
-            if kick or third:
-                x, v = frame.kick(x, v, kick * h, third * h**3 if third else None)
-            if drift:
-                x, v = frame.drift(x, v, drift * h)
-        return frame.out(x, v, Q + sign * h[..., None] * U, U)
+        pieces = (self.before, abs(h)), (substeps, h), (self.after, abs(h))
+        return self.frame.moved(y, sign * h, *pieces)
 
     def tangent(self, y: Array, h: Array, t: Any = 0.0) -> tuple[np.ndarray, np.ndarray] | None:
         n = y.shape[-1]
@@ -694,28 +688,15 @@ class KeplerInteraction(Composition):
         return ""
 
     def kernel(self, compensated: bool) -> KeplerKernel:
-        from sympflow.kernels.kepler import KeplerKernel
+        from sympflow.kernels.kepler import KeplerKernel, kepler_loops
 
-        return KeplerKernel(_kepler_loops(self.frame), self.substeps, self.before, self.after, compensated)
+        return KeplerKernel(kepler_loops(self.frame), self.substeps, self.before, self.after, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         counts = scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
         processed = (n_saved if backend == "compiled" else 2 * n_steps) + 2 * n_extra
         counts["force_evaluations"] += sum(kick != 0 for kick, *_ in self.before) * processed
         return counts
-
-
-def _paired(maps: Sequence[tuple[str, float, float]]) -> list[tuple[float, float, float]]:
-    """Kicks, each with the drift after it, and its force gradient."""
-    pairs: list[tuple[float, float, float]] = []
-    for kind, c, third in maps:
-        if kind == "kick":
-            pairs.append((c, 0.0, third))
-        elif pairs and not pairs[-1][1]:
-            pairs[-1] = pairs[-1][0], c, pairs[-1][2]
-        else:
-            pairs.append((0.0, c, 0.0))
-    return pairs
 
 
 SPLITTINGS: dict[str, type[Composition]] = {

@@ -33,8 +33,11 @@ from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_state
 from sympflow.kernels.rollouts import Columns, Rollouts, zeros
 from sympflow.kernels.runs import Numbers, Room
 from sympflow.kernels.tangents import EVERY, TangentKernel, exponent_of
+from sympflow.kernels.threads import run_in_threads, threads_for
+from sympflow.lazy import kept
+from sympflow.schemes import Substeps
 
-__all__ = ["KeplerKernel", "KeplerLoops", "KeplerTangents", "Substeps"]
+__all__ = ["KeplerFlowKernel", "KeplerKernel", "KeplerLoops", "KeplerTangents", "kepler_loops"]
 
 LANES, LANES_SHIFT = 8, 3
 AXES = 3
@@ -50,8 +53,6 @@ ROWS = ("Gm", "mu", "weight", "ratio", "over", "mass", "star", "share")
 """Constants of each planet: Gm, μ, its share in the mass up to it, that mass over the one before, 1 over that, m, the
 G m of the star, its mass as a part of the star's."""
 
-Substeps = Sequence[tuple[float, float, float]]
-"""Kicks, the drifts after them, and the force gradients of the kicks, one after the other, of a step of length 1."""
 Vectors = list[Any]
 
 
@@ -87,8 +88,8 @@ class KeplerCode(Rollouts):
 
     lanes, fewest = 1, 1
 
-    def __init__(self, frame: Frame, form: Form) -> None:
-        self.light = places_of_light(frame)
+    def __init__(self, frame: Frame, form: Form, part: slice = slice(None)) -> None:
+        self.light = places_of_light(frame)[part]
         self.groups = -(-(len(frame.order) + bool(self.light)) // LANES)  # with one lane behind all planets
         self.form, self.whole = form, NUMBERS * (self.groups + len(self.light))
         n_values = self.whole * (1 + form.vectors + form.compensated) + form.vectors * form.grows
@@ -101,7 +102,8 @@ class KeplerCode(Rollouts):
         table, limits = constants(frame, self.groups)
         self.report = zeros(AXES * (planets + LANES) + 1)
         inside = np.array([frame.inside[group[0]] for group in self.light])
-        of_light = np.stack([frame.G * frame.sums[inside], 1 / frame.sums[inside], inside]) if len(inside) else zeros(1)
+        heavy = frame.sums[inside if frame.jacobi else 0 * inside] if len(inside) else zeros(0)
+        of_light = np.stack([frame.G * heavy, 1 / heavy, inside]) if len(inside) else zeros(1)
         near = np.zeros(planets)
         near[: len(frame.order)] = ((frame.encounter or 0.0) * frame.hill_radii(frame.order, frame.order, 0.0)) ** 2
         self.extra = frame.extra
@@ -139,24 +141,28 @@ class KeplerCode(Rollouts):
         (kick, drift, *third) = lengths
         state = [self._read(room, code.at(room.state, NUMBERS * g), vector, NUMBERS * g) for g in groups]
         if not self.jacobi:
-            self._jump(state, c, 0.5 * kick)
+            self._jump(room, state, c, 0.5 * kick, 1)
         x = [values(group[:AXES]) for group in state]
         roots = [sqrt(dot(each, each)) for each in x]
         inverses = [1.0 / r for r in roots]
         watch = partial(self._watch, room, kick) if self.watches and vector is None else None
         a, kick = self._accelerations(room, x, c, inverses, kick, watch)
-        turned = None
+        changes = [kick * y for group in a for y in group]
         if third:
-            again = [[Dual(y, b) for y, b in zip(*z, strict=True)] for z in zip(x, a, strict=True)]
-            turned, _ = self._accelerations(room, again, c, [1.0 / sqrt(dot(y, y)) for y in again], kick)
-        for g in groups:
-            for i in range(AXES):
-                change = kick * a[g][i]
-                if turned is not None:
-                    change = change + third[0] * turned[g][i].rate
-                state[g][AXES + i].add(change)
+
+            def bent() -> Vectors:
+                again = [[Dual(y, b) for y, b in zip(*z, strict=True)] for z in zip(x, a, strict=True)]
+                rates, _ = self._accelerations(room, again, c, [1.0 / sqrt(dot(y, y)) for y in again], kick)
+                found = [y.rate for group in rates for y in group]
+                return [y + third[0] * z for y, z in zip(changes, found, strict=True)]
+
+            # the kicks of a processor may have force gradients where those of a step have none
+            bends = code.any(third[0] < 0.0) | code.any(third[0] > 0.0)
+            changes = code.when(bends, bent, lambda: changes) if vector is None else bent()
+        for k, change in enumerate(changes):
+            state[k // AXES][AXES + k % AXES].add(change)
         if not self.jacobi:
-            self._jump(state, c, 0.5 * kick)
+            self._jump(room, state, c, 0.5 * kick, 2)
             x = [values(group[:AXES]) for group in state]
             roots = [sqrt(dot(each, each)) for each in x]
             inverses = [1.0 / r for r in roots]
@@ -201,11 +207,19 @@ class KeplerCode(Rollouts):
             start = AXES * planets * which
             return [code.splat(code.load(room.work, j + (start + planets * i)), LANES) for i in range(AXES)]
 
-        h = [y + p for y, p in zip(x, vector(1, inside), strict=True)]
-        square, own = dot(h, h), dot(x, x)
-        pull, r = star / (square * sqrt(square)), sqrt(own)
-        inverse = 1.0 / r
-        a = [over * p - pull * y for p, y in zip(vector(2, inside), h, strict=True)]
+        def jumped(which: int) -> None:
+            for y, change in zip(state, vector(which, code.constant(0, INT)), strict=False):
+                y.add(change)
+
+        if self.jacobi:
+            h = [y + p for y, p in zip(x, vector(1, inside), strict=True)]
+            square, over_r = dot(h, h), 1.0 / sqrt(dot(x, x))
+            pull, own = star / (square * sqrt(square)), mu * over_r * over_r * over_r
+            a = [over * p - pull * y + own * z for p, y, z in zip(vector(2, inside), h, x, strict=True)]
+        else:
+            jumped(1)
+            h = values(state[:AXES])
+            a = [code.constant(0.0, REGISTER)] * AXES
         a = self._with_extra(room, a, h)
 
         def added(j: Value, total: list[Value]) -> list[Value]:
@@ -222,10 +236,13 @@ class KeplerCode(Rollouts):
         near, *a = code.loop(self.planets, [start, *a], added)
         if self.watches:
             kick = kick + self._met(room, code.any(near < 0.0), [h], kick, g)
-        own = mu * inverse * inverse * inverse
         for i in range(AXES):
-            state[AXES + i].add(kick * (a[i] + own * x[i]))
-        for y, change in zip(state, drifted(x, values(state[AXES:]), mu, drift, r, inverse), strict=True):
+            state[AXES + i].add(kick * a[i])
+        if not self.jacobi:
+            jumped(2)
+        x = values(state[:AXES])
+        r = sqrt(dot(x, x))
+        for y, change in zip(state, drifted(x, values(state[AXES:]), mu, drift, r, 1.0 / r), strict=True):
             y.add(change)
         self._write(room, place, state)
 
@@ -280,6 +297,8 @@ class KeplerCode(Rollouts):
             kick = watch(close, h)
         a = [self._with_extra(room, each, y) for each, y in zip(a, h, strict=True)]
         if not self.jacobi:
+            for g in groups if len(self.light) else ():
+                self._tell(room, h[g], 0, g)
             return a, kick
         new: list[Vectors] = []
         behind: Vectors = [zero] * AXES
@@ -299,10 +318,13 @@ class KeplerCode(Rollouts):
                 before = [y - z for y, z in zip(h[g], x[g], strict=True)]
                 all_behind = [p + q for p, q in zip(weighted, outer, strict=True)]
                 for which, vector in enumerate((h[g], before, all_behind)):
-                    for i, value in enumerate(vector):
-                        start = LANES * (self.groups * (AXES * which + i) + g)
-                        code.store(value, room.work, start)
+                    self._tell(room, vector, which, g)
         return new[::-1], kick
+
+    def _tell(self, room: Room, vector: Vectors, which: int, g: int) -> None:
+        """Write down one of three vectors of a group of planets, for the bodies without mass."""
+        for i, value in enumerate(vector):
+            room.code.store(value, room.work, LANES * (self.groups * (AXES * which + i) + g))
 
     def _heliocentric(self, x: list[Vectors], c: list[dict[str, Value]]) -> list[Vectors]:
         """Places as seen from the star, of those from the centre of all inside."""
@@ -319,13 +341,16 @@ class KeplerCode(Rollouts):
                 before = [b + t for b, t in zip(before, total, strict=True)] if g else total
         return h
 
-    def _jump(self, state: list[list[Sum]], c: list[dict[str, Value]], t: Value) -> None:
+    def _jump(self, room: Room, state: list[list[Sum]], c: list[dict[str, Value]], t: Value, which: int) -> None:
         """Move places with the star, whose momentum is that of the planets reversed."""
+        jumps = []
         for k in range(AXES):
             parts = [of_lanes(_whole, c[g]["share"] * group[AXES + k].value) for g, group in enumerate(state)]
-            jump = t * sum(parts[1:], parts[0])
+            jumps.append(t * sum(parts[1:], parts[0]))
             for group in state:
-                group[k].add(jump)
+                group[k].add(jumps[k])
+        if len(self.light):
+            self._tell(room, jumps, which, 0)
 
     def look(self, room: Room) -> None:
         """Divide vectors by the power of two next to their lengths, whose exponents are added up."""
@@ -494,12 +519,13 @@ class KeplerLoops:
 
     def __init__(self, frame: Frame) -> None:
         n, light = len(frame.order), places_of_light(frame)
-        if not n or n > MOST_GROUPS * LANES - 1 or (light and not frame.jacobi):
+        if not n or n > MOST_GROUPS * LANES - 1:
             raise NotCompiled(
-                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}, with "
-                "bodies without mass in Jacobi's coordinates only: use backend='array'."
+                f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}: use "
+                "backend='array'."
             )
-        self.frame, self._light, self._codes = frame, bool(light), dict[Form, KeplerCode]()
+        self.frame, self._groups, self._light = frame, light, bool(light)
+        self._codes: dict[tuple[Form, int, int], KeplerCode] = {}
         groups = self.code(Form()).groups
         spare = LANES * groups - n
         self._spare = np.zeros((spare, 2 * AXES))
@@ -529,9 +555,28 @@ class KeplerLoops:
                 "`system` has bodies without mass, and compiled deviation vectors and force gradients are for bodies "
                 "with mass: use backend='array'."
             )
-        if form not in self._codes:
-            self._codes[form] = KeplerCode(self.frame, form)
-        return self._codes[form]
+        return self._made(form, 0, 1)
+
+    def parts(self, form: Form, threads: int) -> list[tuple[KeplerCode, np.ndarray]]:
+        """Codes of parts of the bodies without mass, all with the planets, and the places of their running states."""
+        found, start = [], NUMBERS * self.code(form).groups
+        for k in range(threads):
+            code = self._made(form, k, threads)
+            places = np.concatenate(
+                [np.arange(start), start + NUMBERS * self._ends(k, threads)[0] + np.arange(code.whole - start)]
+            )
+            whole = self.code(form).whole
+            found.append((code, np.concatenate([places, whole + places]) if form.compensated else places))
+        return found
+
+    def _ends(self, k: int, threads: int) -> tuple[int, int]:
+        n = len(self._groups)
+        return n * k // threads, n * (k + 1) // threads
+
+    def _made(self, form: Form, k: int, threads: int) -> KeplerCode:
+        if (form, k, threads) not in self._codes:
+            self._codes[form, k, threads] = KeplerCode(self.frame, form, slice(*self._ends(k, threads)))
+        return self._codes[form, k, threads]
 
     def rows(self, y: np.ndarray, spare: float = 1.0) -> np.ndarray:
         """The running states (..., n_values) of states (..., 2d); of deviation vectors with a `spare` of 0."""
@@ -559,6 +604,12 @@ class KeplerLoops:
         return self.frame.out(planets[..., :AXES], planets[..., AXES:], centre, size * U + 0 * centre)
 
 
+@kept
+def kepler_loops(frame: Frame) -> KeplerLoops:
+    """Return the loops of a frame, made once."""
+    return KeplerLoops(frame)
+
+
 class KeplerKernel(Kernel):
     """The compiled loops of a scheme of kicks by the interaction and Kepler's drifts, with or without a processor.
 
@@ -579,8 +630,9 @@ class KeplerKernel(Kernel):
         after: Substeps = (),
         compensated: bool = False,
     ) -> None:
-        self.loops, self.before, self.after, self.step_itself = loops, before, after, [*before, *substeps, *after]
-        self.form = Form(gradients=any(third for *_, third in self.step_itself), compensated=compensated)
+        self.loops, self.before, self.substeps, self.after = loops, before, substeps, after
+        thirds = [third for *_, third in (*before, *substeps, *after)]
+        self.form = Form(gradients=any(thirds), compensated=compensated)
         self.code = loops.code(self.form)
         *rest, last = np.array(substeps)
         first = rest[0] if rest else last
@@ -588,28 +640,68 @@ class KeplerKernel(Kernel):
         inner, end = (rest[1:], last) if ends else ([*rest[1:], last], 0 * last)
         self.columns = np.array([first, *inner, end + first, end])
 
-    def _table(self, h: Any, columns: Any) -> Columns:
-        entries = np.asarray(h, dtype=float)[..., None, None] ** POWERS * np.asarray(columns)
-        return np.ascontiguousarray(entries[..., : self.code.size]), np.zeros(len(columns), dtype=np.int64)
+    def _table(self, h: Any, *pieces: Any) -> Columns:
+        """The columns of pieces in turn, those of the processor, every other, for a step forwards."""
+        h = np.asarray(h, dtype=float)[..., None, None]
+        made = [
+            (abs(h) if k % 2 else h) ** POWERS * np.reshape(piece, (-1, len(POWERS))) for k, piece in enumerate(pieces)
+        ]
+        entries = np.concatenate(made, axis=-2)
+        return np.ascontiguousarray(entries[..., : self.code.size]), np.zeros(entries.shape[-2], dtype=np.int64)
 
     def rollout(self, code: KeplerCode, h: float) -> Callable[[Batch], None]:
         """The runs of batches, with steps of a length."""
         columns = self._table(h, self.columns)
         if not self.before:
             return partial(code.run, columns)
-        after = self._table(h, [self.columns[-1], *self.after])
-        return partial(code.run_processed, self._table(h, self.before), columns, after)
+        after = self._table(h, self.columns[-1:], self.after)
+        return partial(code.run_processed, self._table(h, (), self.before), columns, after)
 
     def runs(self, task: Task) -> Run:
-        loops, start = self.loops, self.loops.rows(task.y0)
-        run, work = self.rollout(self.code, task.h), WORK * len(self.columns)
-        rows, n_finite, _ = run_states(run, task._replace(y0=start), self.code.n_values, work)
-        self.remark = self._pair() if len(start) == 1 and n_finite[0] < task.n_steps else ""
+        loops, code, start = self.loops, self.code, self.loops.rows(task.y0)
+        light = len(code.light)
+        work = WORK * len(self.columns) * (code.groups + light)
+        threads = threads_for(light, (task.n_steps - (task.carry.steps if task.carry else 0)) * work, task.threads)
+        given = task._replace(y0=start)
+        if len(start) == 1 < threads:
+            rows, n_finite, code = self._in_parts(given, threads)
+        else:
+            rows, n_finite, _ = run_states(self.rollout(code, task.h), given, code.n_values, work)
+        self.remark = self._pair(code) if len(start) == 1 and n_finite[0] < task.n_steps else ""
         return Run(loops.states(rows, task.y0, task.save * task.h), n_finite)
 
-    def _pair(self) -> str:
+    def _in_parts(self, task: Task, threads: int) -> tuple[np.ndarray, np.ndarray, KeplerCode]:
+        """A run of one state by threads that share the bodies without mass, with the code that ended first."""
+        carry, whole = task.carry, self.code.whole
+        save = np.ascontiguousarray(task.save, dtype=np.int64)
+        parts = self.loops.parts(self.form, threads)
+        running = np.zeros((1, self.code.n_values)) if carry is None or carry.running is None else carry.running
+        running = running.reshape(1, -1)
+        batches = []
+        for code, places in parts:
+            own = Batch.whole(task.y0[:, places[: code.whole]], task.n_steps, save, code.n_out)
+            if carry is not None:
+                own = own._replace(first=carry.steps, running=running[:, places])
+            batches.append(own)
+
+        def run(code: KeplerCode, own: Batch, stop: np.ndarray) -> None:
+            self.rollout(code, task.h)(own._replace(stop=stop))
+
+        run_in_threads([partial(run, code, own) for (code, _), own in zip(parts, batches, strict=True)])
+        rows, new = np.empty((1, len(save), whole)), np.empty_like(running)
+        for (code, places), own in zip(parts, batches, strict=True):
+            rows[..., places[: code.whole]] = own.out
+            if carry is not None:
+                new[:, places] = own.running
+        ended = [int(own.n_finite[0]) for own in batches]
+        rows[:, save > min(ended)] = np.nan
+        if carry is not None:
+            carry.advance(task.n_steps, new)
+        return rows, np.array([min(ended)]), parts[int(np.argmin(ended))][0]
+
+    def _pair(self, code: KeplerCode) -> str:
         """A sentence on the bodies that met."""
-        frame, code = self.loops.frame, self.code
+        frame = self.loops.frame
         if frame.encounter is None or not code.report.any():
             return ""
         *places, group = code.report
@@ -640,14 +732,44 @@ class KeplerKernel(Kernel):
         N, k, _ = vectors.shape
         code = self.loops.code(self.form._replace(vectors=k, compensated=False))
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), (N,))
-        nothing = (0.0, 0.0, 0.0)
+        nothing = np.zeros((2, len(POWERS)))
         rows = np.concatenate([self.loops.rows(y), self.loops.rows(vectors, 0.0).reshape(N, k * code.whole)], axis=1)
         start = np.concatenate([rows, np.arange(N, dtype=float)[:, None]], axis=1)
         batch = Batch.whole(start, 1, ONE, code.n_out)
-        code.run(self._table(lengths, [*self.step_itself, nothing, nothing]), batch, False)
+        columns = self._table(lengths, (), self.before, self.substeps, self.after, nothing)
+        code.run(columns, batch, False)
         rows = batch.out[:, 0].reshape(N, 1 + k, code.whole)
         moved = self.loops.moved(rows[:, 1:], vectors, lengths[:, None])
         return self.loops.moved(rows[:, 0], y, lengths), moved.swapaxes(-1, -2)
+
+
+class KeplerFlowKernel(Kernel):
+    """The compiled loops of a flow that is trained at Δt, where `at_dt` of a step is True, and a scheme before it."""
+
+    def __init__(self, at_dt: Callable[[Any], Any], trained: KeplerKernel, between: KeplerKernel) -> None:
+        self.at_dt, self.trained, self.between = at_dt, trained, between
+
+    def runs(self, task: Task) -> Run:
+        kernel = self.trained if self.at_dt(task.h) else self.between
+        found = kernel.runs(task)
+        self.remark = kernel.remark
+        return found
+
+    def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
+        return Steps(self._moved(h, y, False)[0])
+
+    def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._moved(h, y, True)
+
+    def _moved(self, h: ArrayLike, y: np.ndarray, tangents: bool) -> tuple[np.ndarray, np.ndarray]:
+        lengths, n = np.broadcast_to(np.asarray(h, dtype=float), (len(y),)), y.shape[-1]
+        whole = self.at_dt(lengths)
+        ends, jacobians = np.empty_like(y), np.empty((*y.shape, n if tangents else 0))
+        for kernel, rows in ((self.trained, whole), (self.between, ~whole)):
+            if rows.any():
+                given = lengths[rows], y[rows]
+                ends[rows], jacobians[rows] = kernel.tangents(*given) if tangents else kernel.jvp(*given)
+        return ends, jacobians
 
 
 class KeplerTangents(TangentKernel):

@@ -69,7 +69,7 @@ class LayeredCode(SplittingRollouts):
     def stage(self, values: list[Value], numbers: Numbers, kind: Value, step: Value) -> list[Value]:
         d, potential = self._potential.ndof, self._potential
         q, p, a, b = values[:d], values[d:], numbers(0), numbers(1)
-        slope = _Layers(potential, values[0], kind).gradient(q)
+        slope = _Layers(potential, values[0], kind).slopes(q)
         p = [fma(-b, x, y) for x, y in zip(slope, p, strict=True)]
         return [*self._drifted(q, p, a), *p]
 
@@ -84,7 +84,7 @@ class LayeredCode(SplittingRollouts):
         of_q, a, b = cotangents[:d], numbers(0), numbers(1)
         of_p = self._drifted(cotangents[d:], of_q, a)  # M⁻¹ is symmetric
         v = [-(b * x) for x in of_p]
-        bend = _Layers(self._potential, values[0], kind, slopes).bend(values[:d], v)
+        bend = _Layers(self._potential, values[0], kind, slopes).slopes(values[:d], v)
         return [*(x + y for x, y in zip(of_q, bend, strict=True)), *of_p], []
 
     def made(self, name: str, width: int) -> Callable[..., None]:
@@ -120,9 +120,12 @@ class _Layers:
     def _room(self, n: int) -> Value:
         return self.code.memory(n, self.type)
 
-    def _put(self, values: Sequence[Any], place: Value) -> None:
+    def _filled(self, values: Sequence[Any]) -> Value:
+        """Room for values, which it has."""
+        place = self._room(len(values))
         for i, x in enumerate(values):
             self.code.store(self.code.operand(x, self.type), place, i * self.width)
+        return place
 
     def _get(self, place: Value, i: Any) -> Value:
         return self.code.load(place, i * self.width, self.type)
@@ -163,87 +166,52 @@ class _Layers:
     def _run(self, program: Program, *values: Value) -> list[Value]:
         return [self.code.operand(x, self.type) for x in program(*values)]
 
-    def gradient(self, q: Sequence[Value]) -> list[Value]:
-        """∇V(q)."""
-        potential, last = self.potential, len(self.sizes) - 1
-        x = self._room(self.sizes[0][0])
-        self._put(potential.first(*q), x)
-        slopes = []
-        for k, (_, go) in enumerate(self.sizes):
-            places = self._room(go), self._room(go)
-            slopes.append(places[1])
-
-            def activated(i: Any, totals: list[Value], k: int = k, places: Sequence[Value] = places) -> None:
-                found = totals if k == last else self._run(potential.activations[k], *totals)
-                for place, y in zip(places, found, strict=False):
-                    self.code.store(y, place, i * self.width)
-
-            self._products(k, [x], activated)
-            x = places[0]
-        ends = [self._get(x, i) for i in range(self.sizes[-1][1])]
-        found = self._run(potential.slopes, *q, *ends)
-        r = self._room(len(ends))
-        self._put(found[len(q) :], r)
-        for k in range(last, -1, -1):
-            below = self._room(self.sizes[k][0])
-
-            def pulled(i: Any, totals: list[Value], k: int = k, below: Value = below) -> None:
-                factor = self._get(slopes[k - 1], i) if k else 1.0
-                self.code.store(totals[0] * factor, below, i * self.width)
-
-            self._products(k, [r], pulled, back=True)
-            r = below
-        of_x = [self._get(r, i) for i in range(self.sizes[0][0])]
-        more = self._run(potential.first_reversed, *q, *of_x)
-        return [x + y for x, y in zip(found, more, strict=False)]
-
-    def bend(self, q: Sequence[Value], v: Sequence[Value]) -> list[Value]:
-        """∇²V(q)·v; and the derivatives of v·∇V by the weights are added to their sums."""
-        potential, last, d = self.potential, len(self.sizes) - 1, len(q)
-        n = self.sizes[0][0]
-        x, moved = self._room(n), self._room(n)
-        both = self._run(potential.first_moved, *q, *v)
-        self._put(both[:n], x)
-        self._put(both[n:], moved)
+    def slopes(self, q: Sequence[Value], v: Sequence[Value] = ()) -> list[Value]:
+        """∇V(q); along a vector ∇²V(q)·v, and derivatives of v·∇V by the weights are added to their sums."""
+        potential, last, d, n, m = self.potential, len(self.sizes) - 1, len(q), self.sizes[0][0], self.sizes[-1][1]
+        first, at_ends, reverse = potential.first, potential.slopes, potential.first_reversed
+        if v:
+            first, at_ends, reverse = potential.first_moved, potential.slopes_moved, potential.first_moved_reversed
+        start = self._run(first, *q, *v)
+        columns = [self._filled(start[i : i + n]) for i in range(0, len(start), n)]  # x, and its derivative along v
         taken, slopes = [], []
         for k, (_, go) in enumerate(self.sizes):
-            places = [self._room(go) for _ in range(4)]
-            taken.append((x, moved))
-            slopes.append(places[2:])
+            places = [self._room(go) for _ in range(2 * len(columns))]
+            taken.append(columns)
+            slopes.append(places[len(columns) :])
 
             def activated(i: Any, totals: list[Value], k: int = k, places: Sequence[Value] = places) -> None:
                 found = totals
                 if k < last:
-                    y, slope, bent = self._run(potential.activations[k], totals[0])
-                    found = [y, slope * totals[1], slope, bent * totals[1]]
+                    found = self._run(potential.activations[k], totals[0])
+                    if v:
+                        y, slope, bent = found
+                        found = [y, slope * totals[1], slope, bent * totals[1]]
                 for place, z in zip(places, found, strict=False):
                     self.code.store(z, place, i * self.width)
 
-            self._products(k, [x, moved], activated)
-            x, moved = places[:2]
-        m = self.sizes[-1][1]
-        ends = [self._get(place, i) for place in (x, moved) for i in range(m)]
-        found = self._run(potential.slopes_moved, *q, *ends[:m], *v, *ends[m:])
-        r, s = self._room(m), self._room(m)
-        self._put(found[d : d + m], s)
-        self._put(found[2 * d + m :], r)
+            self._products(k, columns, activated)
+            columns = places[: len(columns)]
+        ends = [self._get(place, i) for place in columns for i in range(m)]
+        found = self._run(at_ends, *q, *ends[:m], *v, *ends[m:])
+        columns = [self._filled(found[-m:]), *([self._filled(found[d : d + m])] if v else [])]  # r and s
         for k in range(last, -1, -1):
-            if self._sums:
-                self._add(k, r, s, *taken[k])
-            below = [self._room(self.sizes[k][0]) for _ in range(2)]
+            if v and self._sums:
+                self._add(k, *columns, *taken[k])
+            below = [self._room(self.sizes[k][0]) for _ in columns]
 
             def pulled(i: Any, totals: list[Value], k: int = k, below: Sequence[Value] = below) -> None:
-                R, S = totals
                 if k:
-                    slope, bent = (self._get(place, i) for place in slopes[k - 1])
-                    R, S = slope * R, fma(slope, S, bent * R)
-                for place, y in zip(below, (R, S), strict=True):
+                    slope, *bent = (self._get(place, i) for place in slopes[k - 1])
+                    R, *S = totals
+                    totals = [slope * R, *(fma(slope, x, b * R) for x, b in zip(S, bent, strict=True))]
+                for place, y in zip(below, totals, strict=True):
                     self.code.store(y, place, i * self.width)
 
-            self._products(k, [r, s], pulled, back=True)
-            r, s = below
-        of_x = [self._get(place, i) for place in (s, r) for i in range(n)]
-        more = self._run(potential.first_moved_reversed, *q, *v, *of_x)
+            self._products(k, columns, pulled, back=True)
+            columns = below
+        of_x = [self._get(place, i) for place in columns[::-1] for i in range(n)]
+        more = self._run(reverse, *q, *v, *of_x)
         return [x + y for x, y in zip(found[:d], more, strict=False)]
 
     def _add(self, k: int, r: Value, s: Value, x: Value, moved: Value) -> None:

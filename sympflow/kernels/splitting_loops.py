@@ -57,6 +57,8 @@ class SplittingLoops:
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
         symbols = system.symbols.named(names) if names and system.symbols is not None else system.symbols
+        if system.local is not None and system.local.in_terms and not system.local.arrays_only:
+            symbols = system.local.spelled
         self.ndof, self.friction = system.ndof, system.friction
         self.values: tuple[float, ...] = ()
         self.work = system.ndof if system.local is None else system.local.work

@@ -52,7 +52,7 @@ def run_one(call: Callable[[np.ndarray], T], work: float) -> T:
     """
     if work < LONG:
         return call(NEVER)
-    return _run_in_threads([call])[0]
+    return run_in_threads([call])[0]
 
 
 def threads_for(n_pieces: int, work: float, threads: int | None) -> int:
@@ -75,10 +75,11 @@ def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_ro
         run_one(partial(rows, slice(0, n_rows)), n_rows * work_per_row)
         return
     bounds = [BLOCK * (n_blocks * k // threads) for k in range(threads)] + [n_rows]
-    _run_in_threads([partial(rows, slice(*ends)) for ends in pairwise(bounds)])
+    run_in_threads([partial(rows, slice(*ends)) for ends in pairwise(bounds)])
 
 
-def _run_in_threads(calls: Sequence[Callable[[np.ndarray], T]]) -> list[T]:
+def run_in_threads(calls: Sequence[Callable[[np.ndarray], T]]) -> list[T]:
+    """``call(stop)`` of each, at the same time; for `stop` see `run_one`."""
     stop = np.zeros(1, dtype=np.int64)
     with ThreadPoolExecutor(len(calls)) as pool:
         futures = [pool.submit(copy_context().run, call, stop) for call in calls]  # with the limit of `at_most`

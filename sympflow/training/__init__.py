@@ -6,7 +6,7 @@ from sympflow.lazy import whole_import
 
 _HOME = {
     "train": "trainer",
-    **dict.fromkeys(("PrimedFit", "SplitFit", "NetworkFit", "LossFit", "ClockedFit"), "fits"),
+    **dict.fromkeys(("PrimedFit", "SplitFit", "NetworkFit", "LossFit", "ClockedFit", "KeplerFit"), "fits"),
     **dict.fromkeys(("GaussNewton", "Adam", "BFGS", "LBFGS"), "fits"),
 }
 __all__ = [*_HOME]  # noqa: PLE0604
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from sympflow.training.fits import Adam as Adam
     from sympflow.training.fits import ClockedFit as ClockedFit
     from sympflow.training.fits import GaussNewton as GaussNewton
+    from sympflow.training.fits import KeplerFit as KeplerFit
     from sympflow.training.fits import LossFit as LossFit
     from sympflow.training.fits import NetworkFit as NetworkFit
     from sympflow.training.fits import PrimedFit as PrimedFit

@@ -572,6 +572,49 @@ class ClockedFit(Fit):
     kind: ClassVar[str] = "clocked"
 
 
+@dataclass(frozen=True, kw_only=True)
+class KeplerFit(Fit):
+    """A flow of planets: Wisdom–Holman steps in trained coordinates, see `sympflow.flow.planetary`.
+
+    Parameters
+    ----------
+    dt : float, optional
+        Δt; by default the longest with an error of at most `tol`, of those from a ninth of the shortest period on.
+    tol : float
+        Relative energy error, where `dt` is left out.
+    reach, gradients : int
+        M, the steps to either side of a state over which the processor goes, and the number of its force gradients.
+    points : int
+        States along the orbit of `y0`, at random times.
+    orbits : float
+        The time over which these are spread, in orbits of the innermost planet.
+    seed
+        Of these times.
+    """
+
+    points: int = 1500
+    tol: float = 1e-8
+    reach: int = 64
+    gradients: int = 8
+    orbits: float = 30_000.0
+
+    kind: ClassVar[str] = "kepler"
+    COUNTS: ClassVar[tuple[str, ...]] = ("points", "reach")
+    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "reach", "gradients")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive("tol", self.tol)
+        check_positive("orbits", self.orbits)
+        if isinstance(self.gradients, bool) or self.gradients not in range(2 * self.reach + 1):
+            raise ValueError(f"`gradients` must be an integer from 0 to twice `reach`; got {self.gradients!r}: take 8.")
+        if self.points < 2 * self.reach + self.gradients:
+            raise ValueError(f"`points` {self.points!r} are fewer than the numbers to be fitted: take 1500.")
+        for name in ("label_times", "reference_states"):
+            if name in self.given():
+                raise TypeError(f"`{name}` is of labels, to which flows of planets are not fitted: leave it out.")
+
+
 # plain keywords -------------------------------------------------------------------------------------------------
 
 KINDS: dict[str, type[Fit]] = {"primed": PrimedFit, "sympflow": NetworkFit, "mlp": NetworkFit}
@@ -596,7 +639,7 @@ OF_SEARCHES = ("restarts", "frozen_weight", "energy_weight", "runs")
 
 def keywords() -> list[str]:
     """All keywords that some fit or solver takes."""
-    of_fits = [name for cls in (PrimedFit, NetworkFit) for name in cls.names() if name != "baseline"]
+    of_fits = [name for cls in (PrimedFit, NetworkFit, KeplerFit) for name in cls.names() if name != "baseline"]
     return list(dict.fromkeys(["kind", "optimizer", *of_fits, *(n for cls in SOLVERS.values() for n in cls.names())]))
 
 

@@ -37,6 +37,7 @@ from sympflow.training.fits import (
     ClockedFit,
     Fit,
     GaussNewton,
+    KeplerFit,
     LossFit,
     NetworkFit,
     PrimedFit,
@@ -48,6 +49,7 @@ from sympflow.training.fits import (
 )
 from sympflow.training.lattice_fit import LatticeSubsystem, by_subsystem, check_runs, runs_of
 from sympflow.training.network_fit import LossRun
+from sympflow.training.planet_fit import can_train, train_planets
 from sympflow.training.points import Stream, handed_in, start_times, unlabelled, warn_of_another_system
 from sympflow.training.runs import Run, Unstarted
 from sympflow.training.session import Deadline, OutOfTime, Path, Session
@@ -80,8 +82,9 @@ def train(
 ) -> Any:
     """Train a flow map of `system` on [0, Δt]: with nothing else given, the best that is known for it.
 
-    For a separable system with T = ½ pᵀM⁻¹p, however V was given, that is a primed flow (`SympFlow.primed`), whose few
-    numbers are fitted to the exact flow in seconds. In up to three degrees of freedom of a symbolic system short trials
+    For planets about a star it is a `KeplerFlow`, found in half a minute. For another separable system with
+    T = ½ pᵀM⁻¹p, however V was given, it is a primed flow (`SympFlow.primed`), whose few numbers are fitted to the
+    exact flow in seconds. In up to three degrees of freedom of a symbolic system short trials
     choose its Δt, and whether its kicks have curvature terms (`sympflow.training.trials`), unless something is said of
     the flow or its fit. For any other system it is a SympFlow with MLP potentials, symplectic for every H, trained by
     Adam on its residual and by Hamiltonian matching, without data. The choice is the same on every machine.
@@ -91,8 +94,8 @@ def train(
     system : HamiltonianSystem
         H, which a flow is fitted to, with `data` as well.
     fit : Fit, optional
-        `PrimedFit`, `SplitFit`, `NetworkFit` and `ClockedFit` of `sympflow.training` make a flow and fit it, `LossFit`
-        trains a given `flow` on losses: their fields are the options. A number is Δt.
+        `PrimedFit`, `SplitFit`, `NetworkFit`, `ClockedFit` and `KeplerFit` of `sympflow.training` make a flow and fit
+        it, `LossFit` trains a given `flow` on losses: their fields are the options. A number is Δt.
     flow : FlowMap, optional
         Train a copy of this flow further in place of a new one: one made by `SympFlow.primed` or `SympFlow.split`, say,
         or a second stage with another solver.
@@ -122,9 +125,9 @@ def train(
         processes, −1 for as many as there are cores, or an engine as for `sympflow.ensemble`. Without a budget the
         result is the same to the last bit whatever they are.
     **options
-        In place of `fit` and `solver` their fields by name, with `dt`, `kind` ("primed", "sympflow", a network, or
-        "mlp", the baseline), `optimizer` ("gauss-newton", "adam", "bfgs", "lbfgs"), and `time_budget` for `budget`:
-        ``train(system, dt=0.5, stages=3, restarts=12)``.
+        In place of `fit` and `solver` their fields by name, with `dt`, `kind` ("primed", "kepler", "sympflow", a
+        network, or "mlp", the baseline), `optimizer` ("gauss-newton", "adam", "bfgs", "lbfgs"), and `time_budget` for
+        `budget`: ``train(system, dt=0.5, stages=3, restarts=12)``.
 
     Returns
     -------
@@ -171,6 +174,8 @@ def train(
         raise ValueError(f"`budget` must be a positive number of seconds; got {budget!r}: leave it out.")
     limit = options.pop("time_budget", budget)
     session = Session(checkpoint, resume, plain(limit), progress, callback, WorkerPool(workers))
+    if _of_planets(system, fit, flow, solver, options):
+        fit, options = KeplerFit(**{name: plain(x) for name, x in options.items() if name != "kind"}), {}
     if fit is None or not isinstance(fit, Fit):
         fit, solver, start = _described(system, fit, solver, flow, said(options))
     elif options:
@@ -188,6 +193,9 @@ def fit_flow(
     start: PrimedFit | None = None,
 ) -> Any:
     """`train`, its arguments sorted: a new flow, one to `start` with or a given one, and its fit."""
+    if isinstance(fit, KeplerFit):  # along an orbit, which needs no domain
+        _checked_kind(system, flow, fit)
+        return train_planets(system, fit, domain or system.domain, session.deadline)
     domain = _domain_for(system, domain)
     solver = _solver_for(fit, solver)
     if start is not None:
@@ -362,6 +370,14 @@ def _described(
     return made, found if solver is None else solver, start
 
 
+def _of_planets(system: HamiltonianSystem, fit: Any, flow: Any, solver: Any, options: dict[str, Any]) -> bool:
+    """Return True where a new flow of planets is meant: by name, or by no option but those that it has."""
+    if fit is not None or flow is not None or solver is not None:
+        return False
+    kind = options.get("kind")
+    return kind == KeplerFit.kind or (kind is None and can_train(system) and set(options) <= set(KeplerFit.names()))
+
+
 def _kind_of(flow: FlowMap) -> str:
     """The kind of a given flow."""
     return next((fit.kind for family, fit in FITTED if isinstance(flow, family)), flow.kind)
@@ -410,7 +426,7 @@ def _checked_kind(system: HamiltonianSystem, flow: FlowMap | None, fit: Fit) -> 
             _check_primable(system, ["fit"], True)
         return fit.kind
     family = next((family for family, cls in FITTED if isinstance(fit, cls)), FlowMap)
-    if not isinstance(flow, family) or isinstance(fit, NetworkFit | ClockedFit):
+    if not isinstance(flow, family) or isinstance(fit, NetworkFit | ClockedFit | KeplerFit):
         raise TypeError(
             f"`fit` {type(fit).__name__} is not one of a given {type(flow).__name__}: pass LossFit(), or leave it out."
         )

@@ -146,18 +146,6 @@ def test_a_call_gives_the_bits_of_the_operations_in_place(name, width):
     assert same(run(often, x, width=width), once(1) + once(INLINE + 2))
 
 
-def test_sine_and_cosine_of_one_number_share_their_calculation():
-    def both(a):
-        before = len(a.code._lines)
-        s = apply("sin", a)
-        middle = len(a.code._lines)
-        c = apply("cos", a)
-        assert len(a.code._lines) == middle > before + 30
-        return s * s + c * c
-
-    np.testing.assert_allclose(run(both, ANGLES, width=8), 1.0, rtol=8 * np.finfo(float).eps)
-
-
 def test_what_was_calculated_in_a_branch_is_not_used_after_it():
     def function(a):
         (y,) = a.code.when(a > 100.0, lambda: [apply("sin", a)], lambda: [a])

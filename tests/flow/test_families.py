@@ -10,11 +10,12 @@ import pytest
 import torch
 from test_primed import FLOWS as PRIMED
 
-from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, load, solve, systems, time_transformed
+from sympflow import Box, HamiltonianSystem, MLPFlow, SympFlow, Tube, load, solve, systems, time_transformed
 from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.families import FAMILIES, family, family_of
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.layers import Drift, Kick
+from sympflow.flow.planetary import KeplerFlow
 from sympflow.flow.potentials import MLPPotential
 from sympflow.flow.scaling import Scaling
 from sympflow.kernels.protocol import Kernel
@@ -23,11 +24,25 @@ EPS = np.finfo(float).eps
 PENDULUM, KEPLER = systems.pendulum(), systems.kepler()
 TRANSFORMED, DRIVEN = time_transformed(KEPLER), systems.driven_pendulum()
 WHOLE = HamiltonianSystem.from_sympy("p**2*(1 + q**2)/2 + q**2/2", y0=[0.4, 0.3])
+PLANETS = HamiltonianSystem.planets(
+    [1.0, 0.02, 0.01], elements={"a": [1.0, 1.7], "e": [0.05, 0.03], "inc": [0.1, 0], "M": [0, 2]}, encounter=None
+)
+PLANETS.domain = Tube(solve(PLANETS, "kepler_aba864", (0, 10), dt=0.2).states, 0.01)
+
+
+def of_planets():
+    flow = KeplerFlow(PLANETS.ndof, 1, 1, 0.4, system=PLANETS)
+    for numbers in (flow.kicks, flow.gradients):
+        numbers.copy_(0.02 * torch.arange(1, 1 + len(numbers)))
+    return flow
+
+
 FLOWS = {
     "sympflow": (lambda: SympFlow(1, hidden=(4, 3)), PENDULUM),
     "primed": (lambda: SympFlow.primed(PENDULUM, 2, dt=0.3, processor=2, curvature=True), PENDULUM),
     "split": (lambda: SympFlow.split(PENDULUM, 2, dt=0.1, parts=("1 - cos(q1)", "p1**2/2")), PENDULUM),
     "clocked": (lambda: ClockedFlow(TRANSFORMED.ndof, "leapfrog", 3, 0.2, TRANSFORMED), TRANSFORMED),
+    "kepler": (of_planets, PLANETS),
     "collocated": (lambda: SympFlow.collocated(WHOLE, dt=0.2, stages=2, steps=2), WHOLE),
     "timed": (lambda: SympFlow.timed(DRIVEN, 2, hidden=(4,)), DRIVEN),
     "mlp": (lambda: MLPFlow(1, (4, 5)), PENDULUM),
@@ -85,7 +100,7 @@ def test_what_is_asked_of_a_flow_map(name):
         solve(systems.toda_lattice(), flow, (0, 1), np.zeros(6))
     assert flow.origin is None
     assert len(flow.clock_numbers()) == (3 if name == "clocked" else 0)
-    assert any(flow.evaluations(10, 1, 0, "array").values()) == (name in ("primed", "split", "clocked", "collocated"))
+    assert any(flow.evaluations(10, 1, 0, "array").values()) == (name not in ("sympflow", "timed", "mlp"))
     begun = started(flow)
     slope = flow.initial_velocity(x, **begun)
     torch.testing.assert_close(slope, flow.velocity(0.0, x, **begun), rtol=1e-12, atol=1e-13)
@@ -110,12 +125,12 @@ def test_compiled_loops_are_kept_while_no_weight_changes(name):
         assert other.kernel_for(system) is not kernel
     with pytest.raises(ValueError, match=r"^`flow` is torch.float32 on cpu: compiled flows are float64 on the CPU"):
         copy.deepcopy(flow).float().kernel_for(system)
-    for weights in list(flow.parameters())[:1]:  # a collocated flow has none
+    for weights in list(flow.parameters())[:1]:  # a collocated flow and one of planets have none
         weights.mul_(1.5).add_(0.1)
     x = torch.as_tensor(system.y0)
     after = flow.kernel_for(system).step(flow.dt, x[None].numpy()).states
     torch.testing.assert_close(torch.as_tensor(after[0]), flow.psi(flow.dt, x), rtol=1e-12, atol=1e-13)
-    if name == "primed":
+    if name in ("primed", "kepler"):
         assert flow.kernel_for(system, compensated=True) is not flow.kernel_for(system)
     else:
         with pytest.raises(ValueError, match=r"^`compensated` sums need the compiled loops of a primed flow"):
@@ -173,6 +188,7 @@ LAWFUL = {
     "midpoint rule": lambda: SympFlow.collocated(systems.double_pendulum(), dt=0.5, stages=1, steps=3),
     "Gauss": lambda: SympFlow.collocated(systems.double_pendulum(), dt=0.5, stages=3, steps=1),
     "clocked": FLOWS["clocked"][0],
+    "planets": of_planets,
     "timed": FLOWS["timed"][0],
     "driven": lambda: rough(SympFlow.primed(DRIVEN, 2, processor=2, dt=0.4), 0.05),
     "damped": lambda: rough(SympFlow.primed(systems.damped_pendulum(0.3), 2, processor=2, dt=0.4), 0.05),

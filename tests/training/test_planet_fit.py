@@ -1,0 +1,69 @@
+"""Flows of planets: one kick a step in trained coordinates."""
+
+import numpy as np
+import pytest
+
+from sympflow import HamiltonianSystem, KeplerFit, load, solve, systems, train
+
+OUTER = systems.solar_system(("Jupiter", "Saturn", "Uranus", "Neptune"))
+LIGHT = HamiltonianSystem.planets([1.0, 1e-3, 0.0], elements={"a": [1.0, 2.0]})
+SMALL = {"reach": 16, "points": 400, "orbits": 5000}
+
+
+@pytest.fixture(scope="module")
+def flow():
+    return train(OUTER, KeplerFit(222.0, **SMALL))
+
+
+@pytest.mark.filterwarnings("ignore:`dt` .* is long")
+def test_trained_coordinates_are_better_than_standard_ones(flow, tmp_path):
+    """Over ten times as long as it was trained for; a step is the same, a kick and a drift."""
+    given = {"t_span": (0, 3e7), "save_every": 100, "on_domain_exit": "ignore"}
+    runs = {}
+    for name, method in (("trained", flow), ("standard", "wisdom_holman")):
+        options = {"dt": 222.0, "corrector": 17} if name == "standard" else {}
+        runs[name] = solve(OUTER, method, **options, **given)
+    errors = {name: np.abs(sol.energy_error()).max() for name, sol in runs.items()}
+    assert errors["trained"] < 0.75 * errors["standard"]
+    assert errors["trained"] < 1.5 * flow.figures["energy_error"]
+    flow.save(tmp_path / "flow.safetensors")
+    again = load(tmp_path / "flow.safetensors", system=OUTER)
+    assert np.array_equal(solve(OUTER, again, **given).y, runs["trained"].y)
+
+
+def test_times_between_steps_are_near_the_exact_solution(flow):
+    t = np.array([0.0, 100.0, 222.0, 500.0])
+    y = solve(OUTER, flow, (0, 500.0), t_eval=t).y
+    right = solve(OUTER, "kepler_aba1064", (0, 500.0), dt=5.0, t_eval=t).y
+    assert np.abs(y - right)[:, [1]].max() < 1e-12
+    assert np.abs(y - right).max() < 1e-4  # of the trained step, whose phase is early or late
+
+
+def test_a_tolerance_chooses_the_step():
+    masses, orbits = [1.0, 1e-5, 1e-5], {"a": [1.0, 1.6], "e": [0.05, 0.02], "M": [0, 2.0]}
+    system = HamiltonianSystem.planets(masses, elements=orbits)
+    flow = train(system, tol=1e-6, reach=4, points=100, gradients=0, orbits=300.0)
+    assert flow.figures["energy_error"] <= 1e-6
+    assert 2 * np.pi / 100 < flow.dt <= 2 * np.pi / 10 * 1.001
+
+
+def test_where_it_does_not_hold(flow):
+    other = {"a": [5.2, 9.6, 19.2, 30.1], "e": 0.02, "M": [0, 1.0, 2.0, 3.0]}
+    system = HamiltonianSystem.planets(OUTER.local.masses, elements=other, units="AU, day, solar mass")
+    with pytest.raises(ValueError, match=r"^`system` .* has body 2 on another orbit, of period"):
+        solve(system, flow, (0, 1000.0))
+
+
+@pytest.mark.parametrize(
+    ("system", "options", "message"),
+    [
+        (OUTER, {"gradients": -1}, "^`gradients` must be an integer from 0"),
+        (OUTER, {"points": 20}, "^`points` 20 are fewer than the numbers"),
+        (OUTER, {"tol": 0.0}, "^`tol` must be"),
+        (systems.henon_heiles(), {}, "has no planets in Jacobi's coordinates"),
+        (LIGHT, {}, "^`system` .* has bodies without mass, .* train a flow of the planets alone"),
+    ],
+)
+def test_bad_arguments(system, options, message):
+    with pytest.raises(ValueError, match=message):
+        train(system, KeplerFit(1.0, **options))
