@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NoReturn, Unpack
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.linear_part import checked_damping, checked_inverse_mass, checked_stiffness, numeric
 from sympflow.hamiltonian.scene import UNNAMED, Scene, SceneOptions
 from sympflow.hamiltonian.times import check_period, probe_times
-from sympflow.show.cards import Card, Shown, cut, numbers
+from sympflow.show.cards import Answering, Card, cut, numbers
 
 if TYPE_CHECKING:
     import sympy
@@ -65,7 +65,7 @@ class Parameters(dict[str, Any]):
         return Parameters, (dict(self),)
 
 
-class HamiltonianSystem(Hamiltonian, Shown):
+class HamiltonianSystem(Hamiltonian, Answering):
     """A Hamiltonian system x' = J∇H(x), x = [q, p]; with `time` H(t, x); with `damping` p' = −∂H/∂q − Γp.
 
     Parameters
@@ -140,6 +140,17 @@ class HamiltonianSystem(Hamiltonian, Shown):
     >>> system.force(np.array([0.0]))
     array([-0.])
     """
+
+    _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(("solve", "integrate", "run"), "sympflow.solve(system, method, t_span, y0)"),
+        **dict.fromkeys(("H", "energy"), "`hamiltonian(y)` for its values, `expression` for the formula"),
+        **dict.fromkeys(("V", "U"), "`potential(q)`"),
+        **dict.fromkeys(("T", "K"), "`kinetic(p)`"),
+        **dict.fromkeys(("dim", "dimension", "n", "d", "dof"), "`ndof`"),
+        **dict.fromkeys(("rhs", "f", "fun"), "`vector_field(y)`"),
+        **dict.fromkeys(("grad", "jac"), "`gradient(y)`, or `hessian(y)`"),
+        "parameters": "`params`",
+    }
 
     _period: float | None = None
     _former_period: float | None = None

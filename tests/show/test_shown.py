@@ -129,3 +129,19 @@ def test_a_system_of_a_file_is_called_by_its_file(tmp_path):
     system = factory(path, "morse")()
     assert system.title == "own.py:morse, D = 1"
     assert orbits(system).plot().get_suptitle().startswith("own.py:morse")
+
+
+@pytest.mark.parametrize(("dt", "joined"), [(0.1, True), (1.0, False)])
+def test_curves_are_joined_where_they_are_known_between_points(dt, joined):
+    line = sympflow.solve("harmonic-oscillator", "kahan_li8", (0, 30), dt=dt).plot("phase")
+    assert (line.axes[0].lines[0].get_linestyle() == "-") == joined
+
+
+def test_one_output_is_a_point():
+    assert orbits(t_eval=[5.0]).plot("orbit").axes[0].lines[0].get_marker() == "."
+
+
+def test_a_doubled_system_is_drawn_in_its_physical_limit():
+    figure = sympflow.solve("decaying-orbit", t_span=(0, 5)).plot()
+    assert len(figure.axes) == 2
+    assert np.ptp(figure.axes[1].lines[0].get_ydata()) > 1
