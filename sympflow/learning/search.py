@@ -161,16 +161,14 @@ def without_growth(found: Fitted) -> Fitted:
     growing = np.arange(model.n) >= np.where(theta < 0, first, model.n)
     if not growing.any():
         return found
-    covariance = found.fit.covariance()
-    errors = np.sqrt(np.diag(covariance))
+    errors = np.sqrt(np.diag(found.fit.covariance()))
     worst = int(np.argmin(np.where(growing, theta / errors, np.inf)))
     if theta[worst] < -GROWS * errors[worst]:
         warn(
             f"`damping` is {theta[worst]:.2g} ± {errors[worst]:.1g} by the data, whose energy grows: it is taken as 0. "
             "Look at the order of the times and the sign of the momenta, or leave `damping` out."
         )
-    moved = covariance[:, growing] @ np.linalg.pinv(covariance[np.ix_(growing, growing)]) @ theta[growing]
-    return replace(found, theta=np.where(growing, 0.0, theta - moved))
+    return replace(found, theta=found.fit.without(growing, theta))
 
 
 Chosen = tuple[Candidate, Fitted, Held]
