@@ -272,7 +272,8 @@ def test_a_potential_with_kinks_stays(name):
 
 
 def test_jumps_of_lattices_pairs_and_parameters():
-    site = np.linspace(1, 2, 8)
+    site, wells = np.linspace(1, 2, 8), "Piecewise((a*rho, rho < 1), (rho, True))"
+    waves = HamiltonianSystem.schroedinger(wells, shape=8, params={"a": 1.0})
     refused = (
         ("`bond` jumps where r - 1 = 0", lambda: HamiltonianSystem.lattice(shape=8, bond="r**2/2 + Heaviside(r - 1)")),
         (
@@ -286,6 +287,7 @@ def test_jumps_of_lattices_pairs_and_parameters():
             lambda: HamiltonianSystem.pairs(NEAR_LJ, masses=np.ones(3), params={"s": 0.01}),
         ),
         ("`expression` jumps", lambda: made("p**2/2 + V*Heaviside(q)", params={"V": 0.0}).with_params(V=1.0)),
+        ("`onsite` jumps", lambda: waves.with_params(a=2.0)),
     )
     for words, make in refused:
         with pytest.raises(ValueError, match=f"^{words}"):
