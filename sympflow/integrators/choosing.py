@@ -120,7 +120,7 @@ def _attractive_pole(system: HamiltonianSystem, states: bytes) -> tuple[str, boo
 
     Such places are q = 0 and those where an expression of H vanishes that is next to them.
     """
-    if not system.definition.poles:
+    if not system.definition.poles or system.local is not None:
         return "", False
     q = np.frombuffer(states).reshape(-1, 2 * system.ndof)[:, : system.ndof]
     scales = np.array([100.0, 10.0, 1.0, *NEAR_POLE])[:, None, None]
