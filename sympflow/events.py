@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +47,8 @@ class Event:
         value = self.g(t, copied(y))  # a g that writes into its y changes no result
         try:
             number = float(to_numpy(value))
+            if isinstance(value, bool | np.bool_):
+                raise TypeError(f"it returned {value}, which does not tell where the event is")
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{self.label} must return one number for a time and a state of shape {tuple(y.shape)}; {error}. "
@@ -81,6 +85,11 @@ def parse(events: Any) -> tuple[Event, ...]:
 def _parse_one(g: Any, label: str) -> Event:
     if not callable(g):
         raise TypeError(f"{label} must be a function g(t, y); got {type(g).__name__}.")
+    with suppress(ValueError):  # of a function without a signature
+        try:
+            inspect.signature(g).bind(0.0, None)
+        except TypeError as error:
+            raise TypeError(f"{label} is called with (t, y), a time and a state: {error}. Write g(t, y).") from error
     terminal, direction = getattr(g, "terminal", None), getattr(g, "direction", 0)
     if terminal is None or terminal is False or terminal == 0:
         limit = math.inf

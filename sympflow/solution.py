@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from sympflow.arguments import check_flag, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
-from sympflow.show.cards import Card, Shown
+from sympflow.show.cards import Answering, Card
 from sympflow.show.pictures import KINDS, trajectory_figure
 from sympflow.show.style import saved
 
@@ -39,7 +39,7 @@ LOOKED_AT = 64  # outputs at which the terms of H are looked at
 
 
 @dataclass(repr=False)
-class Solution(Shown):
+class Solution(Answering):
     """The solution of an initial value problem, with SciPy's fields.
 
     Attributes
@@ -71,6 +71,18 @@ class Solution(Shown):
         The parameters of each trajectory, where `solve` was given `params`: see `params` and `by_parameters`. `system`
         is then the one that was given, unless they were given as numbers.
     """
+
+    _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(("times", "time", "ts"), "`t`, the times of outputs"),
+        **dict.fromkeys(("x", "ys", "u", "trajectory"), "`y`, of shape (..., 2d, n), or `q` and `p`"),
+        **dict.fromkeys(("positions", "momenta", "v", "velocities"), "`q` and `p`, of shape (..., d, n)"),
+        **dict.fromkeys(("q0", "p0"), "`y0`, the initial state [q, p]"),
+        **dict.fromkeys(("H", "E", "energies"), "`energy()`, along the solution"),
+        **dict.fromkeys(("error", "errors"), "`energy_error()`, or sympflow.reference_error(sol)"),
+        **dict.fromkeys(("dt", "n_steps", "wall_time"), "`stats`, a dictionary that has it"),
+        **dict.fromkeys(("method", "solver"), "`integrator`"),
+        **dict.fromkeys(("save", "to_csv"), "`to_dataframe()`, `to_xarray()` or `to_netcdf(path)`"),
+    }
 
     t: np.ndarray
     y: Array
@@ -232,7 +244,8 @@ class Solution(Shown):
             Of "orbit", q₁ against q₂ (q over t of one degree of freedom, a map of all q of many), "phase", q₁ against
             p₁, and "energy", which is left out where energy is not kept.
         """
-        y, kinds = to_numpy(self.y), (kinds,) if isinstance(kinds, str) else kinds
+        shown = self if self.system.shows_energy is self.system.keeps_energy else self.physical()
+        y, kinds = to_numpy(shown.y), (kinds,) if isinstance(kinds, str) else kinds
         error = None
         if self.system.shows_energy:
             with warnings.catch_warnings(action="ignore"):

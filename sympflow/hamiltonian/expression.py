@@ -157,8 +157,16 @@ def _remedy(text: str) -> str | None:
         return f"{found[0]} is not understood: write q**2, sqrt(q), *, /, - and pi"
     if found := re.match(r"\s*[A-Za-z]\w*\s*(\([^)]*\)\s*)?=(?!=)", text):
         return f"leave {found[0].strip()!r} out: only what stands after it is H"
-    words = [word for word in re.findall(r"[A-Za-z_]\w*", text) if keyword.iskeyword(word)]
-    return f"{words[0]} is a word of Python: choose another name, such as {words[0]}_" if words else None
+    if "|" in text:
+        return "| is not understood: write abs(q)"
+    if words := [word for word in re.findall(r"[A-Za-z_]\w*", text) if keyword.iskeyword(word)]:
+        return f"{words[0]} is a word of Python: choose another name, such as {words[0]}_"
+    if found := re.search(r"\b([A-Za-z]\w*) +([A-Za-z]\w*)", text):
+        lacks, written = "a sign", f"{found[1]}*{found[2]}"
+        if found[1] in FUNCTIONS:
+            lacks, written = "brackets", f"{found[1]}({found[2]})"
+        return f"{found[0]} lacks {lacks}: write {written}"
+    return None
 
 
 _TOKEN = re.compile(r"\s*(\.?\d[\w.]*(?:(?<=[eE])[+-]\d+)?|[^\W\d]\w*|\*\*|//|<<|>>|[<>=!]=|.)")

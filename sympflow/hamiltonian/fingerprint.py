@@ -92,7 +92,7 @@ def recognised(mine: Sequence[float], identity: Identity | None, system: Any, fr
 
 def without_friction(mine: Sequence[float], identity: Identity | None, system: Hamiltonian) -> bool:
     """Return True if a fingerprint and an identity are those of a damped system without its friction."""
-    return system.friction is not None and recognised(mine, identity, system, friction=False)
+    return bool(system.friction) and recognised(mine, identity, system, friction=False)
 
 
 Known = WeakKeyDictionary["Hamiltonian", bool]

@@ -228,7 +228,7 @@ class Hamiltonian:
         """
         raise ValueError(
             f"`y0` must have shape (..., {2 * self.ndof}) for {self.name!r}, [q, p] with {self.ndof} each; got "
-            f"{tuple(y.shape)}."
+            f"{tuple(y.shape)}. Join q and p along the last axis, np.concatenate([q, p], axis=-1)."
         )
 
     def identity_parts(self) -> Any:
@@ -368,6 +368,8 @@ class Hamiltonian:
         return self.vector_field(y, t)
 
     def _check_width(self, y: Array) -> None:
+        if isinstance(y, list | tuple | int | float):
+            raise TypeError(f"`y` must be an array or a tensor, a state [q, p]; got {y!r}: pass np.array([q, p]).")
         if y.shape[-1:] != (2 * self.ndof,):
             raise ValueError(
                 f"`y` must have shape (..., {2 * self.ndof}), [q, p] on the last axis; got {tuple(y.shape)}. In "

@@ -46,6 +46,11 @@ class SubFlow:
     filters: Any = None  # φ (..., F): the part acts at c + C φ X in place of q = c + C X
     at: float = 0.0  # share of a step after which a part that depends on t acts, at that time
 
+    @property
+    def has_gradient(self) -> bool:
+        """True if there is a force gradient."""
+        return self.gradient != 0.0 if isinstance(self.gradient, float) else bool(np.any(self.gradient))
+
     def inverse(self) -> SubFlow:
         return SubFlow(self.part, -self.length, -self.gradient, self.filters, self.at)
 
@@ -460,13 +465,9 @@ def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
 
 def map_evaluations(maps: Sequence[SubFlow], n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Evaluations of slopes and force gradients, as `FixedStep.evaluations`; linear flows cost none."""
-    counts = [sum(m.part != LINEAR for m in maps), sum(_has_gradient(m) for m in maps)]
+    counts = [sum(m.part != LINEAR for m in maps), sum(m.has_gradient for m in maps)]
     counts = [count * (n_steps + n_extra) for count in counts]
     if backend == "compiled" and len(maps) > 1 and maps[0].part == maps[-1].part:
-        last = maps[-1].part != LINEAR, _has_gradient(maps[-1])  # it is the next step's first one
+        last = maps[-1].part != LINEAR, maps[-1].has_gradient  # it is the next step's first one
         counts = [count - (n_steps - n_saved) * one for count, one in zip(counts, last, strict=True)]
     return {"force_evaluations": int(counts[0]), "hessian_evaluations": int(counts[1])}
-
-
-def _has_gradient(m: SubFlow) -> bool:
-    return m.gradient != 0.0 if isinstance(m.gradient, float) else bool(np.any(m.gradient))

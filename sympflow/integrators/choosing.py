@@ -116,7 +116,7 @@ def _attractive_pole(system: HamiltonianSystem, y0: np.ndarray) -> tuple[str, bo
 
     Such places are q = 0 and those where an expression of H vanishes that is next to them.
     """
-    if not (system.definition.poles and system.separable and system.keeps_energy):
+    if not (system.definition.poles and system.local is None and system.separable and system.keeps_energy):
         return "", False
     q = y0.reshape(-1, y0.shape[-1])[:MOST_STATES, : system.ndof]
     scales = np.array([100.0, 10.0, 1.0, *NEAR_POLE])[:, None, None]

@@ -56,6 +56,9 @@ ABSENT = {
     "yoshida": "Did you mean 'yoshida4' or 'yoshida6'? 'kahan_li8' has smaller errors.",
     "ruth3": "Did you mean 'yoshida4'? A better one of few stages is 'omelyan4'.",
     "ruth4": "Did you mean 'yoshida4'?",
+    **dict.fromkeys(("tsit5", "vern7", "vern9", "bulirsch_stoer", "gbs"), "Did you mean 'dop853', with `rtol`?"),
+    **dict.fromkeys(("symplectic", "splitting"), "Did you mean 'srkn11b', or 'kahan_li8'?"),
+    "semi_implicit_euler": "Did you mean 'verlet', of order 2 at the same cost?",
     "symplectic_euler": "Did you mean 'verlet', of order 2 at the same cost?",
     "rk8": "Did you mean 'dop853'?",
 }

@@ -30,6 +30,7 @@ class Tableau(Protocol):
     B: Any
 
 
+@kept
 def explicit_kernel(system: HamiltonianSystem, tableau: Tableau, names: tuple[str, ...] = ()) -> OneStepKernel:
     """The compiled loops of a method on a symbolic system; a ValueError says why there are none.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,15 +16,15 @@ from numpy.typing import ArrayLike
 
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.arrange import Arranged, Arrangement
-from sympflow.compiler.control import Value
+from sympflow.compiler.control import INT, POINTER, Value
 from sympflow.compiler.functions import fma, summed, times
+from sympflow.compiler.machine import address
 from sympflow.compiler.program import Program, gradient, tangent, traced
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, PartFunctions, SubFlow, shears
-from sympflow.kernels.passes import row_products
 from sympflow.kernels.protocol import Batch, Kernel, Run, Steps, Task, run_states
 from sympflow.kernels.rollouts import Columns, Rollouts
-from sympflow.kernels.runs import Numbers
+from sympflow.kernels.runs import Numbers, begun, finished
 from sympflow.kernels.stage_times import SymbolicLetters
 from sympflow.kernels.terms import MOST_IN_REGISTERS, written_out
 from sympflow.kernels.threads import given
@@ -264,7 +264,7 @@ class PartsLoops:
 
         maps = []
         for m in sequence:
-            g = valued(m.gradient, 3) if has_gradient(m) else 0.0
+            g = valued(m.gradient, 3) if m.has_gradient else 0.0
             maps.append(SubFlow(m.part, valued(m.length, 1), g, None if m.filters is None else valued(m.filters, 0)))
         return self.stepped(maps, y)
 
@@ -321,7 +321,7 @@ class PartsLoops:
 
     def _of(self, sequence: Sequence[SubFlow]) -> PartMaps:
         """The code of maps with what these have."""
-        if any(map(has_gradient, sequence)) and not self.parts.has_force_gradient:
+        if any(m.has_gradient for m in sequence) and not self.parts.has_force_gradient:
             raise NotCompiled("`scheme` has force gradients, which need H = linear part + U(q): take one without them.")
         filters = any(m.filters is not None for m in sequence)
         if filters not in self._maps:
@@ -445,12 +445,7 @@ class PartsKernel(Kernel):
 
 
 def _code_of(m: SubFlow) -> int:
-    return m.part + WITH_GRADIENT * has_gradient(m)
-
-
-def has_gradient(m: SubFlow) -> bool:
-    plain = isinstance(m.gradient, float) and m.gradient == 0.0
-    return not plain and bool(np.any(m.gradient))
+    return m.part + WITH_GRADIENT * m.has_gradient
 
 
 def merge(one: SubFlow, other: SubFlow) -> SubFlow | None:
@@ -464,3 +459,25 @@ def merge(one: SubFlow, other: SubFlow) -> SubFlow | None:
 
 def _same(a: Any, b: Any) -> bool:
     return (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))
+
+
+def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A x of all vectors x (..., n), of which none depends on how many there are, as the products of a library do."""
+    rows, matrix = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(A)
+    out = np.empty_like(rows)
+    n = rows.shape[-1]
+    _products_function()(address(matrix), n, address(rows), rows.size // n, address(out))
+    return out
+
+
+@cache
+def _products_function() -> Callable[..., None]:
+    code = begun("products", [POINTER, INT, POINTER, INT, POINTER])
+    A, n, x, n_rows, out = code.arguments
+    with code.over(n_rows) as i, code.over(n) as j:
+        row, start = code.at(A, j * n), code.at(x, i * n)
+        total = code.variable(code.constant(0.0))
+        with code.over(n) as k:
+            total.value = total.value + code.load(row, k) * code.load(start, k)
+        code.store(total.value, out, i * n + j)
+    return finished(code)

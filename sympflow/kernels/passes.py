@@ -1,4 +1,4 @@
-"""Compiled passes over rows of states: tests if many lie in a box or an energy sublevel, products with a matrix."""
+"""Compiled tests if many states lie in a box or an energy sublevel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
     from sympflow.hamiltonian.system import HamiltonianSystem
 
-__all__ = ["all_within", "row_products"]
+__all__ = ["all_within"]
 
 LANES = 16
 MOST_OPERATIONS = 2000  # of an H that is written out
@@ -87,26 +87,4 @@ def _within_function(n: int, symbols: SymbolicHamiltonian | None) -> Callable[..
             any_out = any_out | each
         inside.value = inside.value & ~code.any(any_out)
     code.store(code.convert("zext", inside.value, "i64"), result)
-    return finished(code)
-
-
-def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """A x of all vectors x (..., n), of which none depends on how many there are, as the products of a library do."""
-    rows, matrix = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(A)
-    out = np.empty_like(rows)
-    n = rows.shape[-1]
-    _products_function()(address(matrix), n, address(rows), rows.size // n, address(out))
-    return out
-
-
-@cache
-def _products_function() -> Callable[..., None]:
-    code = begun("products", [POINTER, INT, POINTER, INT, POINTER])
-    A, n, x, n_rows, out = code.arguments
-    with code.over(n_rows) as i, code.over(n) as j:
-        row, start = code.at(A, j * n), code.at(x, i * n)
-        total = code.variable(code.constant(0.0))
-        with code.over(n) as k:
-            total.value = total.value + code.load(row, k) * code.load(start, k)
-        code.store(total.value, out, i * n + j)
     return finished(code)

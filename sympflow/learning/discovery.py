@@ -22,14 +22,14 @@ from sympflow.arguments import check_positive, checked_count, checked_number, pl
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning.diagnosis import POINTS, Reading, best_by_increments, hint
+from sympflow.learning.diagnosis import Reading, best_by_increments, hint
 from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.orbits import Method
 from sympflow.learning.reading import Run
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import Smooth
-from sympflow.learning.trajectories import Trajectories, periods_of
+from sympflow.learning.trajectories import POINTS, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.show.style import new_figure
 from sympflow.training.session import Session
@@ -128,10 +128,7 @@ class Regression:
         """Terms dropped one at a time from all of them, while the criterion falls or there are more than `most`."""
         active = [*range(len(self.b))] if among is None else [*among]
         while len(active) > 1:
-            theta, _ = self._solve(active)
-            inverse = np.linalg.pinv(self.G[np.ix_(active, active)], rcond=1e-13)
-            least = int(np.argmin(theta**2 / np.maximum(np.diag(inverse), 1e-300)))
-            fewer = active[:least] + active[least + 1 :]
+            fewer = self._fewer(active)
             if len(active) <= most and self.criterion(fewer) >= self.criterion(active):
                 break
             active = fewer
@@ -139,7 +136,9 @@ class Regression:
 
     def _fewer(self, active: list[int]) -> list[int]:
         """The model without the term that is missed least."""
-        return min(([j for j in active if j != k] for k in active), key=lambda a: self._solve(a)[1])
+        inverse = np.linalg.pinv(self.G[np.ix_(active, active)], rcond=1e-13)
+        least = int(np.argmin(self._solve(active)[0] ** 2 / np.maximum(np.diag(inverse), 1e-300)))
+        return active[:least] + active[least + 1 :]
 
     def nested(self, active: list[int]) -> list[list[int]]:
         """Models of one term to all, each with one dropped from the next."""
@@ -598,10 +597,7 @@ class _Search:
     def _carried(active: Sequence[int], origin: Sequence[int], before: Fit) -> np.ndarray:
         """θ of some terms where the squares of a model with others are least, by their quadratic approximation."""
         dropped = np.array([k not in active for k in origin])
-        theta, covariance = before.theta.copy(), before.covariance()
-        if dropped.any():
-            theta -= covariance[:, dropped] @ np.linalg.pinv(covariance[np.ix_(dropped, dropped)]) @ theta[dropped]
-        kept = dict(zip(origin, theta, strict=True))
+        kept = dict(zip(origin, before.without(dropped, before.theta), strict=True))
         return np.array([kept.get(k, 0.0) for k in active])
 
     def _criterion(self, active: Sequence[int]) -> float:

@@ -32,7 +32,6 @@ from sympflow.learning.diagnosis import (
     forced,
     free_reading,
     hint,
-    sample,
 )
 from sympflow.learning.families import MOST_TERMS, Candidate, Constraints, Group, pruned, with_unit_mass
 from sympflow.learning.fitting import (
@@ -161,16 +160,14 @@ def without_growth(found: Fitted) -> Fitted:
     growing = np.arange(model.n) >= np.where(theta < 0, first, model.n)
     if not growing.any():
         return found
-    covariance = found.fit.covariance()
-    errors = np.sqrt(np.diag(covariance))
+    errors = np.sqrt(np.diag(found.fit.covariance()))
     worst = int(np.argmin(np.where(growing, theta / errors, np.inf)))
     if theta[worst] < -GROWS * errors[worst]:
         warn(
             f"`damping` is {theta[worst]:.2g} ± {errors[worst]:.1g} by the data, whose energy grows: it is taken as 0. "
             "Look at the order of the times and the sign of the momenta, or leave `damping` out."
         )
-    moved = covariance[:, growing] @ np.linalg.pinv(covariance[np.ix_(growing, growing)]) @ theta[growing]
-    return replace(found, theta=np.where(growing, 0.0, theta - moved))
+    return replace(found, theta=found.fit.without(growing, theta))
 
 
 Chosen = tuple[Candidate, Fitted, Held]
@@ -302,7 +299,7 @@ class Search:
         families are returned in the order in which they are to be tried, with True for those that are linear: those
         that leave much more of increments than the best of all are the last.
         """
-        smooth = sample(self.folds[0][0])
+        smooth = self.folds[0][0].sample
         queue = [(g.family.linear, [c for one in g.models for c in self._sparse(one, smooth)]) for g in groups]
         linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
         drives: tuple[Drive, ...] = ()

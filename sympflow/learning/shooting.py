@@ -281,6 +281,12 @@ class Fit:
         """The covariance of θ (n, n), where σ is the noise."""
         return np.linalg.pinv(self.normal.precision(), hermitian=True)
 
+    def without(self, dropped: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        """θ (n,) of the minimum where some numbers are 0, by the quadratic approximation about a minimum."""
+        S = self.covariance()
+        inner = np.linalg.pinv(S[np.ix_(dropped, dropped)])
+        return np.where(dropped, 0.0, theta - S[:, dropped] @ inner @ theta[dropped])
+
 
 def _robust_variances(r: np.ndarray, huber: float) -> np.ndarray:
     """σ² of rows (2d, n) by Huber's proposal 2: the mean of min(r², k²σ²) is that of normal residuals."""

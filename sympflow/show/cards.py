@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -79,6 +79,22 @@ class Shown(ABC):
             with suppress(Exception), np.errstate(all="ignore"):  # the table is shown without it
                 figure = self.preview()
         return self.card().html(figure)
+
+
+class Answering(Shown):
+    """An object that says where it has what users look for under other names."""
+
+    _OTHER_NAMES: ClassVar[Mapping[str, str]] = {}
+    """These names, and what to take."""
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in self._OTHER_NAMES:
+                return object.__getattribute__(self, name)  # which says what is wrong
+            raise AttributeError(
+                f"{type(self).__name__} has no attribute {name!r}: take {self._OTHER_NAMES[name]}.", name="", obj=None
+            )
 
 
 def _picture(figure: Figure | None) -> str:

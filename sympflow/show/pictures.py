@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 KINDS = ("orbit", "phase", "energy")
 MOST_LINES, MOST_POINTS = 16, 20_000
 """Trajectories of a batch that are drawn, and points of each."""
+COARSE = 0.5
+"""Radians between two points of a phase plane beyond which these are not joined."""
 MANY = 12
 """Degrees of freedom from which the orbit is a map of q over time."""
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F3C8D", "#666666")
@@ -51,11 +53,21 @@ def trajectory_figure(
     figure = new_figure(3.6 * max(1, len(panels)), 3.3)
     draw = {"orbit": _orbit, "phase": _phase, "energy": _energy}
     every = max(1, -(-t.shape[-1] // MOST_POINTS))
+    marker = marker or "." * _coarse(y[:MOST_LINES, :: y.shape[1] // 2, ::every])
     error = np.empty((0, t.shape[-1])) if energy_error is None else energy_error
     for kind, ax in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0] if panels else (), strict=True):
         draw[kind](ax, t[..., ::every], y[:MOST_LINES, :, ::every], error[:MOST_LINES, ::every], marker)
     figure.suptitle(filled(title, 3.4 * max(1, len(panels)), 10), fontsize=10, color=TEXT)
     return figure
+
+
+def _coarse(y: np.ndarray) -> bool:
+    """True for curves (N, 2, n) that turn so far between points that lines from one to the next are no picture."""
+    with np.errstate(all="ignore"):
+        steps = np.diff(y, axis=-1) / np.ptp(y, axis=-1, keepdims=True)
+        turns = np.diff(np.arctan2(steps[:, 1], steps[:, 0]), axis=-1)
+        turns = np.abs((turns + np.pi) % (2 * np.pi) - np.pi)
+    return bool(np.median(turns[np.isfinite(turns)]) > COARSE) if np.isfinite(turns).any() else y.shape[-1] == 1
 
 
 def _lines(ax: Axes, x: np.ndarray, y: np.ndarray, marker: str = "") -> None:
@@ -67,7 +79,7 @@ def _lines(ax: Axes, x: np.ndarray, y: np.ndarray, marker: str = "") -> None:
 def _orbit(ax: Axes, t: np.ndarray, y: np.ndarray, error: np.ndarray, marker: str) -> None:
     d = y.shape[1] // 2
     if d == 1:
-        _lines(ax, t, y[:, 0], marker)
+        _lines(ax, t, y[:, 0], marker and f"{marker}-")
         dress(ax, "t", "q")
     elif d < MANY:
         _lines(ax, y[:, 0], y[:, 1], marker)

@@ -60,7 +60,6 @@ MOST_OUTPUTS, TANGENT_STEPS, FEWEST_FOR_DRIFT = 20_000, 256, 40
 FEW_STARTS = 16  # up to so many, a compiled method runs one by one: the kernel for batches takes longer to compile
 ARRAYS_SLOWER = 200  # times, by which runs on arrays are shortened
 TAIL = 20  # steps before a blow-up whose growth is looked at
-StabilityRow = Row  # the name that its rows had before those of all studies were of one kind
 
 
 def stability(

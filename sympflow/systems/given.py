@@ -45,6 +45,8 @@ def given_system(system: Any, params: Mapping[str, Any] | None = None) -> Hamilt
     if sympy is not None and isinstance(system, sympy.Basic | sympy.MatrixBase):
         return HamiltonianSystem.from_sympy(system, params=_first(params))
     what, remedy = type(system).__name__, "take a scene of sympflow.systems, or H as text, 'p**2/2 + q**2/2'"
+    if isinstance(getattr(system, "system", None), HamiltonianSystem):
+        remedy = "pass its `system`, and its `y0`"
     if callable(system):
         of_scene = getattr(system, "__module__", "").startswith("sympflow.systems")
         what = f"the function {getattr(system, '__name__', what)!r}"

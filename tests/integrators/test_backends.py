@@ -66,7 +66,7 @@ def test_auto_chooses_what_applies(system, arguments, backend):
         (HH, {"backend": "compiled", "dtype": "float32"}, r"^`backend` 'compiled' does not apply. `y0` is float32"),
         (
             HH,
-            {"backend": "compiled", "y0": torch.tensor(HH.y0, requires_grad=True), "method": "gauss_legendre4"},
+            {"backend": "compiled", "y0": torch.tensor(HH.y0, requires_grad=True), "method": "tao4"},
             r"^`backend` 'compiled' .* `y0` ",
         ),
         (PLAIN, {"backend": "compiled"}, r"^`backend` 'compiled' .* functions could not be traced: numpy\.sort"),

@@ -23,6 +23,12 @@ CHOSEN = {
     "two": (lambda: text(f"{KEPLER} - 1/sqrt((q1 - 1)**2 + q2**2)"), [2, 0, 0, 0.3], {}, "log_kahan_li8"),
     "a logarithm": (lambda: text("p1**2/2 + p2**2/2 + log(q1**2 + q2**2)"), [1, 0, 0, 0.01], {}, "dop853"),
     "softened": (lambda: text("p1**2/2 + p2**2/2 + log(q1**2 + q2**2 + 1)"), [1, 0, 0, 0.01], {}, "srkn11b"),
+    "bodies that attract each other": (
+        lambda: HamiltonianSystem.pairs("-1/r", masses=[1.0, 0.5], dim=2),
+        [0, 1, 0, 0, 0.5, 0, -0.5, 0],
+        {},
+        "srkn11b",
+    ),
     "repulsion at 0": (lambda: text("p**2/2 + 1/q**2 + q**2"), [1, 0], {}, "srkn11b"),
     "events": (lambda: text(KEPLER), [1, 0, 0, 0.8], {"events": lambda t, y: y[0]}, "srkn11b"),
     "tolerances": (lambda: text("p**2/2 + q**4/4"), [1, 0], {"rtol": 1e-8}, "dop853"),

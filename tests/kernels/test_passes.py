@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sympflow import Box, HamiltonianSystem
-from sympflow.kernels.passes import all_within, row_products
+from sympflow.kernels.parts_loops import row_products
+from sympflow.kernels.passes import all_within
 
 
 @pytest.mark.parametrize("shape", [(7,), (1, 7), (64, 7), (3, 5, 7)])

@@ -124,7 +124,7 @@ def test_bad_tolerances_are_refused(tol):
 def test_a_tolerance_chooses_flow_and_step(other):
     with pytest.raises(ValueError, match=r"^`tol` chooses the flow and its Δt"):
         solve(PENDULUM, "sympflow", (0.0, 1.0), tol=1e-3, **other)
-    with pytest.raises(TypeError, match=r"^`tol` chooses the step .*'mlp' has none"):
+    with pytest.raises(TypeError, match=r"^`tol` chooses the step .*, and a flow has its own"):
         solve(PENDULUM, "mlp", (0.0, 1.0), tol=1e-3)
 
 

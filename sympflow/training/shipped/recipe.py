@@ -39,7 +39,16 @@ from sympflow.training.fits import (
     SplitFit,
 )
 from sympflow.training.session import Session
-from sympflow.training.shipped.judges import AsPublished, ByBalance, ByCertificate, ByClock, ByRuns, Judge, OfStiff
+from sympflow.training.shipped.judges import (
+    AsPublished,
+    ByBalance,
+    ByCertificate,
+    ByClock,
+    ByRuns,
+    Judge,
+    OfStiff,
+    network_cost,
+)
 from sympflow.training.trainer import fit_flow
 from sympflow.workers import WorkerPool
 
@@ -76,6 +85,10 @@ EARLIER = {
 @lru_cache(maxsize=1)
 def scene_named(scene: str) -> HamiltonianSystem:
     """The system of a scene, which its flows share."""
+    if scene not in SCENES:
+        raise ValueError(
+            f"`scene` {scene!r}, the first word of a file's name, is unknown: choose one of {', '.join(SCENES)}."
+        )
     return SCENES[scene]()
 
 
@@ -172,7 +185,7 @@ class Recipe:
         if isinstance(flow, SplitFlow):
             return OfStiff()
         if not isinstance(flow, PrimedFlow):
-            return AsPublished(*INITIAL[scene])
+            return AsPublished(*INITIAL[scene]) if scene in INITIAL else ByCertificate(cost=network_cost)
         if scene == "outer_solar_system":
             return ByRuns(along_the_orbit, 1e5 * YEAR, 100 * YEAR)
         if flow.shape.timed:
