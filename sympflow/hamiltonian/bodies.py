@@ -6,14 +6,13 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from itertools import combinations
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from sympflow.arguments import check_kept, checked_count, checked_number, plain, real_array
 from sympflow.arrays import Array, is_tensor, like, masked, to_numpy
-from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.local import LocalHamiltonian, check_memory, checked_params, named_values, numbered, parsed
 from sympflow.hamiltonian.poles import PairsPoles, Poles
@@ -160,13 +159,10 @@ class PairsHamiltonian(LocalHamiltonian):
         made_with = (self.dim, self.masses, self.box, self.cutoff, self.softening)
         return [made_with, self.V, self.columns, list(self.params.items())]
 
-    def with_params(self, values: Mapping[str, Any]) -> Self:
-        self.check_names(values)
-        other = bare_copy(self)
-        other._set_params({**self.params, **values})
-        other.constants = (*other.params.values(), *self.constants[len(self.params) :])
-        other._check_continuous()
-        return other
+    def _take(self, params: Mapping[str, Any]) -> None:
+        self._set_params(params)
+        self.constants = (*self.params.values(), *self.constants[len(params) :])
+        self._check_continuous()
 
     @property
     def work(self) -> int:

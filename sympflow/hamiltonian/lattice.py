@@ -69,13 +69,10 @@ class LatticeHamiltonian(LocalHamiltonian):
     def identity_parts(self) -> Any:
         return [self.shape, self.boundary, self.fields, self.U, self.T, self.bonds, list(self.params.items())]
 
-    def with_params(self, values: Mapping[str, Any]) -> Self:
-        self.check_names(values)
-        other = bare_copy(self)
-        other.params = checked_params({**self.params, **values}, self.shape)
-        other._check_continuous()
-        other._set_mass()
-        return other
+    def _take(self, params: Mapping[str, Any]) -> None:
+        self.params = checked_params(params, self.shape)
+        self._check_continuous()
+        self._set_mass()
 
     def subsystem(self, sites: Any = None, boundary: Any = "periodic") -> Self:
         shape = self.few() if sites is None else checked_shape(sites, "sites")

@@ -19,7 +19,7 @@ import sympy as sp
 
 from sympflow.arguments import as_float, check_kept, plain, real_array, real_number
 from sympflow.arrays import Array, is_tensor, like
-from sympflow.hamiltonian.definition import Definition
+from sympflow.hamiltonian.definition import Definition, bare_copy
 from sympflow.hamiltonian.expression import complex_part, stated
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
@@ -58,9 +58,16 @@ class LocalHamiltonian(Definition, ABC):
     quadratic_kinetic: bool
     params: Mapping[str, Any]
 
-    @abstractmethod
     def with_params(self, values: Mapping[str, Any]) -> Self:
         """Return the definition with other values of some parameters."""
+        self.check_names(values)
+        other = bare_copy(self)
+        other._take({**self.params, **values})
+        return other
+
+    @abstractmethod
+    def _take(self, params: Mapping[str, Any]) -> None:
+        """Take values of all parameters, and what follows from them."""
 
     def check_names(self, names: Iterable[str]) -> None:
         """Refuse names other than those of parameters, which the message lists."""

@@ -888,7 +888,7 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
         return function
 
     def heaviside(x: Any, value: float) -> Any:
-        return torch.heaviside(x, torch.as_tensor(value, dtype=x.dtype, device=x.device))
+        return torch.heaviside(x.detach(), torch.as_tensor(value, dtype=x.dtype, device=x.device))  # of slope 0
 
     return [
         {

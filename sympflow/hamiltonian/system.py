@@ -188,20 +188,12 @@ class HamiltonianSystem(Hamiltonian, Answering):
             raise TypeError(f"`time` must be True for functions with t first; got {time!r}: names are for from_sympy.")
         check_flag("time", time)
         definition = CallableHamiltonian(d, potential, hamiltonian, gradient, hessian_vector, check, bool(time))
-        if definition.separable:
-            super().__init__(settled.name, definition, checked_inverse_mass(mass, d), True)
-        elif mass is not None:
-            raise TypeError("`mass` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
-        else:
-            super().__init__(settled.name, definition, None, False)
-        if stiffness_matrix is not None:
-            if not definition.separable:
-                raise TypeError("`stiffness_matrix` only goes with `potential`: leave it out.")
-            self.stiffness_matrix = checked_stiffness(stiffness_matrix, definition.ndof)
-            self.stiffness_matrix.setflags(write=False)
-        self._set_friction(damping)
-        self._set_scene({}, settled)
-        self._set_period(period)
+        for argument, value in (("mass", mass), ("stiffness_matrix", stiffness_matrix)):
+            if value is not None and not definition.separable:
+                raise TypeError(f"`{argument}` only goes with `potential`: leave it out, it is part of `hamiltonian`.")
+        inverse_mass = checked_inverse_mass(mass, d) if definition.separable else None
+        K = None if stiffness_matrix is None else checked_stiffness(stiffness_matrix, d)
+        self._make(definition, inverse_mass, definition.separable, {}, settled, damping, period, K)
 
     @classmethod
     def from_sympy(
@@ -264,10 +256,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             )
         self = cls.__new__(cls)
         M = symbols.inverse_mass
-        Hamiltonian.__init__(self, settled.name, symbols, None if M is None else numeric(M), M is not None)
-        self._set_friction(damping)
-        self._set_scene(params, settled)
-        self._set_period(period)
+        self._make(symbols, None if M is None else numeric(M), M is not None, params, settled, damping, period)
         return self
 
     @classmethod
@@ -596,14 +585,28 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def _of_local(cls, local: LocalHamiltonian, damping: float | ArrayLike | None, scene: Scene) -> HamiltonianSystem:
         """A system by a definition of one piece."""
         self = cls.__new__(cls)
-        Hamiltonian.__init__(self, scene.name, local, local.inverse_mass, local.quadratic_kinetic)
-        self._set_friction(damping)
-        self._set_scene(local.params, scene)
+        self._make(local, local.inverse_mass, local.quadratic_kinetic, local.params, scene, damping)
         return self
 
-    def _set_friction(self, damping: float | ArrayLike | None) -> None:
-        G = checked_damping(damping, self.ndof)
-        self.friction = Friction(G)
+    def _make(
+        self,
+        definition: Any,
+        inverse_mass: np.ndarray | None,
+        quadratic_kinetic: bool,
+        params: Mapping[str, Any],
+        scene: Scene,
+        damping: float | ArrayLike | None = None,
+        period: float | None = None,
+        stiffness_matrix: np.ndarray | None = None,
+    ) -> None:
+        """Make the system of a definition, in a scene."""
+        Hamiltonian.__init__(self, scene.name, definition, inverse_mass, quadratic_kinetic)
+        self.stiffness_matrix = stiffness_matrix
+        if stiffness_matrix is not None:
+            stiffness_matrix.setflags(write=False)
+        self.friction = Friction(checked_damping(damping, self.ndof))
+        self._set_scene(params, scene)
+        self._set_period(period)
 
     def _set_period(self, period: float | None) -> None:
         if period is None:

@@ -14,7 +14,6 @@ from sympflow.arrays import Array, concatenate, library
 from sympflow.arrays import like as as_like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.hamiltonian import Hamiltonian
 from sympflow.hamiltonian.scene import Scene
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
 
@@ -93,8 +92,8 @@ def time_transformed(
         transformed._params = Parameters({**system.params, "shift": c})
     else:
         transformed = HamiltonianSystem.__new__(HamiltonianSystem)
-        Hamiltonian.__init__(transformed, f"log_{system.name}", _Logarithmic(system, c), None, False)
-        transformed._set_scene({**system.params, "shift": c}, Scene(dt=0.05, energy_scale=1.0))
+        scene = Scene(f"log_{system.name}", dt=0.05, energy_scale=1.0)
+        transformed._make(_Logarithmic(system, c), None, False, {**system.params, "shift": c}, scene)
     transformed.domain = domain
     if system.y0 is not None:
         transformed.y0 = Scene(y0=lifted(system, system.y0, c)).state(transformed.ndof)

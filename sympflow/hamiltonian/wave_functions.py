@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import sympy as sp
 
 from sympflow.arguments import real_number
 from sympflow.arrays import Array, concatenate, library, like
-from sympflow.hamiltonian.definition import bare_copy
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.lattice import checked_shape
 from sympflow.hamiltonian.linear_part import SpectralPart, Transform
@@ -56,9 +55,7 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
         used = self.f.free_symbols | self.w.free_symbols
         if unused := [name for name, s in values.items() if s not in used]:
             raise ValueError(f"`params` has {unused[0]!r}, which no expression uses: remove it.")
-        given = dict(zip(self.c, self.params.values(), strict=True))
-        for argument, f in (("onsite", self.f), ("dispersion", self.w)):
-            check_continuous(argument, f, [self.rho], given, dict(zip(self.c, self.params, strict=True)))
+        self._check_continuous()
         self._set_rates()
 
     def _set_rates(self) -> None:
@@ -84,12 +81,16 @@ class WaveFunctionHamiltonian(LocalHamiltonian):
     def identity_parts(self) -> Any:
         return [self.grid, self.length, self.f, self.w, list(self.params.items())]
 
-    def with_params(self, values: Mapping[str, Any]) -> Self:
-        self.check_names(values)
-        other = bare_copy(self)
-        other.params = checked_params({**self.params, **values}, self.grid)
-        other._set_rates()
-        return other
+    def _take(self, params: Mapping[str, Any]) -> None:
+        self.params = checked_params(params, self.grid)
+        self._check_continuous()
+        self._set_rates()
+
+    def _check_continuous(self) -> None:
+        """Refuse f and ω that jump."""
+        given = dict(zip(self.c, self.params.values(), strict=True))
+        for argument, f in (("onsite", self.f), ("dispersion", self.w)):
+            check_continuous(argument, f, [self.rho], given, dict(zip(self.c, self.params, strict=True)))
 
     def hamiltonian(self, y: Array) -> Array:
         return self.energy_density(y).sum(tuple(range(-len(self.grid), 0)))

@@ -35,7 +35,10 @@ class ProjectedSolution(DenseOutput):
 def extended_run(run: Callable[[Problem], Outcome], extension: Composition, problem: Problem) -> Outcome:
     """The outcome of a problem that is run on an extended phase space."""
     search = problem.events
-    lifted = None if search is None else EventSearch(_of_projections(search, extension), search.max_interval)
+    lifted, before = None, []
+    if search is not None:  # which may go on from an earlier piece of the run
+        lifted, before = EventSearch(_of_projections(search, extension), search.max_interval), search.found
+        lifted.found, lifted.values, lifted.n_dense = [[*zeros] for zeros in before], search.values, search.n_dense
     store = problem.store
     if store is not None:
         store.project = lambda x: _noted(store, extension, x)
@@ -46,7 +49,13 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Composition, prob
         outcome, stopped = stop.outcome, stop
     x = outcome.y
     if search is not None and lifted is not None:
-        search.found = [[(t, extension.project(y)) for t, y in zeros] for zeros in lifted.found]
+        search.found, search.values = (
+            [
+                old + [(t, extension.project(y)) for t, y in zeros[len(old) :]]
+                for old, zeros in zip(before, lifted.found, strict=True)
+            ],
+            lifted.values,
+        )
         search.end = None if lifted.end is None else (lifted.end[0], extension.project(lifted.end[1]))
         search.n_dense = lifted.n_dense
     outcome.y = extension.project(x)

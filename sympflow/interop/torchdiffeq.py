@@ -372,8 +372,10 @@ def _landing(
         last = first + math.copysign(max(_LATE, abs(func.t_span[1] - func.t_span[0])), last - first)
     low, high, step = min(first, last), max(first, last), func.dt / 4
     found = func.jump_times(low, high, step)
+    if name in ADAPTIVE and not endless and func.definition.may_jump and "step_t" not in known:
+        known["step_t"] = torch.as_tensor([last], dtype=torch.float64)  # a longer step may meet a jump beyond
     if not len(found):
-        return options
+        return known or options
     if name in ADAPTIVE:
         known["jump_t"] = torch.as_tensor(found, dtype=torch.float64)
         if func.shortest_piece < math.inf:

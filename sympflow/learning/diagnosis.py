@@ -39,9 +39,6 @@ orbits are to decide."""
 PLAINER = 1.5
 """Factor by which friction or another order of columns may leave more than a field without any structure, and one that
 stands before another in the list may leave more."""
-POINTS = 24  # Number of points of a piece whose increments are compared
-LONG = 10  # Such pieces in a part of a trajectory that is smoothed
-COMPARED = 2000  # Points of trajectories that are compared
 PER_NUMBER = 3.0  # Values that there are at least for a number of a model
 MOST_NUMBERS = 400
 LIKELY = 8  # Models beside which forces are tried
@@ -187,7 +184,7 @@ def best_by_increments(
     The doubt is a reading of the data that leaves much less than all models. None in place of all for too few points.
     """
     scales, d = data.scales, data.ndof
-    fitted, others = sample(data), sample(held)
+    fitted, others = data.sample, held.sample
     affordable = [k for k, model in enumerate(models) if affords(fitted, model)]
     if not affordable or not others.runs:
         return None
@@ -232,15 +229,6 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
         theta = matched(model, theta, moved, 1 / moved.scales)
     squares = increments_left(model, theta, held, 1 / scales)
     return squares if math.isfinite(squares) else math.inf
-
-
-def sample(data: Trajectories) -> Trajectories:
-    """Return pieces of smoothed trajectories, evenly chosen."""
-    pieces = data.pieces(LONG * POINTS)
-    n = max(1, min(len(pieces.runs), COMPARED * len(pieces.runs) // max(pieces.n_points, 1)))
-    some = pieces.subset(np.unique(np.linspace(0, len(pieces.runs) - 1, n).astype(int)).tolist())
-    runs = tuple(Run(run.t, y) for run, y in zip(some.runs, some.smooth.states, strict=True) if run.n_points > 1)
-    return replace(some, runs=runs).pieces(POINTS)
 
 
 # by slopes -----------------------------------------------------------------------------------------------------------

@@ -22,14 +22,14 @@ from sympflow.arguments import check_positive, checked_count, checked_number, pl
 from sympflow.flow.flow_map import FlowMap
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning.diagnosis import POINTS, Reading, best_by_increments, hint
+from sympflow.learning.diagnosis import Reading, best_by_increments, hint
 from sympflow.learning.fitting import STEP_ERROR, limit_of, noise_of
 from sympflow.learning.library import Library, library_for
 from sympflow.learning.orbits import Method
 from sympflow.learning.reading import Run
 from sympflow.learning.shooting import Fit, Problem, chosen_method, minimized
 from sympflow.learning.smoothing import Smooth
-from sympflow.learning.trajectories import Trajectories, periods_of
+from sympflow.learning.trajectories import POINTS, Trajectories, periods_of
 from sympflow.learning.unseen import remark_on, tube, unseen
 from sympflow.show.style import new_figure
 from sympflow.training.session import Session

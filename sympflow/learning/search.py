@@ -32,7 +32,6 @@ from sympflow.learning.diagnosis import (
     forced,
     free_reading,
     hint,
-    sample,
 )
 from sympflow.learning.families import MOST_TERMS, Candidate, Constraints, Group, pruned, with_unit_mass
 from sympflow.learning.fitting import (
@@ -300,7 +299,7 @@ class Search:
         families are returned in the order in which they are to be tried, with True for those that are linear: those
         that leave much more of increments than the best of all are the last.
         """
-        smooth = sample(self.folds[0][0])
+        smooth = self.folds[0][0].sample
         queue = [(g.family.linear, [c for one in g.models for c in self._sparse(one, smooth)]) for g in groups]
         linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
         drives: tuple[Drive, ...] = ()

@@ -112,9 +112,10 @@ def _windows(t: np.ndarray, y: np.ndarray, seen: np.ndarray, width: int) -> tupl
     window = first[:, None] + np.arange(width)
     half = np.abs(t[window] - t[:, None]).max(1)
     V = ((t[window] - t[:, None]) / half[:, None])[..., None] ** np.arange(DEGREE + 1)
-    has = seen[:, window]
-    G = np.einsum("nwa,inw,nwb->inab", V, has.astype(float), V) + 1e-10 * np.eye(DEGREE + 1)
-    right = np.einsum("nwa,inw->ina", V, np.where(has, y[:, window], 0.0))
+    has = (seen[:1] if (seen == seen[0]).all() else seen)[:, window]  # what is missing is mostly missing of all
+    known = np.where(seen[:, window], y[:, window], 0.0)
+    G = np.swapaxes(V * has[..., None], -1, -2) @ V + 1e-10 * np.eye(DEGREE + 1)
+    right = np.moveaxis(np.swapaxes(V, 1, 2) @ np.moveaxis(known, 0, -1), -1, 0)
     inverse = np.linalg.inv(G)
     c = (inverse @ right[..., None])[..., 0]
     share = np.minimum(inverse[:, :, 0, 0], 1 - 1e-6)

@@ -46,6 +46,9 @@ JUMP, STEP = 0.75, 0.3
 """Shares of a period: steps of an angle that was wrapped are longer than the first, or shorter than the second."""
 FAR, LARGEST = 1e3, 1e60
 """Mean of a coordinate in its spread, from which powers of it lose digits; and the largest value that has powers."""
+POINTS, LONG = 24, 10
+"""Points of a piece by which models are compared, and such pieces in a part of a trajectory that is smoothed."""
+COMPARED = 2000  # Points in all such pieces
 ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}
 """Periods of angles that are looked for."""
 
@@ -232,6 +235,15 @@ class Trajectories(Shown):
     def smooth(self) -> Smooth:
         """Smooth curves through the trajectories, with their slopes, and the noise."""
         return smoothed(self.runs, self.velocities)
+
+    @cached_property
+    def sample(self) -> Trajectories:
+        """Some short pieces of smooth curves, evenly chosen, by which models are compared."""
+        pieces = self.pieces(LONG * POINTS)
+        n = max(1, min(len(pieces.runs), COMPARED * len(pieces.runs) // max(pieces.n_points, 1)))
+        some = pieces.subset(np.unique(np.linspace(0, len(pieces.runs) - 1, n).astype(int)).tolist())
+        runs = tuple(Run(run.t, y) for run, y in zip(some.runs, some.smooth.states, strict=True) if run.n_points > 1)
+        return replace(some, runs=runs).pieces(POINTS)
 
     @cached_property
     def time_scale(self) -> float:

@@ -272,7 +272,8 @@ def test_a_potential_with_kinks_stays(name):
 
 
 def test_jumps_of_lattices_pairs_and_parameters():
-    site = np.linspace(1, 2, 8)
+    site, wells = np.linspace(1, 2, 8), "Piecewise((a*rho, rho < 1), (rho, True))"
+    waves = HamiltonianSystem.schroedinger(wells, shape=8, params={"a": 1.0})
     refused = (
         ("`bond` jumps where r - 1 = 0", lambda: HamiltonianSystem.lattice(shape=8, bond="r**2/2 + Heaviside(r - 1)")),
         (
@@ -286,6 +287,7 @@ def test_jumps_of_lattices_pairs_and_parameters():
             lambda: HamiltonianSystem.pairs(NEAR_LJ, masses=np.ones(3), params={"s": 0.01}),
         ),
         ("`expression` jumps", lambda: made("p**2/2 + V*Heaviside(q)", params={"V": 0.0}).with_params(V=1.0)),
+        ("`onsite` jumps", lambda: waves.with_params(a=2.0)),
     )
     for words, make in refused:
         with pytest.raises(ValueError, match=f"^{words}"):
@@ -466,6 +468,32 @@ def test_metrics_of_a_run_that_lands_on_jumps_are_those_of_its_steps():
         assert switched(1.03, scipy.sol(times)[0], times).max() < 1e-13
 
 
+@pytest.mark.parametrize("method", ["tao4", "kahan_li8", "gauss_legendre6", "strang_parts", "dop853"])
+@pytest.mark.parametrize(("limit", "n"), [(None, 2), (1, 1), (2, 2)])
+def test_events_of_all_pieces_between_jumps_are_kept(method, limit, n):
+    """A free body that is pushed up at 1.003, down at 2.007 and never again: it rises and falls through a height."""
+    force = sp.Heaviside(t - 1.003) - 3 * sp.Heaviside(t - 2.007) + 2 * sp.Heaviside(t - 3.013)
+    rise, fall = 1.003, 2.007
+
+    def height(s, y):
+        return y[0] - 0.3
+
+    def level(s, y):
+        return y[1]
+
+    height.terminal = limit or False
+    options = {"rtol": 1e-10, "atol": 1e-12} if method == "dop853" else {"dt": 0.01}
+    sol = solve(driven(force, y0=[0.0, 0.0]), method, (0.5, 6), events=[height, level], **options)
+    v = fall - rise
+    up = rise + math.sqrt(0.6)
+    top = fall + v / 2
+    q, p_end = v**2 / 2 + v * (3.013 - fall) - (3.013 - fall) ** 2, v - 2 * (3.013 - fall)
+    expected = [up, 3.013 + (0.3 - q) / p_end]
+    np.testing.assert_allclose(sol.t_events[0], expected[:n], atol=1e-6)
+    if limit != 1:
+        np.testing.assert_allclose(sol.t_events[1][-1], top, atol=1e-6)
+
+
 def test_runs_that_do_not_land_on_jumps_warn(tmp_path):
     fast = made(p**2 / 2 + q**2 / 2 - q * sp.sign(sp.sin(50000 * t)), time="t", y0=[0.5, 0.1])
     for run in (
@@ -493,6 +521,9 @@ def test_methods_of_torchdiffeq_end_their_steps_at_jumps(method, back):
     T = ends[1].item()
     exact = height * ((T - a) ** 2 - (T - b) ** 2) / 2 * (-1 if back else 1)
     assert found == pytest.approx(exact, rel=1e-9)
+    before = torch.tensor([100.0, b + 1e-3] if back else [0.0, a - 1e-3], dtype=torch.float64)
+    still = odeint(system, torch.zeros(2, dtype=torch.float64), before, method=method, options=options)
+    assert not still.any()
 
 
 @pytest.mark.parametrize(

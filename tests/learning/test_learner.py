@@ -407,9 +407,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("make", "options", "match"), [(make, *rest) for makes, *rest in REFUSED for make in makes], ids=str
-)
+@pytest.mark.parametrize(("make", "options", "match"), [(make, *rest) for makes, *rest in REFUSED for make in makes])
 def test_what_cannot_be_learned_is_refused(make, options, match):
     with pytest.raises((ValueError, TypeError), match=f"^{match}"):
         make(trajectories(4, 12), **options)

@@ -1,5 +1,7 @@
 """Objects as text, as HTML and as figures."""
 
+import io
+import sys
 import warnings
 
 import matplotlib  # noqa: F401
@@ -9,6 +11,7 @@ import pytest
 import sympflow
 from sympflow import HamiltonianSystem, systems
 from sympflow.learning.trajectories import Trajectories
+from sympflow.show.cards import legible
 from sympflow.systems.user_files import factory
 
 HH = systems.henon_heiles()
@@ -145,3 +148,13 @@ def test_a_doubled_system_is_drawn_in_its_physical_limit():
     figure = sympflow.solve("decaying-orbit", t_span=(0, 5)).plot()
     assert len(figure.axes) == 2
     assert np.ptp(figure.axes[1].lines[0].get_ydata()) > 1
+
+
+@pytest.mark.parametrize(("encoding", "expected"), [("ascii", "omega = 2.5e-06 us +- 1, Henon x -1"), ("utf-8", None)])
+def test_what_a_terminal_cannot_print_is_spelled(monkeypatch, encoding, expected):
+    text = "ω = 2.5e−06 µs ± 1, Hénon × −1"
+    written = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", written)
+    assert legible(text) == (expected or text)
+    print(sympflow.solve(sympflow.systems.henon_heiles(), "verlet", (0, 1)))
+    written.flush()
