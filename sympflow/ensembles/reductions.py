@@ -6,7 +6,6 @@ sees a `Chunk` of orbits, and walks along them by `chunk.windows()`, or runs loo
 
 from __future__ import annotations
 
-import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sympflow.arguments import did_you_mean
 from sympflow.ensembles.chunks import Chunk
 from sympflow.hamiltonian.scales import known_scale, size_of_terms
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -231,8 +231,7 @@ def reduction(reduce: Any) -> Reduction:
         if reduce in REDUCTIONS:
             module, _, name = REDUCTIONS[reduce].partition(":")
             return getattr(import_module(f"sympflow.{module}"), name)()
-        close = difflib.get_close_matches(reduce.lower(), REDUCTIONS, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
+        hint = did_you_mean(reduce.lower(), REDUCTIONS)
         raise ValueError(f"`reduce` {reduce!r} is unknown.{hint} Choose one of {', '.join(REDUCTIONS)}.")
     if isinstance(reduce, type) and issubclass(reduce, Reduction):
         raise TypeError(f"`reduce` is the class {reduce.__name__}: pass an instance of it.")

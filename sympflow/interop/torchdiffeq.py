@@ -6,7 +6,6 @@ options go into `options`: `flow`, `dt` (or `step_size`), and `system` where `fu
 
 from __future__ import annotations
 
-import difflib
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -19,7 +18,7 @@ import torch
 import torchdiffeq
 from torch import Tensor
 
-from sympflow.arguments import check_not_traced, warn
+from sympflow.arguments import check_not_traced, did_you_mean, warn
 from sympflow.arrays import differentiable, finite_states, one_lane, readable, transformed, unfollowed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, Integrator
@@ -335,8 +334,7 @@ def _names_of_both() -> Iterator[None]:
             raise
         name = str(error).split('"')[1]
         known = sorted({*available(), *_THEIRS})
-        close = difflib.get_close_matches(name.lower(), known, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
+        hint = did_you_mean(name.lower(), known)
         raise ValueError(f"`method` {name!r} is unknown.{hint} Choose one of {', '.join(known)}.") from None
 
 

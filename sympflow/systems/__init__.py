@@ -1,11 +1,11 @@
 """The scenes by name: the built-in ones, those registered at run time, and those of installed plug-ins."""
 
-import difflib
 import inspect
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from sympflow.arguments import did_you_mean
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import announced, distribution, load_announced
 from sympflow.systems.celestial import (
@@ -122,8 +122,7 @@ def get(name: str) -> Callable[..., HamiltonianSystem]:
         return _registered[key]
     if key in _plugins():
         return _load(key, _plugins()[key])
-    close = difflib.get_close_matches(key, available(), n=1)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
+    hint = did_you_mean(key, available())
     raise ValueError(f"`name` {name!r} is not a known scene.{hint} Choose one of {', '.join(available())}.")
 
 
@@ -201,8 +200,5 @@ __all__ += [factory.__name__ for factory in SYSTEMS.values()]
 
 
 def __getattr__(name: str) -> Any:
-    import difflib
-
-    close = difflib.get_close_matches(name, [key.replace("-", "_") for key in SYSTEMS], n=1, cutoff=0.5)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
+    hint = did_you_mean(name, [key.replace("-", "_") for key in SYSTEMS], 0.5)
     raise AttributeError(f"module 'sympflow.systems' has no attribute {name!r}.{hint}")

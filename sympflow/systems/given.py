@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from sympflow.arguments import did_you_mean
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -34,10 +34,9 @@ def given_system(system: Any, params: Mapping[str, Any] | None = None) -> Hamilt
             key = system.replace("_", "-").lower()
             if key in available():
                 return get(key)()
-            close = difflib.get_close_matches(key, available(), n=1, cutoff=0.5)
-            hint = f"Did you mean {close[0]!r}? " if close else ""
+            hint = did_you_mean(key, available(), 0.5)
             raise ValueError(
-                f"`system` {system!r} is the name of no scene. {hint}There are {', '.join(available())}; a formula "
+                f"`system` {system!r} is the name of no scene.{hint} There are {', '.join(available())}; a formula "
                 "such as 'p**2/2 + q**2/2' is a system too."
             )
         return HamiltonianSystem.from_sympy(system, params=_first(params))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib.util
 import inspect
 import os
@@ -14,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sympflow.arguments import did_you_mean
 from sympflow.hamiltonian.domain import Ball, Box, EnergySublevel, Tube, domain_from_dict
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.scene import UNNAMED
@@ -99,8 +99,7 @@ def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[.
         raise ValueError(f"`system` {str(file)!r} lacks the name of a system in it ({has}): write {file.name}:NAME.")
     if name not in vars(module):
         candidates = _candidates(module) or _functions(module)
-        close = difflib.get_close_matches(name, candidates, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
+        hint = did_you_mean(name, candidates)
         has = f"It has {', '.join(candidates)}." if candidates else "It has no system."
         raise ValueError(f"`system` {name!r} is not in {str(file)!r}.{hint} {has}")
     found = vars(module)[name]
@@ -171,10 +170,9 @@ def _table(file: Path) -> dict[str, Any]:
         raise ValueError(f"`system` {str(file)!r} is not TOML ({error}): mend it, texts in quotes.") from error
     for key, value in table.items():
         if key not in KEYS:
-            close = difflib.get_close_matches(key, KEYS, n=1)
-            hint = f"Did you mean {close[0]!r}? " if close else ""
+            hint = did_you_mean(key, KEYS)
             raise ValueError(
-                f"`{key}` is not a key of a system (in {str(file)!r}). {hint}The keys are {', '.join(KEYS)}."
+                f"`{key}` is not a key of a system (in {str(file)!r}).{hint} The keys are {', '.join(KEYS)}."
             )
         kind, words = KEYS[key]
         if not _fits(value, kind) or not all(map(_is_number, _numbers(key, value))):
