@@ -24,6 +24,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Problem
 from sympflow.integrators.registry import build, check_applies, get
+from sympflow.lazy import lately_kept
 from sympflow.systems.given import GivenSystem, given_system
 
 TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
@@ -39,7 +40,7 @@ SAFETY = 0.5  # of the tolerance, at which a step is aimed
 ENOUGH, MOST = 0.2, 0.7  # of the tolerance: errors with which a step is taken
 NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
 LOGARITHMIC = 0.9  # ratio of differences of V at these distances from a pole, at least: of a logarithm 1
-NEWTON_STEPS = 8
+NEWTON_STEPS, MOST_CENTERS = 8, 12  # of places that are looked for, and coordinates of the motion
 
 Candidate = tuple[str, str]
 """The name of a method, and why it is chosen."""
@@ -83,7 +84,9 @@ def _candidates(
         yield "sympflow", "a trained flow ships for this system, and y0 is in its domain"
     if system.local is not None and system.local.frame is not None and system.local.frame.crossing() is None:
         yield "wisdom_holman", "planets move about a star"
-    place, steep = _attractive_pole(system, y0) if plain and y0.dtype == np.float64 else ("", False)
+    place, steep = "", False
+    if plain and y0.dtype == np.float64 and system.separable and system.keeps_energy:
+        place, steep = _attractive_pole(system, y0.reshape(-1, y0.shape[-1])[:MOST_STATES].tobytes())
     if place and (steep or tol is None):
         name = "log_kahan_li8" if steep else "dop853"
         yield name, f"V falls without bound at {place}, where its steps become shorter"
@@ -111,14 +114,15 @@ def _flow_holds(system: HamiltonianSystem, y0: Array, tol: float | None) -> bool
     return domain is None or bool(np.all(np.asarray(domain.contains(y0))))
 
 
-def _attractive_pole(system: HamiltonianSystem, y0: np.ndarray) -> tuple[str, bool]:
+@lately_kept
+def _attractive_pole(system: HamiltonianSystem, states: bytes) -> tuple[str, bool]:
     """A place towards which V falls without bound from all positions, in words; True if like a power where V < 0.
 
     Such places are q = 0 and those where an expression of H vanishes that is next to them.
     """
-    if not (system.definition.poles and system.local is None and system.separable and system.keeps_energy):
+    if not system.definition.poles or system.local is not None:
         return "", False
-    q = y0.reshape(-1, y0.shape[-1])[:MOST_STATES, : system.ndof]
+    q = np.frombuffer(states).reshape(-1, 2 * system.ndof)[:, : system.ndof]
     scales = np.array([100.0, 10.0, 1.0, *NEAR_POLE])[:, None, None]
     for name, center in _centers(system, q):
         with np.errstate(all="ignore"):
@@ -139,7 +143,7 @@ def _centers(system: HamiltonianSystem, q: np.ndarray) -> Iterator[tuple[str, np
         return poles.sizes(np.concatenate([x, 0 * x], axis=-1), np.zeros(x.shape[:-1]))
 
     small = 1e-6 * np.abs(q).max(initial=0.0) * np.eye(d)
-    for column in range(sizes(q).shape[-1] if small.any() else 0):
+    for column in range(min(sizes(q).shape[-1], MOST_CENTERS) if small.any() and d <= MOST_CENTERS else 0):
         x = q
         with np.errstate(all="ignore"):
             for _ in range(NEWTON_STEPS):  # for a double zero, as that of r²

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
-from weakref import WeakKeyDictionary, WeakSet
+from weakref import WeakSet
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap, warn_of_loss
+from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -46,7 +47,6 @@ TOO_LONG = 0.05
 """Energy error, over the size of the energy, of a run whose step is too long."""
 PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
 """Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
-_FAST: WeakKeyDictionary[HamiltonianSystem, tuple[Any, str]] = WeakKeyDictionary()
 LARGE = 200  # degrees of freedom
 FEW_STEPS = 20
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
@@ -362,23 +362,29 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
 
 
 def _too_fast(integrator: FixedStep, problem: Problem) -> str:
-    """A warning of a step that is long for the fastest motion at y0, or nothing; kept for the next run from there."""
-    system, y0 = problem.system.between_impulses, to_numpy(problem.y0).reshape(-1, 2 * problem.system.ndof)
-    y0 = y0[:: max(1, len(y0) // MOST_DIAGNOSED)].astype(float)
-    key = integrator, y0.tobytes(), problem.t0
-    if system not in _FAST or _FAST[system][0] != key:
-        dt, rate, told = integrator.step_length(system), fastest_at(system, problem.t0, y0), ""
-        error = np.abs(integrator.multiplier(PHASES) - np.exp(1j * PHASES))
-        off = np.append(error[:-1] > PHASE_ERROR * PHASES[:-1], error[-1] > 0)
-        most = float(PHASES[off][0]) if off.any() else math.inf
-        if dt * rate > most:
-            told = (
-                f"`dt` {dt:g} is too long for method {integrator.label!r}: the rate of the fastest motion at `y0` is "
-                f"{rate:.3g}, and its product with the step should be at most {most:.2g}. Take {most / rate:.2g}, or "
-                "tol=1e-6, for which the step is chosen."
-            )
-        _FAST[system] = key, told
-    return _FAST[system][1]
+    """A warning of a step that is long for the fastest motion at y0, or nothing."""
+    y0 = to_numpy(problem.y0).reshape(-1, 2 * problem.system.ndof)
+    few = y0[:: max(1, len(y0) // MOST_DIAGNOSED)].astype(float)
+    dt, rate = integrator.step_length(problem.system), _rate(problem.system.between_impulses, problem.t0, few.tobytes())
+    if not _misses(integrator, np.array([dt * rate])).any():
+        return ""
+    most = float(PHASES[_misses(integrator, PHASES)][0])
+    return (
+        f"`dt` {dt:g} is too long for method {integrator.label!r}: the rate of the fastest motion at `y0` is "
+        f"{rate:.3g}, and its product with the step should be at most {most:.2g}. Take {most / rate:.2g}, or tol=1e-6, "
+        "for which the step is chosen."
+    )
+
+
+def _misses(integrator: FixedStep, z: np.ndarray) -> np.ndarray:
+    """True for oscillations of z radians in a step that a method does not follow, (n,)."""
+    error = np.abs(integrator.multiplier(z) - np.exp(1j * z))
+    return (error > PHASE_ERROR * z) | ((error > 0) & (z >= PHASES[-1]))
+
+
+@lately_kept
+def _rate(system: HamiltonianSystem, t: float, states: bytes) -> float:
+    return fastest_at(system, t, np.frombuffer(states).reshape(-1, 2 * system.ndof))
 
 
 def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem, told: bool = False) -> None:

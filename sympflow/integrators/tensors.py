@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sympflow.arguments import check_not_followed
 from sympflow.arrays import detached, differentiable, to_numpy, transformed
 from sympflow.kernels.protocol import RunCheckpoint, Task
 
@@ -54,10 +55,7 @@ class MovingTimes:
         self._times = torch.stack([torch.as_tensor(t, dtype=torch.float64) for t in t_eval]) if listed else t_eval
         for name, times in (("t_span", self._ends), ("t_eval", (self._times,))):
             if transformed(*times):
-                raise TypeError(
-                    f"`{name}` is followed by torch.func, forward mode or torch.compile, which solve does not take: "
-                    "use torch.autograd.grad, or pass `.detach()`."
-                )
+                check_not_followed(name, times)
 
     @property
     def numbers(self) -> tuple[Any, Any]:

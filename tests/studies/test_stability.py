@@ -331,7 +331,7 @@ def test_a_map_of_a_family(tmp_path):
         ({"steps": [True]}, r"^`steps` must be a list"),
         ({"steps": "0.1"}, r"^`steps` must be a list"),
         ({"progress": 3}, r"^`progress` must be a function"),
-        ({"y0": torch.tensor([1.0, 0.0])}, r"^`y0` must be a NumPy array"),
+        ({"y0": torch.tensor([1.0, 0.0])}, r"^`y0` is a tensor, but every method of the study"),
         ({"bound": np.nan}, r"^`bound` must be positive"),
         ({"min_steps": 0}, r"^`min_steps` must be a positive integer"),
         ({"t_span": (1, 1)}, r"^`t_span` has length zero"),
