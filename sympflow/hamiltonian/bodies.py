@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from itertools import combinations
 from typing import Any
 
@@ -439,7 +439,7 @@ class PairsHamiltonian(LocalHamiltonian):
             return
         rows = n if self._all_at_once else max(1, most // n)
         for start in range(0, n - 1, rows):
-            i, j = np.triu_indices(min(rows, n - 1 - start), 1, n - start)
+            i, j = _of_triangle(min(rows, n - 1 - start), n - start)
             yield i + start, j + start
 
     def _within_cutoff(self, states: np.ndarray) -> np.ndarray:
@@ -475,6 +475,13 @@ class Pairs:
             return value
         outside = s >= local.cutoff**2 + local.softening**2
         return masked(value, outside, 0.0)
+
+
+@lru_cache(maxsize=16)
+def _of_triangle(rows: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices above the diagonal, row by row."""
+    i, j = np.triu_indices(rows, 1, n)
+    return i, j
 
 
 @cache
