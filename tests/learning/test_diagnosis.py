@@ -1,6 +1,5 @@
 """The test whether any Hamiltonian explains the data, before fits: friction, another order of columns, no H at all."""
 
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
