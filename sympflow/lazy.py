@@ -30,11 +30,12 @@ def kept(make: Callable[Concatenate[K, P], T], most: float = inf) -> Callable[Co
         values = known.get(owner)
         if values is None:
             values = known[owner] = {}
-        if args not in values:
+        key = *args, *options.items()
+        if key not in values:
             if len(values) >= most:
                 values.clear()
-            values[args] = make(owner, *args, **options)
-        return values[args]
+            values[key] = make(owner, *args, **options)
+        return values[key]
 
     return found
 

@@ -44,12 +44,12 @@ class ClockPotential(Potential):
         self.numbers = nn.Parameter(torch.zeros(terms, dtype=dtype, device=device))
 
     def value(self, t: Time, x: Tensor) -> Tensor:
-        B, k = x[-1], range(len(self.numbers))
-        return sum((self.numbers[k] * t ** (3 + 2 * k) * B ** (k + 1) / (k + 1) for k in k), 0 * B)
+        B = x[-1]
+        return sum((c * t ** (3 + 2 * k) * B ** (k + 1) / (k + 1) for k, c in enumerate(self.numbers)), 0 * B)
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
-        B, k = x[-1], range(len(self.numbers))
-        advance = sum((self.numbers[k] * t ** (3 + 2 * k) * B**k for k in k), 0 * B)
+        B = x[-1]
+        advance = sum((c * t ** (3 + 2 * k) * B**k for k, c in enumerate(self.numbers)), 0 * B)
         return torch.cat([torch.zeros_like(x[:-1]), advance[None]])
 
     def to_dict(self) -> dict[str, Any]:

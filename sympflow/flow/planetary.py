@@ -13,6 +13,7 @@ At times before Δt the flow is another scheme, `kepler_aba1064`, far more accur
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple, Self
@@ -21,11 +22,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.arguments import real_number
-from sympflow.arrays import differentiable, jvp, to_numpy
+from sympflow.arrays import differentiable, to_numpy
 from sympflow.flow.flow_map import to_values
 from sympflow.flow.layers import OwnLayer
-from sympflow.flow.potentials import Time
+from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
@@ -53,6 +53,10 @@ class _Kept(NamedTuple):
 def at_dt(dt: float, t: Any) -> Any:
     """Return True for times that are Δt, or −Δt."""
     return abs(abs(t) - dt) <= AT_DT * dt
+
+
+def _is_period(value: Any) -> bool:
+    return isinstance(value, float) and 0 < value < math.inf
 
 
 def processor_of(kicks: Sequence[float], gradients: Sequence[float]) -> Substeps:
@@ -110,7 +114,7 @@ class KeplerFlow(SystemFlow):
     dt : float
         Δt.
     periods : sequence of float, optional
-        Those of the planets: the numbers hold for their orbits alone.
+        Periods of the planets; the numbers hold for these orbits alone.
     system : HamiltonianSystem, optional
         One of `HamiltonianSystem.planets`, in Jacobi's coordinates. Without it the flow has no values.
     dtype, device
@@ -143,7 +147,7 @@ class KeplerFlow(SystemFlow):
         kind: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         self.register_buffer("kicks", torch.zeros(2 * reach, **kind))
         self.register_buffer("gradients", torch.zeros(n_gradients, **kind))
-        self.periods = None if periods is None else tuple(periods)
+        self.periods = None if periods is None else tuple(map(float, periods))
         self._kept: Kept[_Kept] = Kept([self._buffers])
         # A tuple, not a ModuleList: the layers own no numbers.
         self.layers = tuple(PlanetLayer(self, *m) for b, a, _ in BETWEEN for m in ((b, 0.0), (0.0, a)) if any(m))
@@ -169,7 +173,7 @@ class KeplerFlow(SystemFlow):
         frame = frame_of(system.local, system.y0)
         if frame is None or not frame.jacobi:
             raise ValueError(
-                f"`system` {system.name!r} has no planets in Jacobi's coordinates, of which the flow is: make it by "
+                f"`system` {system.name!r} has no planets in Jacobi's coordinates, which the flow needs: make it by "
                 "HamiltonianSystem.planets."
             )
         frame.check("sympflow")
@@ -209,9 +213,10 @@ class KeplerFlow(SystemFlow):
 
     def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         def between(s: Tensor) -> Tensor:
-            return self.frame.moved(y.T, t + s + 0 * y[0], (BETWEEN, t + s + 0 * y[0])).T
+            time = t + s + 0 * y[0]
+            return self.frame.moved(y.T, time, (BETWEEN, time)).T
 
-        return self._map(t, y), jvp(between, y.new_zeros(()), y.new_ones(()))[1]
+        return self._map(t, y), by_time(between, y)[1]
 
     def _moved(self, t: float | Tensor, x: Tensor, parts: slice) -> Tensor:
         """States after some of χ⁻¹, K and χ, or of the scheme before Δt, for t < 0 of its inverse."""
@@ -242,12 +247,8 @@ class KeplerFlow(SystemFlow):
 
             loops = kepler_loops(flow.frame)
             trained = KeplerKernel(loops, STEP, kept.inverse, kept.processor, compensated)
-            known = (
-                flow.frame,
-                KeplerFlowKernel(
-                    partial(at_dt, self.dt), trained, KeplerKernel(loops, BETWEEN, compensated=compensated)
-                ),
-            )
+            between = KeplerKernel(loops, BETWEEN, compensated=compensated)
+            known = flow.frame, KeplerFlowKernel(partial(at_dt, self.dt), trained, between)
             kept.kernels[compensated] = known
         return known[1]
 
@@ -269,6 +270,6 @@ class KeplerFlow(SystemFlow):
         gradients, periods = shape.get("gradients"), shape.get("periods")
         if gradients != 0:
             gradients = checked_integer(gradients, "number of force gradients", 2 * reach)
-        if not (isinstance(periods, list) and len(periods) == ndof // 3 - 1 and all(map(real_number, periods))):
+        if not (isinstance(periods, list) and len(periods) == ndof // 3 - 1 and all(map(_is_period, periods))):
             raise Refused("its periods are not those of its planets")
         return cls(ndof, reach, gradients, dt, periods, dtype=dtype)

@@ -524,7 +524,7 @@ class KeplerLoops:
                 f"`system` has {n} planets with a mass, and compiled code is for 1 to {MOST_GROUPS * LANES - 1}: use "
                 "backend='array'."
             )
-        self.frame, self._groups, self._light = frame, light, bool(light)
+        self.frame, self._light = frame, light
         self._codes: dict[tuple[Form, int, int], KeplerCode] = {}
         groups = self.code(Form()).groups
         spare = LANES * groups - n
@@ -559,18 +559,16 @@ class KeplerLoops:
 
     def parts(self, form: Form, threads: int) -> list[tuple[KeplerCode, np.ndarray]]:
         """Codes of parts of the bodies without mass, all with the planets, and the places of their running states."""
-        found, start = [], NUMBERS * self.code(form).groups
+        found, whole, start = [], self.code(form).whole, NUMBERS * self.code(form).groups
         for k in range(threads):
             code = self._made(form, k, threads)
-            places = np.concatenate(
-                [np.arange(start), start + NUMBERS * self._ends(k, threads)[0] + np.arange(code.whole - start)]
-            )
-            whole = self.code(form).whole
+            own = start + NUMBERS * self._ends(k, threads)[0] + np.arange(code.whole - start)
+            places = np.concatenate([np.arange(start), own])
             found.append((code, np.concatenate([places, whole + places]) if form.compensated else places))
         return found
 
     def _ends(self, k: int, threads: int) -> tuple[int, int]:
-        n = len(self._groups)
+        n = len(self._light)
         return n * k // threads, n * (k + 1) // threads
 
     def _made(self, form: Form, k: int, threads: int) -> KeplerCode:

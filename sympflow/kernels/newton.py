@@ -220,7 +220,7 @@ class _Iteration:
     def pulled(self, end: Sequence[Any], slopes: bool) -> list[Any]:
         """The cotangents of y, and with `slopes` of the parameters, for those λ of the state after the step.
 
-        By the transposed equations, for μ: those of y are λ + Σ_i v_i, of which Aᵀv = μ − Bλ.
+        The transposed equations give μ; the cotangents of y are λ + Σ_i v_i, where Aᵀv = μ − Bλ.
         """
         n, d, N, wide, method = self.n, self.d, self.N, self.wide, self.method
         weights = method.tableau[1]
@@ -310,7 +310,7 @@ class _Iteration:
         return where(ratios[1] <= ratios[0], ratios[0], ratios[1])
 
     def fill_letters(self) -> None:
-        """What depends on t alone, at all stages, behind the numbers of the column."""
+        """The letters, which depend on t alone, of all stages into the column, behind its numbers."""
         method, count = self.method, len(self.method.lettered.letters)
         nodes = self.array("nodes", method.nodes)
         for i in self.each(self.s) if count else ():
@@ -525,8 +525,7 @@ class _InMemory(NewtonCode):
 def _solve(M: Value, sizes: Value, N: int, wide: int) -> None:
     """Eliminate the unknowns in place: the last column of M becomes the solution.
 
-    Pivots are the largest of their column in units of the sizes of the unknowns, whose reciprocals `sizes` go
-    along.
+    Pivots are the largest of their column in units of the sizes of the unknowns; their reciprocals are `sizes`.
     """
     code, type = M.code, Type("double", ABREAST)
     with code.over(N) as k:

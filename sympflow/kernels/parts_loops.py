@@ -462,7 +462,7 @@ def _same(a: Any, b: Any) -> bool:
 
 
 def row_products(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """A x of all vectors x (..., n), of which none depends on how many there are, as the products of a library do."""
+    """A x of all vectors x (..., n); unlike those of a library, its bits do not depend on how many there are."""
     rows, matrix = np.ascontiguousarray(x, dtype=np.float64), np.ascontiguousarray(A)
     out = np.empty_like(rows)
     n = rows.shape[-1]

@@ -193,14 +193,14 @@ def reverse_function(
     n_out: int,
     size: int,
     adjoint: Adjoint,
-    width: int = 1,
-    own: bool = False,
-    slopes: bool = False,
-    closing: bool = True,
-    memory: bool = False,
-    of_values: OfValues | None = None,
-    n_given: int = 0,
-    n_own: int = 0,
+    width: int,
+    own: bool,
+    slopes: bool,
+    closing: bool,
+    memory: bool,
+    of_values: OfValues,
+    n_given: int,
+    n_own: int,
 ) -> Callable[..., None]:
     """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
 
@@ -264,7 +264,6 @@ def reverse_function(
             n.value = to
         lanes.store([x.value for x in cotangents], rows, begin, n_rows, one, zero)
         if slopes and n_own:
-            assert of_values is not None
             behind, stride = Lanes(code, n_own, width), code.constant(n_out + n_own, INT)
             own_values = behind.loaded(starts, begin, n_rows, stride, code.constant(n_out, INT))
             totals = [code.variable(code.constant(0.0, lanes.type)) for _ in range(n_own)]

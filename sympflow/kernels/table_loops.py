@@ -28,6 +28,7 @@ from sympflow.hamiltonian.monomials import Monomials
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 from sympflow.kernels.rollouts import aligned, filled
 from sympflow.kernels.runs import begun, finished
+from sympflow.lazy import kept
 from sympflow.schemes import CURVATURE, FORCE_GRADIENT
 
 __all__ = ["LabelErrors", "TableLoops", "table_loops"]
@@ -260,7 +261,7 @@ class _Maps:
     def memory(self, n_stages: int, n_numbers: int) -> int:
         return LANES * (4 * self.width + n_numbers + n_stages * self.tape)
 
-    @lru_cache(maxsize=128)  # noqa: B019  (of as many maps as are kept)
+    @kept
     def function(self, linearized: bool) -> Callable[..., None]:
         """The compiled function: see `_Errors`."""
         return _Errors(self, linearized).compiled()

@@ -55,6 +55,11 @@ def tube(**fields):
     return {"kind": "Tube", "orbit": [[0.0, 0.0], [1.0, 1.0]], "radius": 1.0, **fields}
 
 
+def of_planets(period):
+    shape = {"reach": 1, "gradients": 0, "periods": [period]}
+    return lambda f: described(f, architecture={"ndof": 6, "kepler": shape})
+
+
 INADMISSIBLE = "its domain is not admissible"
 BOX = {"kind": "Box", "low": [0.0, 0.0], "high": [1.0, 1.0]}
 
@@ -88,6 +93,8 @@ FILES = {
         lambda f: described(f, architecture={"type": "mlp", "ndof": 10**12, "layers": []}),
         "ndof 1000000000000",
     ),
+    "a planet of an endless period": (of_planets(10**400), "its periods are not those of its planets"),
+    "a planet without a period": (of_planets(0.0), "its periods are not those of its planets"),
     "a tube of another width": (
         lambda f: described(f, domain=tube(orbit=[[0.0] * 4] * 2)),
         "states of length 4, not 2",
