@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -125,6 +126,27 @@ def fastest_at(system: Any, t: float, y: np.ndarray | None) -> float:
     """The largest rate at states y (..., 2d) at t; 0 where it is not known."""
     with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
         return float(_rates(system, t, y).max(initial=0.0)) if system.ndof <= MOST_DENSE else 0.0
+    return 0.0
+
+
+def rate_of_motion(system: Any, times: Sequence[float], states: Sequence[np.ndarray]) -> float:
+    """The rate √(|(J∇²H)² ẏ|/|ẏ|) of the motion at states (..., 2d) of times, ω of an oscillation; 0 if not known.
+
+    Modes that do not move, as the highest ones of a grid, have no part in it.
+    """
+    d, sizes = system.ndof, np.zeros((2, 1))
+    if d > MOST_DENSE:
+        return 0.0
+    with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError):
+        for t, y in zip(times, map(_few, states), strict=True):
+            S, g = np.asarray(system.hessian(y, t)), np.asarray(system.gradient(y, t))
+            v = [np.concatenate([g[:, d:], -g[:, :d]], axis=1)]
+            for _ in range(2):
+                g = (S @ v[-1][..., None])[..., 0]
+                v.append(np.concatenate([g[:, d:], -g[:, :d]], axis=1))
+            sizes = np.append(sizes, np.linalg.norm(v[::2], axis=-1), axis=1)
+        slow, fast = np.nanmax(sizes, axis=1)
+        return float(np.nan_to_num(np.sqrt(fast / slow), posinf=0.0))
     return 0.0
 
 

@@ -13,12 +13,11 @@ import numpy as np
 
 from sympflow.arguments import warn
 from sympflow.arrays import Array, is_tensor, masked, readable, to_numpy
-from sympflow.hamiltonian.scales import fastest_at
+from sympflow.hamiltonian.scales import rate_of_motion
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep
 from sympflow.integrators.contract import Integrator, Outcome, Problem
 from sympflow.integrators.domain_exit import check_domain, check_system_along, warn_of_leap, warn_of_loss
-from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.parameter_rows import ParameterRows
@@ -326,8 +325,8 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if integrator.trained:
         return
     known = integrator.dt is None or (not system.step_is_open and integrator.dt <= system.dt)
-    looked = n_steps >= FEW_STEPS and not (known or system.keeps_energy)
-    if looked and (told := _too_fast(integrator, problem)):
+    looked = n and n_steps >= FEW_STEPS and not (known or system.keeps_energy)
+    if looked and (told := _too_fast(outcome, integrator, problem)):
         warn(told, RuntimeWarning)
     if not n or not seen or not system.keeps_energy or system.between_impulses is not system:
         return
@@ -361,18 +360,18 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         )
 
 
-def _too_fast(integrator: FixedStep, problem: Problem) -> str:
-    """A warning of a step that is long for the fastest motion at y0, or nothing."""
-    y0 = to_numpy(problem.y0).reshape(-1, 2 * problem.system.ndof)
-    few = y0[:: max(1, len(y0) // MOST_DIAGNOSED)].astype(float)
-    dt, rate = integrator.step_length(problem.system), _rate(problem.system.between_impulses, problem.t0, few.tobytes())
+def _too_fast(outcome: Outcome, integrator: FixedStep, problem: Problem) -> str:
+    """A warning of a step that is long for the motion at the start and the end, or nothing."""
+    times, ends = [problem.t0, float(outcome.t[-1])], [to_numpy(y) for y in (problem.y0, outcome.y[-1])]
+    rate = rate_of_motion(problem.system.between_impulses, times, ends)
+    dt = integrator.step_length(problem.system)
     if not _misses(integrator, np.array([dt * rate])).any():
         return ""
     most = float(PHASES[_misses(integrator, PHASES)][0])
     return (
-        f"`dt` {dt:g} is too long for method {integrator.label!r}: the rate of the fastest motion at `y0` is "
-        f"{rate:.3g}, and its product with the step should be at most {most:.2g}. Take {most / rate:.2g}, or tol=1e-6, "
-        "for which the step is chosen."
+        f"`dt` {dt:g} is too long for method {integrator.label!r}: the rate of the motion is {rate:.3g}, and its "
+        f"product with the step should be at most {most:.2g}. Take {most / rate:.2g}, or tol=1e-6, for which the step "
+        "is chosen."
     )
 
 
@@ -380,11 +379,6 @@ def _misses(integrator: FixedStep, z: np.ndarray) -> np.ndarray:
     """True for oscillations of z radians in a step that a method does not follow, (n,)."""
     error = np.abs(integrator.multiplier(z) - np.exp(1j * z))
     return (error > PHASE_ERROR * z) | ((error > 0) & (z >= PHASES[-1]))
-
-
-@lately_kept
-def _rate(system: HamiltonianSystem, t: float, states: bytes) -> float:
-    return fastest_at(system, t, np.frombuffer(states).reshape(-1, 2 * system.ndof))
 
 
 def note_singularities(outcome: Outcome, integrator: Integrator, problem: Problem, told: bool = False) -> None:
