@@ -332,8 +332,7 @@ def _check_tolerance_met(sol: Solution, tol: float) -> None:
         error = float(np.max(np.abs(energy_change(sol)), initial=0.0))
     sol.stats["energy_error"] = error
     if error > tol:
-        remedy = "pass a smaller one" if sol.y.dtype.itemsize >= 8 else "float32 rounds off, compute in float64"
-        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: {remedy}."
+        note = f"The relative energy error of the run is {error:.2g}, more than `tol` {tol:g}: pass a smaller one."
         sol.message += f" {note}"
         warn(note, RuntimeWarning)
 
@@ -439,7 +438,7 @@ def _check_jumps_stay(problem: Problem, rows: ParameterRows) -> None:
             if not np.array_equal(jumps(values), jumps(near)):
                 raise ValueError(
                     f"`params` has {name} that requires gradients and moves the times at which H jumps in t, which "
-                    "gradients do not follow: detach it, or make the jump a smooth step such as (1 + tanh((t - c)/w))/2."
+                    "gradients do not follow: detach it, or make the jump smooth, such as (1 + tanh((t - c)/w))/2."
                 )
 
 
