@@ -61,7 +61,7 @@ class Orbit(NamedTuple):
 
 
 def can_train(system: HamiltonianSystem) -> bool:
-    """Return True for planets of which a flow of this kind is the best that is known."""
+    """Return True for planets whose best known flow is of this kind."""
     local = system.local
     return isinstance(local, PlanetsHamiltonian) and local.frame.jacobi and not len(local.frame.test)
 
