@@ -18,13 +18,12 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor, nn
 
-from sympflow.arrays import to_numpy
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, PrimedPotential
 from sympflow.flow.records import MAX_DEGREE, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, checked_device, checked_dtype
+from sympflow.flow.weights import Kept, checked_device, checked_dtype, doubles
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
@@ -149,7 +148,7 @@ class ClockedFlow(SystemFlow):
 
     def clock_numbers(self) -> tuple[float, ...]:
         """Return the c_k that the clock has now, the last one first."""
-        return self._numbers.current(lambda: tuple(to_numpy(self.clock.numbers).astype(float)[::-1].tolist()))
+        return self._numbers.current(lambda: tuple(doubles(self.clock.numbers)[::-1].tolist()))
 
     def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
         from sympflow.flow.loops import ClockedFlowKernel

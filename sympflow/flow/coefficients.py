@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sympflow.arrays import to_numpy
 from sympflow.flow.potentials import Time
 from sympflow.flow.tables import Total, free_numbers
+from sympflow.flow.weights import doubles
 
 
 class FreeTable(nn.Module):
@@ -53,7 +53,7 @@ class FreeTable(nn.Module):
     @property
     def numbers(self) -> np.ndarray:
         """All c_ik as an array of float64, the same bits wherever the parameter is."""
-        basis, offset, free = (to_numpy(x).astype(float) for x in (self.basis, self.offset, self.free))
+        basis, offset, free = map(doubles, (self.basis, self.offset, self.free))
         return offset + basis @ free
 
     def _functions(self, tau: Any) -> list[Any]:
@@ -66,7 +66,7 @@ class FreeTable(nn.Module):
 
     def affine(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """t^power c(t/Δt) as a function of the parameters: offset (J, n) and design (J, n, f)."""
-        basis, offset = (a.cpu().double().numpy() for a in (self.basis, self.offset))
+        basis, offset = map(doubles, (self.basis, self.offset))
         weights = np.asarray(t)[:, None] ** self.power * self.functions(t)
         return weights @ offset.T, np.einsum("nkf,jk->jnf", basis, weights, optimize=True)
 
@@ -115,7 +115,7 @@ class Column(FreeTable):
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """`values` of an array of times: (…, n)."""
-        c = to_numpy(self.table).astype(float)
+        c = doubles(self.table)
         return np.asarray(t)[..., None] ** self.power * (self.functions(t) @ c.T)
 
     def _functions(self, tau: Any) -> list[Any]:

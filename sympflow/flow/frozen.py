@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import numpy as np
 
 from sympflow.arrays import untransformed
-from sympflow.compiler import NotCompiled
-from sympflow.flow.known import UNCOMPENSATED, KnownFlow
+from sympflow.flow.known import KnownFlow
 from sympflow.flow.records import Provenance, numbers_checksum, read
 from sympflow.flow.tables import PrimedShape, Tables, free_numbers
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
@@ -203,9 +202,7 @@ class FrozenNetwork(KnownFlow):
         flow.check_system(system)
         return flow
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
-        if compensated:
-            raise NotCompiled(UNCOMPENSATED)
+    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
         return self._kernel
 
     @cached_property

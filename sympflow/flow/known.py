@@ -250,6 +250,12 @@ class KnownFlow:
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
         """Return the compiled loops of the flow with its present weights, the same while these do not change."""
+        if compensated:
+            raise NotCompiled(UNCOMPENSATED)
+        return self._loops_for(system)
+
+    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
+        """The compiled loops without compensated sums."""
         raise NotCompiled(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:

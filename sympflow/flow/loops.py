@@ -33,10 +33,7 @@ class PrimedFlowKernel(Kernel):
     """
 
     def __init__(self, tables: Tables, system: HamiltonianSystem, compensated: bool = False) -> None:
-        if system.friction and compensated:
-            raise NotCompiled(
-                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
-            )
+        system.friction.check_sums(compensated)
         known = system.form is not None or (tables.level == CURVATURE and system.local is not None)
         if tables.level >= CURVATURE and not known:
             raise NotCompiled(

@@ -28,7 +28,7 @@ from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
 from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
@@ -235,7 +235,7 @@ class KeplerFlow(SystemFlow):
     # its runs -------------------------------------------------------------------------------------------------
 
     def _frozen(self) -> _Kept:
-        processor = processor_of(*(to_numpy(x).astype(float).tolist() for x in (self.kicks, self.gradients)))
+        processor = processor_of(*(doubles(x).tolist() for x in (self.kicks, self.gradients)))
         return _Kept(processor, reversed_substeps(processor), {})
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:

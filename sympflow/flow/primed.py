@@ -43,7 +43,7 @@ from sympflow.flow.primed_potentials import (
 from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Tables, columns_of
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.monomials import Monomials, in_monomials, monomials
@@ -336,7 +336,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         """Take the numbers of a flow with as many kicks, of a longer Δt as they are at this one's."""
         shorter = min(self.dt / other.dt, 1.0)
         theirs = {
-            name: to_numpy(column.table).astype(float) * shorter ** np.array(column.exponents, float)
+            name: doubles(column.table) * shorter ** np.array(column.exponents, float)
             for name, column in other.columns()
         }
         mine = dict(self.columns())

@@ -19,17 +19,14 @@ import torch
 from torch import Tensor
 
 from sympflow.arguments import check_flag, plain
-from sympflow.arrays import to_numpy
-from sympflow.compiler import NotCompiled
 from sympflow.flow.coefficients import Column
 from sympflow.flow.flow_map import check_system
-from sympflow.flow.known import UNCOMPENSATED
 from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Memory, Total
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype
+from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts, map_evaluations
@@ -250,7 +247,7 @@ class SplitFlow(SystemFlow):
     def _coefficient_maps(self) -> list[SubFlow]:
         """The maps with the coefficients of the columns, (K, …), in place of their values."""
         return self._assemble(
-            lambda column: to_numpy(column.table).astype(float),
+            lambda column: doubles(column.table),
             lambda entries: np.stack(entries, axis=-1),
             np.eye(1, self.terms)[0],
         )
@@ -290,9 +287,7 @@ class SplitFlow(SystemFlow):
         parts = self.parts
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> SplitFlowKernel:
-        if compensated:
-            raise NotCompiled(UNCOMPENSATED)
+    def _loops_for(self, system: HamiltonianSystem) -> SplitFlowKernel:
         flow = self.bound(system)
         frozen = flow.frozen()
         if frozen.kernel is None or frozen.kernel.parts is not flow.parts:

@@ -14,10 +14,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from sympflow.arguments import plain, real_number
-from sympflow.compiler import NotCompiled
 from sympflow.flow.families import family
 from sympflow.flow.flow_map import FlowMap
-from sympflow.flow.known import UNCOMPENSATED
 from sympflow.flow.layers import LAYERS, Binding, Drift, Kick, Layer
 from sympflow.flow.potentials import (
     MLPPotential,
@@ -540,9 +538,7 @@ class SympFlow(FlowMap):
                 _check_storable(layer)
         super().save(path)
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
-        if compensated:
-            raise NotCompiled(UNCOMPENSATED)
+    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
         if self._network is None:
             self._network = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
         return self._network.current(self._compiled)
@@ -650,9 +646,7 @@ class SystemFlow(SympFlow):
     def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)
 
-    def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
-        if compensated:
-            raise NotCompiled(UNCOMPENSATED)
+    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
         check_compilable(self.dtype, self.device)
         if self._loops is None or self._loops[0] is not system:
             self._loops = system, self._compiled_for(system)
@@ -660,7 +654,7 @@ class SystemFlow(SympFlow):
 
     def _compiled_for(self, system: HamiltonianSystem) -> Kernel:
         """The compiled loops of the flow on a system."""
-        raise NotCompiled(f"`method` {self.kind!r} has no compiled form: use backend='array'.")
+        raise NotImplementedError
 
 
 def _pairs_of_layers(

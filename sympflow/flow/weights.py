@@ -73,7 +73,7 @@ def check_compilable(dtype: torch.dtype, device: torch.device) -> None:
 
 def doubles(values: Tensor) -> np.ndarray:
     """The values as an array of float64."""
-    return values.detach().cpu().double().numpy()
+    return to_numpy(values).astype(float)
 
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:

@@ -393,6 +393,7 @@ class CallableHamiltonian(Definition):
         """V of q or H of y, by the function itself, but for tensors that it does not take."""
         if (form := self._in_place_of(self._own, x)) is not None:
             return form.value(x, *t)
+        _ = self.form  # finds out for which library the function is written
         if self._gradient is not None or self.library == library_name(x) == "numpy":
             return _checked(self._protected(self._own, self._name, t, x), x, self._name, ())
         return _with_torch(partial(self._own, *t), x, self._name, (), self.untraced)

@@ -315,6 +315,10 @@ class TracedPoles:
         values = np.stack([np.broadcast_to(x, y.shape[:-1]) for x in found], axis=-1)
         return values[..., :-2], values[..., -2], values[..., -1]
 
+    def sizes(self, y: np.ndarray, t: Any) -> np.ndarray:
+        """The values (..., m) that vanish at the places, of those that can be written in symbols."""
+        return self.exact.sizes(y, t) if self.exact else np.empty((*y.shape[:-1], 0))
+
     @property
     def exact(self) -> Any:
         """The places in symbols, None if they cannot be written."""

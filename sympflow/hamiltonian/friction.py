@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from sympflow.arrays import Array, as_array, library, like
+from sympflow.compiler import NotCompiled
 
 
 class Friction:
@@ -25,6 +26,13 @@ class Friction:
 
     def __bool__(self) -> bool:
         return self.damping is not None
+
+    def check_sums(self, compensated: bool) -> None:
+        """Refuse compensated sums where there is friction."""
+        if self and compensated:
+            raise NotCompiled(
+                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
+            )
 
     @property
     def kind(self) -> int | None:

@@ -205,7 +205,7 @@ class Frame:
         return x, v
 
     def moved(self, y: Array, passed: Any, *pieces: tuple[Substeps, Any]) -> Array:
-        """States after substeps of so long a step (...) each; the centre moves for the time that has `passed`."""
+        """States after pieces of substeps, each with its step (...); the centre moves for the time `passed`."""
         x, v, Q, U = self.into(y)
         for substeps, h in pieces:
             for kick, drift, third in substeps:

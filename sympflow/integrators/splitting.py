@@ -285,10 +285,7 @@ class Splitting(FixedStep):
             return
         composition = self.composed(system)
         composition.check_system(self.step_length(system))
-        if system.friction and self.compensated:
-            raise ValueError(
-                "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
-            )
+        system.friction.check_sums(self.compensated)
 
     def forces_at_ends(self, system: HamiltonianSystem) -> bool:
         return any(not END < c < 1 - END for c in self._force_times(system))

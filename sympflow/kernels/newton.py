@@ -59,8 +59,7 @@ def implicit_kernel(
             "or use backend='array'."
         )
     friction = system.friction
-    if friction and compensated:
-        raise NotCompiled("`compensated` sums are for systems without friction, which forgets round-off: leave it out.")
+    friction.check_sums(compensated)
     if friction.kind == 2:
         raise NotCompiled("`damping` is a matrix, whose decay is not compiled here: use backend='array'.")
     symbols = parametric(written, names)

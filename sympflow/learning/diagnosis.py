@@ -316,7 +316,7 @@ def fields_of_drive(drive: Drive, smooth: Smooth) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Rest:
-    """What fields (n, 2d, K) leave of slopes (n, 2d), each coordinate in its spread."""
+    """Slopes (n, 2d) without the part that fields (n, 2d, K) explain, each coordinate in its spread."""
 
     basis: np.ndarray  # (2dn, K): Orthonormal, of the fields
     left: np.ndarray  # (2dn,)

@@ -33,7 +33,7 @@ def coordinates(ndof: int) -> tuple[Coordinates, Coordinates]:
 
 
 def coordinates_of(part: str, ndof: int) -> Coordinates:
-    """Those of the coordinates that a part of H has: "q", "p" or "y" for both."""
+    """The coordinates of a part of H: of "q", "p" or "y", which is both."""
     q, p = coordinates(ndof)
     return {"q": q, "p": p, "y": (*q, *p)}[part]
 

@@ -558,7 +558,7 @@ class Drive(Part):
         return np.arange(self.n) < self.n - 1
 
     def subset(self, kept: np.ndarray) -> Part:
-        """The terms of which the cosine or the sine is kept."""
+        """The drive with the terms whose cosine or sine is kept."""
         return Drive(self.base.subset(kept[: self.base.n] | kept[self.base.n : -1]), self.frequency)
 
     def at(self, t: np.ndarray) -> Drive:

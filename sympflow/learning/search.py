@@ -78,7 +78,7 @@ CERTAIN = 5.0  # standard errors that the factor of a force is worth a word
 SYMPLECTIC = 1e-9  # defect of a field, up to which it is of an H
 GROWS = 4.0  # standard errors below 0, from which a negative friction is no chance
 DRAG_STEPS = 20  # of a Gauss method in Δt, with a force that has a kink
-SCATTERED = 400  # states at which 𝓗 is looked at
+SCATTERED, ALONG = 400, 20  # states at which 𝓗 is looked at, and trajectories of these at least
 OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 
@@ -716,7 +716,7 @@ class Search:
         return SympFlow.collocated(system, dt=step, states=states)
 
     def _is_worse(self, flow: FlowMap) -> bool:
-        """True of a flow that is worse than the H of which it is."""
+        """True of a flow that is worse than the H it was made of."""
         error, noise = flow.figures.get("one_step_error"), self.noise
         return error is not None and error > max(noise, POOR * float(self.data.scales.min()))
 
@@ -751,8 +751,10 @@ class Search:
 
     def energy_scatter(self, flow: FlowMap) -> float | None:
         """The standard deviation of 𝓗 along a held-out trajectory, in their mean; None where no state is whole."""
-        step = 1 + self.held.n_points // SCATTERED
-        runs = [run.y[:, np.isfinite(run.y).all(axis=0)][:, ::step] for run in self._whole(self.held).runs]
+        most = len(self.held.runs)
+        n = max(min(most, ALONG), SCATTERED * most // self.held.n_points)
+        some = self._whole(self.held.subset(np.unique(np.linspace(0, most - 1, n).astype(int)).tolist()))
+        runs = [run.y[:, np.isfinite(run.y).all(axis=0)][:, :: -(-some.n_points // SCATTERED)] for run in some.runs]
         energies = self._energy(flow, np.concatenate(runs, axis=1).T)
         along = np.split(energies, np.cumsum([y.shape[1] for y in runs])[:-1])
         scatter = [float(np.std(values)) for values in along if len(values) > 1]

@@ -579,7 +579,7 @@ class KeplerFit(Fit):
     Parameters
     ----------
     dt : float, optional
-        Δt; by default the longest with an error of at most `tol`, of those from a ninth of the shortest period on.
+        Δt; by default the longest with an error of at most `tol`, of those up to a tenth of the shortest period.
     tol : float
         Relative energy error, where `dt` is left out.
     reach, gradients : int
@@ -592,21 +592,17 @@ class KeplerFit(Fit):
         Of these times.
     """
 
-    points: int = 1500
-    tol: float = 1e-8
-    reach: int = 64
-    gradients: int = 8
-    orbits: float = 30_000.0
+    points: int = option(count, 1500)
+    tol: float = option(check_positive, 1e-8)
+    reach: int = option(count, 64, of_flow=True)
+    gradients: int = option(default=8, of_flow=True)
+    orbits: float = option(check_positive, 30_000.0)
 
     kind: ClassVar[str] = "kepler"
-    COUNTS: ClassVar[tuple[str, ...]] = ("points", "reach")
-    OF_FLOW: ClassVar[tuple[str, ...]] = ("dt", "reach", "gradients")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive("tol", self.tol)
-        check_positive("orbits", self.orbits)
-        if isinstance(self.gradients, bool) or self.gradients not in range(2 * self.reach + 1):
+        if type(plain(self.gradients)) is not int or not 0 <= self.gradients <= 2 * self.reach:
             raise ValueError(f"`gradients` must be an integer from 0 to twice `reach`; got {self.gradients!r}: take 8.")
         if self.points < 2 * self.reach + self.gradients:
             raise ValueError(f"`points` {self.points!r} are fewer than the numbers to be fitted: take 1500.")

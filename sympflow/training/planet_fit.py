@@ -24,7 +24,7 @@ from sympflow.kernels.kepler import KeplerKernel, KeplerLoops, kepler_loops
 from sympflow.kernels.protocol import Task
 from sympflow.schemes import corrector_maps, paired, reversed_substeps
 from sympflow.training.fits import KeplerFit
-from sympflow.training.session import Deadline
+from sympflow.training.session import Session
 
 LINEAR_STEPS, WEIGHTED_STEPS = 3, 6
 CUTOFF = 1e-9, 1e-5  # of singular values, without and with force gradients
@@ -61,12 +61,12 @@ class Orbit(NamedTuple):
 
 
 def can_train(system: HamiltonianSystem) -> bool:
-    """Return True for planets of which a flow of this kind is the best that is known."""
+    """Return True for planets whose best known flow is of this kind."""
     local = system.local
     return isinstance(local, PlanetsHamiltonian) and local.frame.jacobi and not len(local.frame.test)
 
 
-def train_planets(system: HamiltonianSystem, fit: KeplerFit, domain: Domain | None, deadline: Deadline) -> KeplerFlow:
+def train_planets(system: HamiltonianSystem, fit: KeplerFit, domain: Domain | None, session: Session) -> KeplerFlow:
     """A flow of planets about a star, with its record."""
     started, cpu = time.perf_counter(), time.process_time()
     flow = KeplerFlow(system.ndof, fit.reach, fit.gradients, 1.0, system=system)
@@ -76,7 +76,7 @@ def train_planets(system: HamiltonianSystem, fit: KeplerFit, domain: Domain | No
             "planets alone."
         )
     orbit = Orbit.of(system, flow.frame)
-    dt = _longest(orbit, fit, deadline) if fit.dt is None else fit.dt
+    dt = _longest(orbit, fit, session) if fit.dt is None else fit.dt
     flow.dt = float(dt)
     numbers, residual = fitted(orbit, flow.dt, fit)
     for mine, found in zip((flow.kicks, flow.gradients), _split(numbers, fit), strict=True):
@@ -150,26 +150,29 @@ def held_out(orbit: Orbit, h: float, numbers: np.ndarray, fit: KeplerFit) -> flo
     return float(np.abs(orbit.errors(y)).max())
 
 
-def _longest(orbit: Orbit, fit: KeplerFit, deadline: Deadline) -> float:
+def _longest(orbit: Orbit, fit: KeplerFit, session: Session) -> float:
     """The longest Δt whose flow has an error of at most `tol`; the best one where time ran out."""
     best, tried = (np.inf, 0.0), replace(fit, points=FEW * (2 * fit.reach + fit.gradients))
-    for h in _between_resonances(orbit, HOPE * fit.tol, fit.seed):
-        if deadline.over() and best[1]:
-            break
-        error = np.inf
-        if _promised(orbit, h, tried) <= 2 * fit.tol:
-            error = held_out(orbit, h, fitted(orbit, h, fit)[0], fit)
-        best = min(best, (error, h)) if best[1] else (error, h)
-        if error <= fit.tol:
-            break
+    steps = np.geomspace(LONGEST, SHORTEST, round(math.log(LONGEST / SHORTEST) / math.log(RATIO)))
+    steps *= orbit.frame.periods.min()
+    with session.bar(len(steps), f"{orbit.system.name} steps") as bar:
+        for h in _between_resonances(orbit, steps, HOPE * fit.tol, fit.seed):
+            if session.deadline.over() and best[1]:
+                break
+            bar.tries(int((steps > h).sum()), f"Δt {h:.4g}")
+            error = np.inf
+            if _promised(orbit, h, tried) <= 2 * fit.tol:
+                error = held_out(orbit, h, fitted(orbit, h, fit)[0], fit)
+            best = min(best, (error, h)) if best[1] else (error, h)
+            if error <= fit.tol:
+                break
     return best[1]
 
 
-def _between_resonances(orbit: Orbit, hope: float, seed: int) -> Iterator[float]:
+def _between_resonances(orbit: Orbit, steps: np.ndarray, hope: float, seed: int) -> Iterator[float]:
     """Steps from the longest on at which the error with a standard corrector is the least, and in reach."""
     standard = tuple(paired([(*m, 0.0) for m in corrector_maps(17, sign)]) for sign in (1, -1))
-    period, last = orbit.frame.periods.min(), [(0.0, 0.0), (0.0, 0.0)]
-    steps = period * np.geomspace(LONGEST, SHORTEST, round(math.log(LONGEST / SHORTEST) / math.log(RATIO)))
+    last = [(0.0, 0.0), (0.0, 0.0)]
     for h in [float(f"{h:.4g}") for h in steps]:
         error = np.abs(orbit.errors(orbit.states(h, TRIAL_ORBITS, LOOKS, seed, standard))).max()
         (one, _), (two, middle) = last

@@ -175,7 +175,10 @@ def train(
     limit = options.pop("time_budget", budget)
     session = Session(checkpoint, resume, plain(limit), progress, callback, WorkerPool(workers))
     if _of_planets(system, fit, flow, solver, options):
-        fit, options = KeplerFit(**{name: plain(x) for name, x in options.items() if name != "kind"}), {}
+        kind = options.pop("kind", None)
+        for name in (name for name in options if name not in KeplerFit.names()):
+            raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
+        fit, options = KeplerFit(**{name: plain(x) for name, x in options.items()}), {}
     if fit is None or not isinstance(fit, Fit):
         fit, solver, start = _described(system, fit, solver, flow, said(options))
     elif options:
@@ -193,9 +196,14 @@ def fit_flow(
     start: PrimedFit | None = None,
 ) -> Any:
     """`train`, its arguments sorted: a new flow, one to `start` with or a given one, and its fit."""
+    if isinstance(fit, KeplerFit | ClockedFit):
+        of_steps = {"solver": solver, "checkpoint": session.checkpoint, "resume": session.resume}
+        for name, value in {**of_steps, "callback": session.callback}.items():
+            if value is not None:
+                raise TypeError(f"`{name}` is of fits in steps, and {type(fit).__name__} has none: leave it out.")
     if isinstance(fit, KeplerFit):  # along an orbit, which needs no domain
         _checked_kind(system, flow, fit)
-        return train_planets(system, fit, domain or system.domain, session.deadline)
+        return train_planets(system, fit, domain or system.domain, session)
     domain = _domain_for(system, domain)
     solver = _solver_for(fit, solver)
     if start is not None:
@@ -356,7 +364,7 @@ def _described(
     else:
         named = ["kind"] * (kind is not None) + [n for n in options if n in (*OF_PRIMED, *OF_SEARCHES)]
         kind = _meant(system, options, searches) if kind is None else kind
-        check_one_of("kind", kind, KINDS)
+        check_one_of("kind", kind, (*KINDS, KeplerFit.kind))
         for name in (n for n in options if n in (OF_NETWORKS if kind == "primed" else OF_PRIMED)):
             raise TypeError(f"`{name}` is not an option of flows of kind {kind!r}: leave it out.")
         if kind == "primed":
@@ -372,10 +380,10 @@ def _described(
 
 def _of_planets(system: HamiltonianSystem, fit: Any, flow: Any, solver: Any, options: dict[str, Any]) -> bool:
     """Return True where a new flow of planets is meant: by name, or by no option but those that it has."""
-    if fit is not None or flow is not None or solver is not None:
+    if fit is not None or flow is not None:
         return False
-    kind = options.get("kind")
-    return kind == KeplerFit.kind or (kind is None and can_train(system) and set(options) <= set(KeplerFit.names()))
+    kind, like = options.get("kind"), set(options) <= set(KeplerFit.names())
+    return kind == KeplerFit.kind or (kind is None and solver is None and like and can_train(system))
 
 
 def _kind_of(flow: FlowMap) -> str:

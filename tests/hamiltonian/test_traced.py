@@ -449,3 +449,21 @@ def test_functions_of_the_time_that_jump_are_landed_on(method, name):
     options = {} if method.startswith("dop") else {"dt": 0.1}
     sol = solve(system, method, (0, 3), **options)
     np.testing.assert_allclose(sol.y[:, -1], [(3 - 1.003) ** 2 / 2, 3 - 1.003], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "V",
+    [
+        lambda q: np.sum(q**4, axis=-1),
+        lambda q: np.linalg.norm(q, axis=-1) ** 2,
+        lambda q: np.where(q[..., 0] > 0, q[..., 0] ** 2, q[..., 0] ** 4),
+        lambda q: np.cos(q[..., 0]),
+    ],
+    ids=["sum", "norm", "where", "cos"],
+)
+def test_functions_of_numpy_alone_are_given_no_tensors(V):
+    """Neither by the first call of H nor where no method is named."""
+    system, q = HamiltonianSystem(V, ndof=1), np.array([[0.3], [0.7]])
+    y = np.concatenate([q, np.zeros_like(q)], axis=-1)
+    np.testing.assert_allclose(system.hamiltonian(y), V(q), rtol=1e-15)
+    assert solve(HamiltonianSystem(V, ndof=1), t_span=(0, 1), y0=[1.0, 0.0]).success

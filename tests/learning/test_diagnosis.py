@@ -1,7 +1,5 @@
 """The test whether any Hamiltonian explains the data, before fits: friction, another order of columns, no H at all."""
 
-import re
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -131,7 +129,7 @@ def test_hints_name_the_reason_and_its_size(field, d, known, said):
     data = Trajectories.read(runs(field, d, points=61, noise=1e-3))
     smooth = data.smooth
     found = hint(library_for(None, d, 4, smooth.points)[0], smooth, data, **known)
-    assert re.search(rf"{re.escape(said)}\d?", str(found)), found
+    assert said in str(found)
     one = data.subset([0])
     assert "driven" not in str(hint(library_for(None, d, 4, one.smooth.points)[0], one.smooth, data, **known))
 

@@ -61,7 +61,7 @@ def test_lagranges_equations_give_the_masses_of_a_double_pendulum(observed):
 
 @pytest.mark.parametrize("observed", ["qp", "qv"])
 def test_terms_that_smooth_curves_do_not_ask_for_are_left_out(observed):
-    """Of 51 numbers a dozen are kept, with accelerations to 1 %: those of all numbers are worthless elsewhere."""
+    """A dozen of 51 numbers are kept, with accelerations to 1 %: those of all numbers are worthless elsewhere."""
     data, y = observations(double_pendulum(), observed, noise=1e-3)
     kept = [*FAMILIES["inertia"].models(_constraints(data, None, None, False, 2 * np.pi, None))][1]
     for _ in range(3):

@@ -306,7 +306,7 @@ def test_shipped_flows_are_maps_for_all_times(flow):
 
 @pytest.mark.parametrize("listed", shipped_flows(), ids=lambda f: f.name)
 def test_every_flow_is_a_map_for_all_times(listed):
-    """Whatever its kind, networks and stiff ones included; measured on a few states, not read."""
+    """Networks and stiff ones included; measured on a few states, not read."""
     system = scene_named(listed.name.partition("-")[0])
     flow = listed.load(system)
     if listed.shift is not None:  # in its own time it is early or late: what it is right in is the physical time

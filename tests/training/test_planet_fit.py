@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sympflow import HamiltonianSystem, KeplerFit, load, solve, systems, train
+from sympflow.training import ClockedFit, GaussNewton
 
 OUTER = systems.solar_system(("Jupiter", "Saturn", "Uranus", "Neptune"))
 LIGHT = HamiltonianSystem.planets([1.0, 1e-3, 0.0], elements={"a": [1.0, 2.0]})
@@ -39,10 +40,11 @@ def test_times_between_steps_are_near_the_exact_solution(flow):
     assert np.abs(y - right).max() < 1e-4  # of the trained step, whose phase is early or late
 
 
-def test_a_tolerance_chooses_the_step():
+def test_a_tolerance_chooses_the_step(capsys):
     masses, orbits = [1.0, 1e-5, 1e-5], {"a": [1.0, 1.6], "e": [0.05, 0.02], "M": [0, 2.0]}
     system = HamiltonianSystem.planets(masses, elements=orbits)
-    flow = train(system, tol=1e-6, reach=4, points=100, gradients=0, orbits=300.0)
+    flow = train(system, tol=1e-6, reach=4, points=100, gradients=0, orbits=300.0, progress=True)
+    assert f"Δt {flow.dt:.4g}" in capsys.readouterr().err
     assert flow.figures["energy_error"] <= 1e-6
     assert 2 * np.pi / 100 < flow.dt <= 2 * np.pi / 10 * 1.001
 
@@ -58,6 +60,9 @@ def test_where_it_does_not_hold(flow):
     ("system", "options", "message"),
     [
         (OUTER, {"gradients": -1}, "^`gradients` must be an integer from 0"),
+        (OUTER, {"gradients": 2.0}, "^`gradients` must be an integer from 0"),
+        (OUTER, {"points": 150.5}, "^`points` must be a positive integer"),
+        (OUTER, {"reach": 0.5}, "^`reach` must be a positive integer"),
         (OUTER, {"points": 20}, "^`points` 20 are fewer than the numbers"),
         (OUTER, {"tol": 0.0}, "^`tol` must be"),
         (systems.henon_heiles(), {}, "has no planets in Jacobi's coordinates"),
@@ -67,3 +72,17 @@ def test_where_it_does_not_hold(flow):
 def test_bad_arguments(system, options, message):
     with pytest.raises(ValueError, match=message):
         train(system, KeplerFit(1.0, **options))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"kind": "kepler", "stages": 3}, "^`stages` is not an option of flows of kind 'kepler'"),
+        ({"kind": "kepler", "solver": GaussNewton()}, "^`solver` is of fits in steps, and KeplerFit has none"),
+        ({"callback": print}, "^`callback` is of fits in steps, and KeplerFit has none"),
+        ({"fit": ClockedFit(1.0), "resume": "run.ckpt"}, "^`resume` is of fits in steps, and ClockedFit has none"),
+    ],
+)
+def test_options_of_fits_in_steps_are_refused(options, message):
+    with pytest.raises(TypeError, match=message):
+        train(OUTER, **options)
