@@ -22,6 +22,11 @@ from sympflow.lazy import lately_kept
 MOST_SHOWN = 4  # values of a row, in messages
 
 
+@lately_kept
+def _of_values(system: HamiltonianSystem, **values: float) -> HamiltonianSystem:
+    return system.with_params(**values)
+
+
 class Rows(NamedTuple):
     """Trajectories that one run takes together."""
 
@@ -179,7 +184,6 @@ class ParameterRows:
 
 _Key = tuple[tuple[str, ...], tuple[float, ...]]
 _FORMED: WeakKeyDictionary[HamiltonianSystem, dict[_Key, HamiltonianSystem]] = WeakKeyDictionary()
-_of_values = lately_kept(HamiltonianSystem.with_params)
 _ROUNDED_ONCE: dict[Any, Callable[[np.ndarray], np.ndarray]] = {
     sp.Integer(-1): lambda x: 1 / x,
     sp.Integer(2): lambda x: x * x,
