@@ -154,7 +154,7 @@ def _centers(system: HamiltonianSystem, q: np.ndarray) -> Iterator[tuple[str, np
                 slope = (ends[0] - ends[1]) / (2 * small.max())
                 x = x - np.where(g == 0, 0.0, 2 * g * slope / (slope**2).sum(-1, keepdims=True))
         if np.isfinite(x).all():
-            yield f"{poles.name(column)}", x
+            yield poles.name(column), x
 
 
 def integrator_for(
@@ -334,7 +334,6 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
     system, y0 = problem.system, problem.y0
     sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
     factors, smallest = weights(system), smallest_size(system, y0)
-
     compiled, idle = False, system.keeps_energy is not system.shows_energy
     of_states = tol_of == "state" or idle or integrator.in_another_time  # on a clock H is kept where time is wrong
 
