@@ -48,6 +48,7 @@ PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
 """Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
 LARGE = 200  # degrees of freedom
 FEW_STEPS = 20
+SAFE = 4  # steps of so many `dt` of a system are not looked at in a run of few
 FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 """The closest of so many steps, or of all, to a value where terms cancel is that part of the way from it; a force with
 that share of errors there is told."""
@@ -316,17 +317,18 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     Where energy is not kept, the motion at the start and the end must not be too fast for the step.
 
     H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
-    steps, which would take twice the time. Its size is the largest of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
+    steps that are not long, which would take twice the time. Its size is the largest of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
     """
     if not isinstance(integrator, FixedStep):
         return
     system, n, n_steps = problem.system, len(outcome.t), outcome.stats.get("n_steps", 0)
     if doubt := integrator.doubt(system):
         warn(doubt, RuntimeWarning)
-    seen = LOOKED_AT * (n_steps >= FEW_STEPS) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
     if integrator.trained:
         return
     known = integrator.dt is None or (not system.step_is_open and integrator.dt <= system.dt)
+    few = n_steps < FEW_STEPS and (known or integrator.dt <= SAFE * system.dt)
+    seen = LOOKED_AT * (not few) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
     looked = n and n_steps >= FEW_STEPS and not (known or system.keeps_energy)
     if looked and (told := _too_fast(outcome, integrator, problem)):
         warn(told, RuntimeWarning)
@@ -354,10 +356,12 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
         except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
             return
         off = np.fmax.reduce(change / np.maximum(size, system.energy_scale or 0.0), axis=None)  # of a rest 0/0
-    if TOO_LONG < off < np.inf:
+    overflows = bool(np.isfinite(H[0]).all() and np.isinf(change).any())
+    if TOO_LONG < off < np.inf or overflows:
+        found = "overflows" if overflows else f"is off by {100 * off:.2g} %"
         warn(
             f"`dt` {integrator.step_length(system):g} is too long for method {integrator.label!r}: the energy of the "
-            f"run is off by {100 * off:.2g} %. Take a shorter step, or tol=1e-6, for which it is chosen.",
+            f"run {found}. Take a shorter step, or tol=1e-6, for which it is chosen.",
             RuntimeWarning,
         )
 
