@@ -26,16 +26,7 @@ from sympflow.kernels.splittings import Splitting, SplittingCode
 if TYPE_CHECKING:
     from sympflow.kernels.terms import Terms
 
-__all__ = [
-    "ARRAYS",
-    "ArrayCode",
-    "Forces",
-    "FunctionSplitting",
-    "Functions",
-    "TermForces",
-    "function_code",
-    "term_code",
-]
+__all__ = ["ARRAYS", "ArrayCode", "Forces", "FunctionSplitting", "function_code", "term_code"]
 
 ARRAYS = 4  # of d numbers that a kick needs: slopes, velocities, products with the Hessian, curvatures
 
