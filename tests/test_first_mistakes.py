@@ -268,6 +268,6 @@ def test_names_of_other_rooms_are_told(name, home):
     assert callable(getattr(importlib.import_module(f"sympflow.interop.{home}"), name))
 
 
-def test_a_tolerance_below_single_precision_has_another_remedy():
-    with pytest.warns(RuntimeWarning, match="float32 rounds off, compute in float64"):
+def test_a_tolerance_below_single_precision_is_refused():
+    with pytest.raises(ValueError, match="`tol` 1e-09 is below the rounding of single precision: compute in float64"):
         sympflow.solve(sympflow.systems.henon_heiles(), "kahan_li8", (0, 10), tol=1e-9, dtype="float32")

@@ -235,7 +235,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
             continue
         name, equals, value = word.partition("=")
         if not name.startswith("--"):
-            raise ValueError(f"`{name}` is not an option: see --help. A formula begins with another sign than -.")
+            raise ValueError(f"`{name}` is not an option: see --help. A formula must not begin with -.")
         if not equals:
             if not rest:
                 raise ValueError(f"`{name}` is not an option, or lacks its value: see --help.")
@@ -271,14 +271,15 @@ def _formula(text: str) -> Callable[..., HamiltonianSystem]:
     words = dict.fromkeys(w for w in re.findall(r"[A-Za-z_]\w*", symbols) if w not in known)
 
     def make(**values: float) -> HamiltonianSystem:
-        if missing := [f"--{name}" for name in names if name not in (*values, "t")]:
-            HamiltonianSystem.from_sympy(text, params=dict.fromkeys(names, 1.0))  # which says what is not understood
+        params, time = dict.fromkeys(names, 1.0) | values, "t" if "t" in words else None
+        system = HamiltonianSystem.from_sympy(text, params=params, time=time)  # which says what is not understood
+        if missing := [f"--{name}" for name in names if name not in values]:
             raise Usage(f"`{missing[0]}` is missing, the value of a symbol in {text!r}: give it, as in {missing[0]} 1.")
-        driven = "t" in names and "t" not in values
-        return HamiltonianSystem.from_sympy(text, params=values, time="t" if driven else None)
+        return system
 
-    names = [word for word in words if not re.fullmatch(r"[qp]\d*", word)]
-    if len(names) == len(words) > 0:
+    coordinates = [word for word in words if re.fullmatch(r"[qp]\d*", word)]
+    names = [word for word in words if word not in coordinates and word != "t"]
+    if names and not coordinates:
         raise Usage(
             f"`system` {text!r} has no coordinates: they are q and p, or q1 … qd and p1 … pd. Write it with these in "
             f"place of {', '.join(names)}."

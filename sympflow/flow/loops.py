@@ -179,19 +179,19 @@ class ClockedFlowKernel(Kernel):
     def runs(self, task: Task) -> Run:
         """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
         Y, n_finite, _ = self._kernel.runs(task)
-        B = task.y0[:, -1]
-        advance = self._advance(task.h, B) if len(B) > 1 else np.array([self._advance(task.h, float(B[0]))])
-        Y[:, :, self._time] += np.asarray(task.save) * advance[:, None]
+        Y[:, :, self._time] += np.asarray(task.save) * np.reshape(self._advances(task.h, task.y0), (-1, 1))
         return Run(Y, n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         out = self._kernel.step(h, y).states
-        if len(out) == 1:  # as plain numbers, ten times faster
-            out[0, self._time] += self._advance(float(np.ravel(h)[0]), float(y[0, -1]))
-        else:
-            out[:, self._time] += self._advance(np.asarray(h, dtype=np.float64), y[:, -1])
+        out[:, self._time] += self._advances(h, y)
         return Steps(out)
+
+    def _advances(self, h: ArrayLike, y: np.ndarray) -> Any:
+        if len(y) == 1:  # as plain numbers, ten times faster
+            return self._advance(float(np.ravel(h)[0]), float(y[0, -1]))
+        return self._advance(np.asarray(h, dtype=np.float64), y[:, -1])
 
 
 class CollocatedFlowKernel(Kernel):

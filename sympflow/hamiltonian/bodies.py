@@ -37,6 +37,8 @@ ASLANT = np.array([1.0, 0.6180339887498949, 0.3247179572447460])
 """A direction at which no places differ by accident."""
 STRAIGHT, TINY = 1e-9, float(np.finfo(float).tiny)
 """Share of a velocity that is across the line between two bodies, below which they move along it."""
+NEARLY = 1 - 1e-12
+"""Squared cosine of the angle between velocity and line, at least, where that share is looked for."""
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
 """Pairs up to which the ends of a run are always looked at, and steps beside which it costs nothing."""
 
@@ -323,11 +325,15 @@ class PairsHamiltonian(LocalHamiltonian):
             yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values
 
     def may_pass(self, y: np.ndarray) -> bool:
-        """Return True if two of not too many bodies move along their line, in one of the states (..., 2d)."""
+        """Return True if two of not too many bodies move about along their line, in one of the states (..., 2d)."""
         if self.n_bodies * (self.n_bodies - 1) // 2 > CHEAP_PAIRS:
             return False
-        q, v = y[..., : self.ndof], y[..., self.ndof :] / np.repeat(self.inertia, self.dim)
-        return any(_is_straight(*pairs.x).any() for pairs in self._pairs(q, v))
+        for pairs in self._pairs(y[..., : self.ndof], y[..., self.ndof :] / np.repeat(self.inertia, self.dim)):
+            x, w = pairs.x
+            along, speed = _dot(x, w) ** 2, _dot(w, w)
+            if ((along >= NEARLY * pairs.s * speed) & (speed > 0)).any():
+                return True
+        return False
 
     def values_of(
         self, key: str, expressions: list[sp.Expr], x: sp.Symbol, distances: np.ndarray, symbol_values: list[Any]
@@ -407,10 +413,8 @@ class PairsHamiltonian(LocalHamiltonian):
 
     def _pairs(self, *arrays: Array) -> Iterator[Pairs]:
         """The pairs that interact, in pieces that fit into memory; with a cut-off those of any state of a batch."""
-        shape = np.broadcast_shapes(*(x.shape for x in arrays))
         bodies = [self._of_bodies(x) for x in arrays]
-        most = max(1, MOST_PAIRS // max(1, math.prod(shape[:-1])))
-        for i, j in self._ends(to_numpy(bodies[0]), most):
+        for i, j in self._ends(bodies):
             yield Pairs(self, i, j, [self._between(x, i, j, k == 0) for k, x in enumerate(bodies)])
 
     def _between(self, x: Array, i: np.ndarray, j: np.ndarray, positions: bool) -> Array:
@@ -429,15 +433,15 @@ class PairsHamiltonian(LocalHamiltonian):
     def _all_at_once(self) -> bool:
         return self.n_bodies <= ALL_AT_ONCE and self.cutoff is None
 
-    def _ends(self, q: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Indices i < j of pairs, `most` at a time, of all states q (..., n, dim) together."""
+    def _ends(self, bodies: Sequence[Array]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Indices i < j of pairs, of all states (..., n, dim) together, of which the first array is of positions."""
         n = self.n_bodies
         if self.cutoff is not None:
-            near = self._within_cutoff(q.reshape(-1, n, self.dim))
+            near, most = self._within_cutoff(to_numpy(bodies[0]).reshape(-1, n, self.dim)), most_pairs(bodies)
             for start in range(0, len(near), most):
                 yield near[start : start + most, 0], near[start : start + most, 1]
             return
-        rows = n if self._all_at_once else max(1, most // n)
+        rows = n if self._all_at_once else max(1, most_pairs(bodies) // n)
         for start in range(0, n - 1, rows):
             i, j = _of_triangle(min(rows, n - 1 - start), n - start)
             yield i + start, j + start
@@ -475,6 +479,12 @@ class Pairs:
             return value
         outside = s >= local.cutoff**2 + local.softening**2
         return masked(value, outside, 0.0)
+
+
+def most_pairs(bodies: Sequence[Array]) -> int:
+    """Pairs of bodies (..., n, dim) that fit into memory at a time."""
+    batch = np.broadcast_shapes(*(x.shape[:-2] for x in bodies))
+    return max(1, MOST_PAIRS // max(1, math.prod(batch)))
 
 
 @lru_cache(maxsize=16)

@@ -300,14 +300,9 @@ class TracedPoles:
             if g.name in _AS_THEIR_ARGUMENTS:
                 for x in g.args:
                     self._add(x)
-            elif (
-                g.name == "sub"
-                and isinstance(g.args[1], float)
-                and g.args[1] > 0
-                and (x := _squared(g.args[0])) is not None
-            ):
-                for root in (-math.sqrt(g.args[1]), math.sqrt(g.args[1])):
-                    self._add(x - root)
+            elif (ends := _between_roots(g)) is not None:
+                for x in ends:
+                    self._add(x)
             elif _least(g) < POSITIVE:
                 self._vanishing[g.order] = g
                 used = [x for x in self._form.H.program.inputs if x.order in _reached(g)]
@@ -330,11 +325,17 @@ class TracedPoles:
         return self._form.written and self._form.written.poles
 
 
+def _between_roots(g: Traced) -> tuple[Any, Any] | None:
+    """The x − a and x + a of x² − a²."""
+    if g.name != "sub" or not isinstance(g.args[1], float) or g.args[1] <= 0:
+        return None
+    x, a = _squared(g.args[0]), math.sqrt(g.args[1])
+    return None if x is None else (x - a, x + a)
+
+
 def _squared(x: Any) -> Traced | None:
     """The x of x²."""
-    if not isinstance(x, Traced):
-        return None
-    if x.name not in ("pow", "mul"):
+    if not (isinstance(x, Traced) and x.name in ("pow", "mul")):
         return None
     base, other = x.args
     square = other is base if x.name == "mul" else isinstance(other, float) and other == 2
@@ -362,7 +363,7 @@ _TOUCHING = {"cos": (math.pi, 0.0), "sin": (math.pi / 2, -math.pi / 2), "cosh": 
 
 
 def _cell(g: Traced) -> Any:
-    """What is another number beyond a place where g vanishes, of 1 ± cos a too, which touches 0."""
+    """A number that changes at a place where g vanishes, of 1 ± cos a too, which touches 0."""
     parts = [x for x in g.args if isinstance(x, Traced)] if g.name in ("add", "sub") else []
     number = [x for x in g.args if isinstance(x, float)]
     if len(parts) != 1 or parts[0].name not in _TOUCHING or [abs(x) for x in number] != [1.0]:

@@ -49,8 +49,9 @@ class LocalHamiltonian(Definition, ABC):
     frame: Any = None
     """The coordinates of planets about a star, of a system that knows its star: see `sympflow.hamiltonian.planets`."""
     arrays_only: str = ""
-    in_terms: bool = False  # True where compiled kicks are made of all terms of H
     """The part of the system without compiled kicks; "" if all has them."""
+    in_terms: bool = False
+    """True where compiled kicks are made of all terms of H."""
     written: SymbolicHamiltonian | None = None
     """H in symbols, of a system so small that it is written out when symbols are asked for."""
     loops: str

@@ -17,9 +17,14 @@ from sympflow.arrays import differentiable, expanded, is_tensor, to_numpy, trans
 from sympflow.hamiltonian.scales import size_of_terms
 from sympflow.hamiltonian.symbolic import exact, generate, printable
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.lazy import lately_kept
 
 MOST_SHOWN = 4  # values of a row, in messages
-MOST_KEPT = 16  # systems of other values, for runs that are repeated
+
+
+@lately_kept
+def _of_values(system: HamiltonianSystem, **values: float) -> HamiltonianSystem:
+    return system.with_params(**values)
 
 
 class Rows(NamedTuple):
@@ -50,21 +55,14 @@ class ParameterRows:
     def system_of(self, row: int) -> HamiltonianSystem:
         """The system of a trajectory, by its place in the flattened batch."""
         values = {name: float(column[row]) for name, column in self._columns.items()}
-        known, key = _OF_VALUES.setdefault(self.system, {}), tuple(values.items())
-        if key in known:
-            return known[key]
         try:
-            made = self.system.with_params(**values)
+            return _of_values(self.system, **values)
         except (ValueError, TypeError) as error:
             where = ", ".join(map(str, np.unravel_index(row, self.shape)))
             raise ValueError(
                 f"`params` has {self.shown(row)} (trajectory {where}), for which there is no system: {error} Leave "
                 "these values out."
             ) from error
-        if len(known) >= MOST_KEPT:
-            known.pop(next(iter(known)), None)
-        known[key] = made
-        return made
 
     def shown(self, row: int) -> str:
         """The values of a trajectory, in words."""
@@ -186,7 +184,6 @@ class ParameterRows:
 
 _Key = tuple[tuple[str, ...], tuple[float, ...]]
 _FORMED: WeakKeyDictionary[HamiltonianSystem, dict[_Key, HamiltonianSystem]] = WeakKeyDictionary()
-_OF_VALUES: WeakKeyDictionary[HamiltonianSystem, dict[Any, HamiltonianSystem]] = WeakKeyDictionary()
 _ROUNDED_ONCE: dict[Any, Callable[[np.ndarray], np.ndarray]] = {
     sp.Integer(-1): lambda x: 1 / x,
     sp.Integer(2): lambda x: x * x,

@@ -18,7 +18,7 @@ from sympflow.arguments import plain, real_number
 from sympflow.arrays import Array, concatenate, like, masked, stack, to_numpy
 from sympflow.compiler.functions import apply
 from sympflow.compiler.program import Program, gradient, tangent, traced
-from sympflow.hamiltonian.bodies import MOST_SPELLED_PAIRS, Pairs, PairsHamiltonian, checked_column
+from sympflow.hamiltonian.bodies import MOST_SPELLED_PAIRS, Pairs, PairsHamiltonian, checked_column, most_pairs
 from sympflow.hamiltonian.formulas import evaluator
 from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
@@ -205,7 +205,7 @@ class Frame:
         return x, v
 
     def moved(self, y: Array, passed: Any, *pieces: tuple[Substeps, Any]) -> Array:
-        """States after substeps of so long a step (...) each; the centre moves for the time that has `passed`."""
+        """States after pieces of substeps, each with its step (...); the centre moves for the time `passed`."""
         x, v, Q, U = self.into(y)
         for substeps, h in pieces:
             for kick, drift, third in substeps:
@@ -489,14 +489,14 @@ class PlanetsHamiltonian(PairsHamiltonian):
     def _all_at_once(self) -> bool:
         return self.felt is None and super()._all_at_once
 
-    def _ends(self, q: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def _ends(self, bodies: Sequence[Array]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         if self.felt is None:
-            yield from super()._ends(q, most)
+            yield from super()._ends(bodies)
             return
         heavy, light = np.flatnonzero(self.masses > 0), np.flatnonzero(self.masses == 0)
         i, j = np.triu_indices(len(heavy), 1)
         yield heavy[i], heavy[j]
-        size = max(1, most // len(heavy))
+        size = max(1, most_pairs(bodies) // len(heavy))
         for k in range(0, len(light), size):
             some = light[k : k + size]
             yield np.tile(some, len(heavy)), np.repeat(heavy, len(some))

@@ -260,7 +260,7 @@ class PairsPoles(Poles):
         q, end = y[..., : self._pairs.ndof], self._pairs.cutoff
         sums = np.zeros((*y.shape[:-1], len(self._places)))
         in_space = not self._on_a_line and [place.cell for place in self._places] == [self._meeting]
-        if in_space and not self._pairs.may_pass(y[[0, -1]]):
+        if in_space and not self._pairs.may_pass(y[:: max(1, len(y) - 1)]):
             return sums, sums[..., 0], None
         for i, j, x, letters in self._pairs.met(y):
             cells = self._cells(x, letters)

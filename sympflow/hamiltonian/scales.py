@@ -118,11 +118,11 @@ def _few(y: np.ndarray) -> np.ndarray:
 @lately_kept
 def _step_at(system: Any, states: bytes | None) -> float:
     y = None if states is None else np.frombuffer(states).reshape(-1, 2 * system.ndof)
-    rate = max(fastest_at(system, t, y) for t in system.probe_times())
+    rate = max(_fastest_at(system, t, y) for t in system.probe_times())
     return float(f"{STEP / rate:.2g}") if 0 < STEP / max(rate, 1e-300) < 1e100 and np.isfinite(rate) else STEP
 
 
-def fastest_at(system: Any, t: float, y: np.ndarray | None) -> float:
+def _fastest_at(system: Any, t: float, y: np.ndarray | None) -> float:
     """The largest rate at states y (..., 2d) at t; 0 where it is not known."""
     with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError, np.linalg.LinAlgError):
         return float(_rates(system, t, y).max(initial=0.0)) if system.ndof <= MOST_DENSE else 0.0
@@ -134,26 +134,25 @@ def rate_of_motion(system: Any, times: Sequence[float], states: Sequence[np.ndar
 
     Modes that do not move, as the highest ones of a grid, have no part in it.
     """
-    d, sizes = system.ndof, np.zeros((2, 1))
-    if d > MOST_DENSE:
-        return 0.0
+    sizes = np.zeros((2, 1))
     with np.errstate(all="ignore"), suppress(ArithmeticError, ValueError, TypeError):
-        for t, y in zip(times, map(_few, states), strict=True):
-            S, g = np.asarray(system.hessian(y, t)), np.asarray(system.gradient(y, t))
-            v = [np.concatenate([g[:, d:], -g[:, :d]], axis=1)]
-            for _ in range(2):
-                g = (S @ v[-1][..., None])[..., 0]
-                v.append(np.concatenate([g[:, d:], -g[:, :d]], axis=1))
-            sizes = np.append(sizes, np.linalg.norm(v[::2], axis=-1), axis=1)
+        for t, y in zip(times, map(_few, states), strict=True) if system.ndof <= MOST_DENSE else ():
+            A, v = _linear(np.asarray(system.hessian(y, t))), np.asarray(system.vector_field(y, t))[..., None]
+            sizes = np.append(sizes, np.linalg.norm([v, A @ (A @ v)], axis=2)[..., 0], axis=1)
         slow, fast = np.nanmax(sizes, axis=1)
         return float(np.nan_to_num(np.sqrt(fast / slow), posinf=0.0))
     return 0.0
 
 
+def _linear(S: np.ndarray) -> np.ndarray:
+    """J∇²H of Hessians (n, 2d, 2d)."""
+    d = S.shape[1] // 2
+    return np.concatenate([S[:, d:], -S[:, :d]], axis=1)
+
+
 def _rates(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:
     """The largest |λ| of J∇²H at each of the states, of those where it is finite."""
-    S, d = _hessians(system, t, y), system.ndof
-    return np.abs(np.linalg.eigvals(np.concatenate([S[:, d:], -S[:, :d]], axis=1))).max(-1, initial=0.0)
+    return np.abs(np.linalg.eigvals(_linear(_hessians(system, t, y)))).max(-1, initial=0.0)
 
 
 def _hessians(system: Any, t: float, y: np.ndarray | None = None) -> np.ndarray:

@@ -31,6 +31,8 @@ TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
 """Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
 AT_ROUNDING = 1e-8
 """Errors that may be rounding: below it, steps that are shorter and no better end the search."""
+FINEST_SINGLE = 2e-6
+"""The smallest tolerance of runs in single precision, 16 units in the last place."""
 KEPT = 1e-12
 """Errors of the energy that are round-off, whatever the step."""
 TRIALS = 12
@@ -120,7 +122,7 @@ def _attractive_pole(system: HamiltonianSystem, states: bytes) -> tuple[str, boo
 
     Such places are q = 0 and those where an expression of H vanishes that is next to them.
     """
-    if not system.definition.poles or system.local is not None:
+    if not system.definition.poles or (system.local is not None and system.written is None):
         return "", False
     q = np.frombuffer(states).reshape(-1, 2 * system.ndof)[:, : system.ndof]
     scales = np.array([100.0, 10.0, 1.0, *NEAR_POLE])[:, None, None]
@@ -152,7 +154,7 @@ def _centers(system: HamiltonianSystem, q: np.ndarray) -> Iterator[tuple[str, np
                 slope = (ends[0] - ends[1]) / (2 * small.max())
                 x = x - np.where(g == 0, 0.0, 2 * g * slope / (slope**2).sum(-1, keepdims=True))
         if np.isfinite(x).all():
-            yield f"{poles.name(column)}", x
+            yield poles.name(column), x
 
 
 def integrator_for(
@@ -275,6 +277,8 @@ def step_for(integrator: Integrator, problem: Problem, tol: float, tol_of: str =
         raise TypeError(f"`tol` chooses the step of a method with fixed steps, such as 'srkn11b', and {own}.")
     if integrator.dt is not None:
         raise ValueError(f"`tol` chooses the step, but `dt` is given, {integrator.dt:g}: leave out one of them.")
+    if tol < FINEST_SINGLE and problem.y0.dtype.itemsize < 8:
+        raise ValueError(f"`tol` {tol:g} is below the rounding of single precision: compute in float64, or raise it.")
     states = to_numpy(problem.y0).astype(float)
     if states.ndim > 1:
         states = states.reshape(-1, states.shape[-1])[:MOST_STATES]
@@ -330,7 +334,6 @@ def _error(integrator: FixedStep, problem: Problem, tol_of: str, trial: float) -
     system, y0 = problem.system, problem.y0
     sign, length = math.copysign(1.0, problem.t1 - problem.t0), abs(problem.t1 - problem.t0)
     factors, smallest = weights(system), smallest_size(system, y0)
-
     compiled, idle = False, system.keeps_energy is not system.shows_energy
     of_states = tol_of == "state" or idle or integrator.in_another_time  # on a clock H is kept where time is wrong
 

@@ -505,7 +505,7 @@ class MidpointLinearRest(LinearRest):
 
 def _each_class(s: Any, parts: ExactParts) -> Any:
     """A time (...) for all F frequencies: (..., F)."""
-    s = as_array(s if hasattr(s, "dtype") else float(s))
+    s = as_array(float(s) if isinstance(s, int) else s)
     return s[..., None] * like(np.ones(parts.n_classes), s)
 
 

@@ -311,7 +311,9 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and where the energy of a run with fixed steps is off by `TOO_LONG` of its size.
+    """Warn of what a method doubts, and of fixed steps with which the energy is off by `TOO_LONG` of its size.
+
+    Where energy is not kept, the motion at the start and the end must not be too fast for the step.
 
     H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
     steps, which would take twice the time. Its size is the largest of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.

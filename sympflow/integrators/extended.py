@@ -49,13 +49,11 @@ def extended_run(run: Callable[[Problem], Outcome], extension: Composition, prob
         outcome, stopped = stop.outcome, stop
     x = outcome.y
     if search is not None and lifted is not None:
-        search.found, search.values = (
-            [
-                old + [(t, extension.project(y)) for t, y in zeros[len(old) :]]
-                for old, zeros in zip(before, lifted.found, strict=True)
-            ],
-            lifted.values,
-        )
+        search.found = [
+            old + [(t, extension.project(y)) for t, y in zeros[len(old) :]]
+            for old, zeros in zip(before, lifted.found, strict=True)
+        ]
+        search.values = lifted.values
         search.end = None if lifted.end is None else (lifted.end[0], extension.project(lifted.end[1]))
         search.n_dense = lifted.n_dense
     outcome.y = extension.project(x)

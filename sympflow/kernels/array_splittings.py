@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -26,16 +26,7 @@ from sympflow.kernels.splittings import Splitting, SplittingCode
 if TYPE_CHECKING:
     from sympflow.kernels.terms import Terms
 
-__all__ = [
-    "ARRAYS",
-    "ArrayCode",
-    "Forces",
-    "FunctionSplitting",
-    "Functions",
-    "TermForces",
-    "function_code",
-    "term_code",
-]
+__all__ = ["ARRAYS", "ArrayCode", "Forces", "FunctionSplitting", "function_code", "term_code"]
 
 ARRAYS = 4  # of d numbers that a kick needs: slopes, velocities, products with the Hessian, curvatures
 
@@ -154,14 +145,14 @@ def function_code(
 ) -> ArrayCode:
     """The compiled functions of a system that is given by Numba functions, of so many degrees of freedom."""
     forces = Functions(gradient, hessian_vector if level else None, inverse_mass, driven)
-    none: Any = None
-    return ArrayCode(FunctionSplitting(none, level, monomials, compensated, friction, ndof=ndof, timed=driven), forces)
+    return ArrayCode(FunctionSplitting(level, monomials, compensated, friction, ndof=ndof, timed=driven), forces)
 
 
 @dataclass(frozen=True)
 class FunctionSplitting(Splitting):
     """The kicks and drifts of a system by functions, which has no symbols: of a driven one the letter is the time."""
 
+    symbols: Any = field(default=None, init=False)
     ndof: int = 1
     timed: bool = False
     own = 0

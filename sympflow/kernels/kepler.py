@@ -639,7 +639,7 @@ class KeplerKernel(Kernel):
         self.columns = np.array([first, *inner, end + first, end])
 
     def _table(self, h: Any, *pieces: Any) -> Columns:
-        """The columns of pieces in turn, those of the processor, every other, for a step forwards."""
+        """The columns of pieces in turn; every second one is of the processor, always for a step forwards."""
         h = np.asarray(h, dtype=float)[..., None, None]
         made = [
             (abs(h) if k % 2 else h) ** POWERS * np.reshape(piece, (-1, len(POWERS))) for k, piece in enumerate(pieces)

@@ -131,7 +131,7 @@ class NewtonCode(OneStep):
 
     @cached_property
     def leftover(self) -> list[float]:
-        """Numbers c with Σ_i c_i A_ij = 1."""
+        """The solution c of A c = 1, so that Σ_i v_i = c·Aᵀv."""
         return [float(x) for x in np.linalg.solve(np.array(self.tableau[0], dtype=float), np.ones(self.stages))]
 
 

@@ -345,8 +345,7 @@ class PairSums(Forces):
     def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
         super().__init__(None)
         self.dim, self.columns, self.data = local.dim, len(local.first), []
-        none: Any = None
-        self.splitting = FunctionSplitting(none, level, (), compensated, 0 if damped else None)
+        self.splitting = FunctionSplitting(level, (), compensated, 0 if damped else None)
         self._stages = ArrayCode(self.splitting, self)
         kinds = tuple(KINDS)[: len(self.splitting.terms)]
         self.laws = {kind: PairLaw(local, KINDS[kind]) for kind in kinds}

@@ -179,7 +179,7 @@ class SplittingLoops:
         varied: bool = False,
         ranges: Ranges | None = None,
     ) -> SplittingRollouts:
-        """The compiled functions for kicks of a level, see `Scheme`; `varied` for `VariedKernel`.
+        """The compiled functions for kicks of a level, see `Scheme`; `varied` where trajectories have own values.
 
         Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
         """
@@ -350,10 +350,10 @@ def _layered_code(layered: LayeredPotential, level: int, compensated: bool, mono
 class SplittingKernel(Kernel):
     """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`.
 
-    With `values` (k, N) those of batches of N trajectories, each with its own values of `SplittingLoops.values`. They
-    take the steps of a system with its values; with compensated sums, force gradients, friction and driving up to
+    With `values` (k, N) the loops of batches of N trajectories, each with its own values of `SplittingLoops.values`. It
+    takes the steps of a system with its values; with compensated sums, force gradients, friction and driving up to
     rounding: products of values, which are part of the code there, or taken out of loops, may be fused with sums here.
-    A batch may be several of such ones, one after the other.
+    Several such batches may be given as one, one after the other.
     """
 
     def __init__(

@@ -132,7 +132,11 @@ def _check(expressions: Iterable[sp.Expr], samples: Mapping[str, Samples]) -> No
     for f in with_symbols(list(expressions))[0]:
         check_recorded(f)
     for each in samples.values():
-        check_samples(each)
+        if each.c.size > MOST_SAMPLED:
+            raise NotCompiled(
+                f"`params` has samples of {len(each.x)} times, more than compiled code holds: give fewer than "
+                f"{MOST_SAMPLED // len(each.c)}, or use backend='array'."
+            )
 
 
 def _values(expressions: Iterable[sp.Expr], known: dict[Any, Any], samples: Mapping[str, Samples]) -> list[Any]:
@@ -161,16 +165,6 @@ def letters_of_time(
 
 
 # functions of the time that are given by samples ----------------------------------------------------------------------
-
-
-def check_samples(samples: Samples) -> None:
-    """Raise a ValueError if there are more than compiled code holds."""
-    c = samples.c
-    if c.size > MOST_SAMPLED:
-        raise NotCompiled(
-            f"`params` has samples of {len(samples.x)} times, more than compiled code holds: give fewer than "
-            f"{MOST_SAMPLED // len(c)}, or use backend='array'."
-        )
 
 
 def sampled_value(samples: Samples, order: int, t: Value) -> Value:

@@ -314,18 +314,12 @@ def _looks(save: np.ndarray, n_steps: int, limit: float) -> np.ndarray:
     return np.concatenate([[*range(a + EVERY, b, EVERY), b] for a, b in pairwise([0, *ends.tolist()])])
 
 
+@kept
 def tangent_code(system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool) -> TangentCode:
     """The compiled functions of a system with k vectors, made once; NotCompiled says why there are none."""
     lacks = _lacks(system)
     if lacks:
         raise NotCompiled(lacks)
-    return _tangent_code(system, level, monomials, vectors, grows)
-
-
-@kept
-def _tangent_code(
-    system: HamiltonianSystem, level: int, monomials: Monomials, vectors: int, grows: bool
-) -> TangentCode:
     splitting = splitting_loops(system).splitting(level, monomials)
     code: TangentCode = shared((splitting.key, vectors, grows), lambda: TangentCode(splitting, vectors, grows))
     return code

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import sympy as sp
 
 GivenSystem: TypeAlias = "HamiltonianSystem | str | sp.Basic"
-"""What functions take as a system: one, the name of a scene, or H as a formula, in text or symbols."""
+"""A system, the name of a scene, or H as a formula, in text or symbols."""
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*([-_][A-Za-z0-9]+)*")
 

@@ -473,6 +473,8 @@ ANSWERED = {
     "a parameter without --": (["solve", "harmonic-oscillator", "omega=3"], "as --omega 3"),
     "an equation": (["solve", "H = p**2/2"], "right side alone, without H ="),
     "a missing sign": (["solve", "p^2/2m"], r"write 2\*m"),
+    "a driven formula without a value": (["solve", "p**2/2 + a*q*cos(t)"], "`--a` is missing"),
+    "an end of a driven formula": (["solve", "p**2/2 + q*cos(t)", "--t", "3"], "did you mean --t-end"),
     "a keyword": (["solve", "p^2/2 + lambda*q"], "'lambda', which is a word of Python"),
     "a foreign option": (["solve", "pendulum", "--solver", "verlet"], "did you mean --method"),
     "a capital": (["solve", "kepler", "--E", "0.3"], "did you mean --e"),

@@ -308,6 +308,18 @@ def test_runs_files_and_copies_are_the_flow(lawful, tmp_path):
         np.testing.assert_allclose(run.y, direct, rtol=0, atol=1e3 * EPS * float(1 + direct.abs().max()))
 
 
+@pytest.mark.parametrize("backend", ["compiled", "array"])
+def test_one_planet_is_back_after_its_period(backend):
+    """Whatever the trained numbers are: its motion is Kepler's, and nothing kicks it."""
+    masses = [1.0, 0.01]
+    system = HamiltonianSystem.planets(masses, elements={"a": [1.3], "e": [0.3], "inc": [0.2]}, encounter=None)
+    period = 2 * np.pi * np.sqrt(1.3**3 / sum(masses))
+    flow = KeplerFlow(system.ndof, 2, 1, period / 16, system=system)
+    flow.kicks.copy_(torch.linspace(0.1, 0.4, 4))
+    sol = solve(system, flow, (0, period), t_eval=[0.3, period], backend=backend)
+    np.testing.assert_allclose(sol.y[:, -1], system.y0, rtol=0, atol=16 * 64 * EPS)
+
+
 def test_a_flow_in_another_time_knows_the_system_that_it_is_for():
     flow = FLOWS["clocked"][0]()
     origin = {"system": KEPLER.name, "fingerprint": list(KEPLER.fingerprint), "shift": TRANSFORMED.params["shift"]}

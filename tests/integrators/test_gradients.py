@@ -380,3 +380,12 @@ ONE = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
 def test_what_no_gradient_flows_to_is_refused(call, error, message):
     with pytest.raises(error, match=message):
         call(torch.tensor(start(CUBIC, ()), requires_grad=True))
+
+
+@pytest.mark.parametrize("force", ["Heaviside(t - c)", "floor(c*t)", "Piecewise((1, t < c), (0, True))"])
+def test_parameters_that_move_jumps_are_refused(force):
+    """The derivative of a state by the time of a jump is that of no stage: for Θ(t − c), −sin(3 − c)."""
+    system = HamiltonianSystem.from_sympy(f"p**2/2 + q**2/2 - q*{force}", time="t", params={"c": 1.3}, y0=[0.0, 0.0])
+    c = torch.tensor(1.234, dtype=torch.float64, requires_grad=True)
+    with pytest.raises(ValueError, match="c that requires gradients and moves the times at which H jumps"):
+        solve(system, "kahan_li8", (0, 3), dt=0.1, params={"c": c})
