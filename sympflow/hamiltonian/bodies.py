@@ -328,6 +328,7 @@ class PairsHamiltonian(LocalHamiltonian):
         """Return True if two of not too many bodies move about along their line, in one of the states (..., 2d)."""
         if self.n_bodies * (self.n_bodies - 1) // 2 > CHEAP_PAIRS:
             return False
+        y = y.astype(float)  # rounding of single precision would hide such motion
         for pairs in self._pairs(y[..., : self.ndof], y[..., self.ndof :] / np.repeat(self.inertia, self.dim)):
             x, w = pairs.x
             along, speed = _dot(x, w) ** 2, _dot(w, w)

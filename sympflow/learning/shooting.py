@@ -33,6 +33,7 @@ from sympflow.training.session import OutOfTime
 
 LEAST_DAMPING = 1e-15
 TRIES = 12
+STATES = 400  # by which the step of a scheme is chosen
 FINEST = 1e-13  # of an observation, relative to the spread of the coordinate
 
 
@@ -318,7 +319,6 @@ def minimized(
     iterations: int = 50,
     gain: float = 1e-3,
     patience: int = 3,
-    damping: float = 1e-3,
     stop: Stop = never,
 ) -> Fit:
     """Levenberg–Marquardt steps until `patience` of them together gain less than this share of the cost."""
@@ -347,7 +347,7 @@ def minimized(
         reason = "it was stopped" if stop() else "the orbits are not finite at the start"
         return Fit(problem, theta, states, costs[0], first, costs, reason)
     options: Any = {"tries": TRIES, "iterations": iterations, "patience": patience, "gain": gain, "stop": stop}
-    end, reason = descend(start, costs, model_at, cost, damping=Damping(damping, LEAST_DAMPING), **options)
+    end, reason = descend(start, costs, model_at, cost, damping=Damping(least=LEAST_DAMPING), **options)
     try:
         normal = normal_at(end)
     except OutOfTime:  # the point before is known
@@ -413,7 +413,7 @@ def chosen_method(
     return best[1]
 
 
-def _gaps(data: Trajectories, most: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _gaps(data: Trajectories) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some states (2d, N) with the times to the next points (N,), the widest among them, and their own times."""
     found = [
         (run.y[:, k], run.t[k + 1] - run.t[k], run.t[k])
@@ -428,7 +428,7 @@ def _gaps(data: Trajectories, most: int = 400) -> tuple[np.ndarray, np.ndarray, 
     gaps, times = np.array([one[1:] for one in found]).T
     chosen = np.unique(
         np.concatenate(
-            [np.argsort(gaps)[-most // 4 :], np.linspace(0, len(gaps) - 1, min(most, len(gaps))).astype(int)]
+            [np.argsort(gaps)[-STATES // 4 :], np.linspace(0, len(gaps) - 1, min(STATES, len(gaps))).astype(int)]
         )
     )
     return np.stack([found[i][0] for i in chosen], axis=1), gaps[chosen], times[chosen]

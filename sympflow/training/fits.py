@@ -398,8 +398,6 @@ class PrimedFit(_LossFit):
         shape["processor"] = 6 if self.processor is None else self.processor
         if self.scheme is None and self.stages is None:
             shape["stages"] = 3
-        elif self.scheme is not None:
-            shape["stages"] = None
         flow = SympFlow.primed(system, **shape)
         if earlier is not None:
             assert isinstance(earlier, PrimedFlow)

@@ -454,7 +454,8 @@ def _with_defaults(system: HamiltonianSystem, domain: Domain, fit: PrimedFit) ->
     dt: Any = default.dt
     if fit.stages is not None and default.stages is not None:
         dt = float(f"{dt * fit.stages / default.stages:.3g}")
-    return fit.but(dt=dt, stages=default.stages, processor=default.processor)
+    stages = default.stages if fit.scheme is None else None
+    return fit.but(dt=dt, stages=stages, processor=default.processor)
 
 
 def _new_primed(

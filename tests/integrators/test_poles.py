@@ -207,6 +207,8 @@ def test_two_bodies_in_space_do_not_pass_each_other(dim, V, speed):
     assert sol.status == -1
     assert "passed r = 0 of two bodies" in sol.message
     if dim > 1 and speed:
+        along_an_axis = np.outer([-2, 2, speed, -speed], np.eye(dim)[0]).ravel()
+        assert sf.solve(system, "verlet", (0, 1), along_an_axis, dt=0.1, dtype="float32").status == -1
         y0[:dim] += across
         assert sf.solve(system, "verlet", (0, 1), y0, dt=0.001).success
 

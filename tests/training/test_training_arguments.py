@@ -103,6 +103,7 @@ NEW = {"kind": "sympflow", "pairs": 1, "hidden": (5,)}
         (P, {"callback": 5}, T, "^`callback` must be a function .*; got 5: leave it out"),
         (P, {"checkpoint": 5}, T, "^`checkpoint` must be the path of a file; got 5"),
         (P, {"resume": 5}, T, "^`resume` must be the path of a file; got 5"),
+        (P, {"scheme": "yoshida4", "stages": 7}, V, "^`stages` and `scheme` were both given: leave out"),
         (P, {"dt": "1"}, V, "^`dt` must be a positive finite number; got '1'"),
         (P, {"stages": 2, "energy_weight": "1"}, V, "^`energy_weight` must be finite and at least 0; got '1'"),
         (P, {"stages": 2, "frozen_weight": "1"}, V, "^`frozen_weight` must be positive and finite; got '1'"),
