@@ -317,7 +317,8 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     Where energy is not kept, the motion at the start and the end must not be too fast for the step.
 
     H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
-    steps that are not long, which would take twice the time. Its size is the largest of ½ Σ|y_i ∂H/∂y_i| there, that of an oscillator.
+    steps that are not long, which would take twice the time. Its size is the largest of ½ Σ|y_i ∂H/∂y_i| there, that
+    of an oscillator.
     """
     if not isinstance(integrator, FixedStep):
         return
