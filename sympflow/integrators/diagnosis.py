@@ -328,7 +328,7 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if integrator.trained:
         return
     known = integrator.dt is None or (not system.step_is_open and integrator.dt <= system.dt)
-    few = n_steps < FEW_STEPS and (known or integrator.dt <= SAFE * system.dt)
+    few = n_steps < FEW_STEPS and (known or integrator.step_length(system) <= SAFE * system.dt)
     seen = LOOKED_AT * (not few) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
     looked = n and n_steps >= FEW_STEPS and not (known or system.keeps_energy)
     if looked and (told := _too_fast(outcome, integrator, problem)):
