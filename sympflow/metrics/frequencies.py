@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_counts
+from sympflow.arguments import check_counts, warn
 from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.grid import Grid
@@ -30,6 +30,7 @@ OF_OTHER_METHODS = 4096  # samples, where steps are of no fixed length
 MOST_VALUES = 1 << 21  # numbers that are held at a time
 MOST_NEWTON = 30
 FAINTEST = 1e-13
+STRAIGHT = 0.98  # correlation of a coordinate with the time from which on it is a ramp
 """Lines fainter than this, relative to the first one, are rounding: they are NaN."""
 
 Signal = Callable[[np.ndarray], np.ndarray]
@@ -149,12 +150,18 @@ def frequencies(
         sol = solve(
             orbits.system,
             orbits.integrator,
-            orbits.t_span,
+            (orbits.t_span[0], float(times[-1])),
             rows[start : start + most],
             t_eval=times,
             backend=backend,
             on_domain_exit="ignore",
         )
+        if signal is None and (growing := _growing(sol.y[:, : system.ndof], times)):
+            warn(
+                f"`signal`: {growing} grows with the time, as an angle that turns over, and its strongest lines are those "
+                "of a ramp. Pass the sine and cosine of the angle, signal=lambda y: np.exp(1j * y[..., :1, :]).",
+                RuntimeWarning,
+            )
         z = signals(taken, sol.y, len(times))
         parts.append(lines(z, times, n))
         status.append(np.broadcast_to(np.asarray(sol.status), len(z)))
@@ -194,6 +201,16 @@ def rotations(system: HamiltonianSystem) -> Signal:
     """The signals s q − ip/s of states, (..., 2d, m) to (..., d, m), with the factors s of `natural_scale`."""
     d, s = system.ndof, natural_scale(system)[:, None]
     return lambda y: s * y[..., :d, :] - 1j * (y[..., d:, :] / s)
+
+
+def _growing(q: np.ndarray, times: np.ndarray) -> str:
+    """The first coordinate (N, d, m) that is nearly a straight line in time, or nothing."""
+    t = times - times.mean()
+    with np.errstate(all="ignore"):
+        part = q - q.mean(-1, keepdims=True)
+        correlation = (part @ t) / np.sqrt((part**2).sum(-1) * (t @ t))
+    found = np.flatnonzero((np.abs(correlation) > STRAIGHT).any(0))
+    return f"q{found[0] + 1}" if len(found) else ""
 
 
 def signals(signal: Signal, y: np.ndarray, m: int) -> np.ndarray:

@@ -77,3 +77,14 @@ def test_bad_arguments_of_escapes():
         sympflow.escape_times(system, "verlet", (0, 1), outside="far")
     with pytest.raises(ValueError, match="has no fixed steps"):
         sympflow.escape_times(system, "dop853", (0, 1), outside=3.0)
+
+
+def test_a_turning_angle_needs_a_signal():
+    """H = p²/2 − cos q at p = 3 turns at a rate near 3 − 1/27."""
+    run = {"t_span": (0, 300), "y0": [0.0, 3.0]}
+    with pytest.warns(RuntimeWarning, match="`signal`: q1 grows with the time"):
+        sympflow.frequencies("p**2/2 - cos(q)", **run)
+    found = sympflow.frequencies("p**2/2 - cos(q)", signal=lambda y: np.exp(1j * y[..., :1, :]), **run)
+    sol = sympflow.solve("p**2/2 - cos(q)", "srkn11b", dt=0.01, **run)
+    assert found.frequencies[0, 0] == pytest.approx(sol.y[0, -1] / 300, abs=0.02)
+    assert found.message == "The solver successfully reached the end of the integration interval."
