@@ -145,7 +145,7 @@ class SymbolicHamiltonian(Definition):
                 "HamiltonianSystem.pairs."
             )
         plain = {sp.Symbol("q", real=True), sp.Symbol("p", real=True)} & H.free_symbols
-        if plain and ndof > 1:
+        if plain and (ndof > 1 or any(sp.Symbol(f"{s.name}1", real=True) in H.free_symbols for s in plain)):
             raise ValueError("`expression` mixes q, p with numbered coordinates: write q1, p1.")
         self.ndof = ndof
         self.q = tuple(sp.symbols(f"q1:{ndof + 1}", real=True))
