@@ -163,6 +163,7 @@ def test_a_zero_on_a_step_counts_once_and_a_zero_at_the_start_counts():
     assert [t.tolist() for t in sol.t_events] == [[0.5], [0.0]]
 
 
+@pytest.mark.filterwarnings("ignore:`dt` 1 is too long")
 @pytest.mark.parametrize("as_tensor", [False, True])
 def test_long_steps_are_sampled_within(as_tensor):
     """By default every `system.dt`, so that both of two close zeros are seen; the run stays the same."""
