@@ -158,8 +158,8 @@ def frequencies(
         )
         if signal is None and (growing := _growing(sol.y[:, : system.ndof], times)):
             warn(
-                f"`signal`: {growing} grows with the time, as an angle that turns over, and its strongest lines are those "
-                "of a ramp. Pass the sine and cosine of the angle, signal=lambda y: np.exp(1j * y[..., :1, :]).",
+                f"`signal`: {growing} grows with the time, as an angle that turns over, and its strongest lines are "
+                "those of a ramp. Pass the sine and cosine of the angle, signal=lambda y: np.exp(1j * y[..., :1, :]).",
                 RuntimeWarning,
             )
         z = signals(taken, sol.y, len(times))
