@@ -55,7 +55,11 @@ class Racer:
         """n steps, at most `OUTPUTS` of them kept."""
         t_span = (0.0, years * YEAR)
         save_every = max(1, math.ceil(n / OUTPUTS))
-        return solve(system, self.method, t_span, dt=t_span[1] / n, save_every=save_every, on_domain_exit="ignore")
+        quietly: dict[str, Any] = {
+            "on_domain_exit": "ignore",
+            "diagnose": False,
+        }  # steps that are too long are tried too
+        return solve(system, self.method, t_span, dt=t_span[1] / n, save_every=save_every, **quietly)
 
     def error(self, system: HamiltonianSystem, years: float, n: int) -> float:
         with np.errstate(all="ignore"):
