@@ -216,7 +216,7 @@ def test_gradients_by_times(system, batch, t_eval):
 
 @pytest.mark.parametrize("method", ["verlet", "rk4", "gauss_legendre4"])
 def test_transforms_of_runs(method):
-    """What torch.func makes of a run that is compiled, by tensor operations: Jacobians and Hessians, either way."""
+    """Jacobians and Hessians of a compiled run by torch.func, forward and reverse, by tensor operations."""
     y0 = torch.tensor(start(CUBIC, ()))
 
     def end(y):
