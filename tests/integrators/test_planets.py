@@ -647,3 +647,10 @@ def test_a_body_without_mass_that_meets_a_planet():
     sol = solve(system, "wisdom_holman", (0, 2000.0), dt=0.2)
     assert sol.status == -1
     assert "Bodies 1 and 3 were" in sol.message
+
+
+def test_a_planet_on_a_straight_line_bounces_without_a_word():
+    system = HamiltonianSystem.planets([1.0, 1e-3], y0=[0.0, 0, 0, 1, 0, 0, *[0.0] * 6])
+    sol = solve(system, "wisdom_holman", (0, 3), dt=0.01)
+    assert sol.success
+    assert sympflow.max_energy_error(sol) < 1e-12
