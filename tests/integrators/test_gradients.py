@@ -66,6 +66,11 @@ def test_values_are_those_of_arrays_and_gradients_those_of_backpropagation(syste
             assert sol.stats["backend"] == "compiled"
     scale = found["array"].abs().max()
     torch.testing.assert_close(found["compiled"] / scale, found["array"] / scale, rtol=0, atol=1e-11)
+    h, v = 3e-4, np.random.default_rng(2).normal(size=y0.shape)  # differences are right to h⁴, and to rounding over h
+    ends = [weighted(solve(system, method, y0=y0 + k * h * v, **run)) for k in (-2, -1, 1, 2)]
+    difference = float(ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * h)
+    along = float((found["compiled"] * torch.as_tensor(v)).sum())
+    assert along == pytest.approx(difference, rel=0, abs=1e-9 * float(scale) * v.size)
 
 
 @pytest.mark.parametrize(
