@@ -155,7 +155,7 @@ def differentiable(*arrays: Any) -> bool:
     That is a graph (reverse mode), a tangent (forward mode), a transform of `torch.func`, or a graph that
     `torch.compile` traces.
     """
-    return any(_is_followed(x) for x in arrays if is_tensor(x))
+    return any(map(_is_followed, filter(is_tensor, arrays)))
 
 
 def values(x: Any) -> np.ndarray | None:
@@ -227,7 +227,7 @@ def lanes(x: Array) -> int:
 
 def readable(x: Array) -> bool:
     """Return True if the values of `x` are there, one for each entry: not under vmap, nor where a graph is traced."""
-    if is_tensor(x) and _is_plain(x):
+    if not is_tensor(x) or _is_plain(x):
         return True
     plain, order = _behind(x)
     return plain is not None and len(order) == x.ndim
