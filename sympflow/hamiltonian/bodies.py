@@ -328,11 +328,13 @@ class PairsHamiltonian(LocalHamiltonian):
         """Return True if two of not too many bodies move about along their line, in one of the states (..., 2d)."""
         if self.n_bodies * (self.n_bodies - 1) // 2 > CHEAP_PAIRS:
             return False
-        y = y.astype(float)  # rounding of single precision would hide such motion
-        for pairs in self._pairs(y[..., : self.ndof], y[..., self.ndof :] / np.repeat(self.inertia, self.dim)):
-            x, w = pairs.x
-            along, speed = _dot(x, w) ** 2, _dot(w, w)
-            if ((along >= NEARLY * pairs.s * speed) & (speed > 0)).any():
+        z = y.reshape(*y.shape[:-1], 2, self.n_bodies, self.dim).astype(float)  # in single precision it would not show
+        z[..., 1, :, :] /= self.inertia[:, None]
+        for i, j in self._ends([z[..., 0, :, :]]):
+            ways = z.take(i, -2) - z.take(j, -2)
+            products = np.einsum("...aik,...bik->ab...i", ways, ways)
+            along, speed = products[0, 1], products[1, 1]
+            if ((along * along >= NEARLY * products[0, 0] * speed) & (speed > 0)).any():
                 return True
         return False
 
@@ -350,12 +352,12 @@ class PairsHamiltonian(LocalHamiltonian):
         """Bodies may meet at r = 0 without softening."""
         return not self.softening and self.n_bodies > 1
 
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: Any, conserves: bool) -> np.ndarray:
         """By an energy that is off by more than T + |V| of the start, and a T of more than twice that."""
         pairs = self.n_bodies * (self.n_bodies - 1) // 2
-        T0, T = ((self._of_bodies(y[:, self.ndof :]) ** 2).sum(-1) @ (0.5 / self.inertia) for y in (starts, ends))
+        T0, T = np.square(np.array([starts, ends])[..., self.ndof :]) @ np.repeat(0.5 / self.inertia, self.dim)
         found = T > 2 * T0
-        if not conserves or not found.any() or (pairs > CHEAP_PAIRS and n_steps < MANY_STEPS):
+        if not conserves or not found.any() or (pairs > CHEAP_PAIRS and np.max(n_steps) < MANY_STEPS):
             return np.zeros(len(ends), dtype=bool)
         with np.errstate(all="ignore"):
             V0, V = (self.potential(y[:, : self.ndof]) for y in (starts, ends))

@@ -311,9 +311,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
         "system.kicks(t0, t1) to the next",
     )
     mro = type(integrator).__mro__
-    if system.external_force is not None and not (
-        integrator.takes_forces and _speaks_itself(mro, "takes_friction")
-    ):
+    if system.external_force is not None and not (integrator.takes_forces and _speaks_itself(mro, "takes_friction")):
         system.check_conservative(f"which method {integrator.name!r} does not take", "")
     if system.friction and not (integrator.takes_friction and _speaks_itself(mro, "takes_friction")):
         what = "was trained without it" if integrator.trained else "does not take it"
