@@ -140,7 +140,7 @@ def to_numpy(x: Array) -> np.ndarray:
         `torch.compile` traces for none.
     """
     found = values(x)
-    if found is None or found.ndim != np.ndim(x):
+    if found is None or (found is not x and found.ndim != np.ndim(x)):
         where = "in a graph that torch.compile traces" if found is None else "inside torch.func.vmap"
         raise TypeError(
             f"The values of a tensor of shape {tuple(x.shape)} are needed as numbers, which it has not {where}: make "
@@ -163,9 +163,11 @@ def values(x: Any) -> np.ndarray | None:
 
     None where there are none to be read, in a graph that `torch.compile` traces.
     """
-    plain, order = (x, None) if is_tensor(x) and _is_plain(x) else _behind(x)
-    if plain is None or isinstance(plain, np.ndarray):
-        return plain
+    if not is_tensor(x):
+        return np.asarray(x)
+    plain, order = (x, None) if _is_plain(x) else _behind(x)
+    if plain is None:
+        return None
     import torch
 
     with torch._C._DisableFuncTorch():

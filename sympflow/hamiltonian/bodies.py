@@ -446,8 +446,7 @@ class PairsHamiltonian(LocalHamiltonian):
             return
         rows = n if self._all_at_once else max(1, most_pairs(bodies) // n)
         for start in range(0, n - 1, rows):
-            i, j = _of_triangle(min(rows, n - 1 - start), n - start)
-            yield i + start, j + start
+            yield _of_triangle(start, min(rows, n - 1 - start), n)
 
     def _within_cutoff(self, states: np.ndarray) -> np.ndarray:
         """The pairs (P, 2) that are nearer than the cut-off in one of the states (N, n, dim) at least."""
@@ -491,10 +490,10 @@ def most_pairs(bodies: Sequence[Array]) -> int:
 
 
 @lru_cache(maxsize=16)
-def _of_triangle(rows: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices above the diagonal, row by row."""
-    i, j = np.triu_indices(rows, 1, n)
-    return i, j
+def _of_triangle(start: int, rows: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices above the diagonal, row by row from a start."""
+    i, j = np.triu_indices(rows, 1, n - start)
+    return i + start, j + start
 
 
 @cache
