@@ -1,4 +1,4 @@
-"""What is made when it is used: values kept with an object, and imports, of plug-ins and of what may be missing."""
+"""Lazy values: results kept with an object, and imports of plug-ins and of packages that may be missing."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def kept(make: Callable[Concatenate[K, P], T], most: float = inf) -> Callable[Co
 
 
 def lately_kept(make: Callable[Concatenate[K, P], T]) -> Callable[Concatenate[K, P], T]:
-    """Make a function keep a few of its values, those of states for instance, of which there may be any number."""
+    """Make a function keep a few of its latest values, those of states for instance."""
     return kept(make, MOST_KEPT)
 
 

@@ -361,7 +361,8 @@ def _solved(integrator: Integrator, problem: Problem, action: str, rows: Paramet
     able = problem.store is None and problem.parameter_values is None
     told, jumps = landings(integrator, between, problem.t0, problem.t1, able)
     if told:
-        warn(told, RuntimeWarning)
+        without = "a `store`" if problem.store is not None else "gradients by `params`, and with `t_eval`"
+        warn(told if able else f"{told} Without {without}, steps end at jumps.", RuntimeWarning)
     if between is not system:
         _check_impulses(problem, integrator)
     if between is not system or jumps:

@@ -276,5 +276,8 @@ def test_a_tolerance_below_single_precision_is_refused():
 @pytest.mark.parametrize("dt", [0.5, 3.0, 100.0])
 def test_a_run_of_few_steps_that_are_far_too_long_is_told(dt):
     system = H("p**2/2 + q**2/2 + 0.3*q**4", y0=[1, 0])
-    with pytest.warns(RuntimeWarning, match=f"`dt` {dt:g} is too long for method 'verlet': the energy of the run"):
+    with pytest.warns(
+        RuntimeWarning, match=f"`dt` {dt:g} is too long for method 'verlet': the energy of the run"
+    ) as told:
         solve(system, "verlet", (0, 10), dt=dt)
+    assert told[0].filename == __file__  # the line of the user

@@ -16,7 +16,7 @@ PARAMETERS = {"allow_extra_args": True, "ignore_unknown_options": True}
 
 
 class Command(TyperCommand):
-    """A command that refuses an option with two values, of which the last one would count."""
+    """A command that refuses an option given twice, instead of taking the last value."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         order: list[Any] = self.make_parser(ctx).parse_args(args=[*args])[2]

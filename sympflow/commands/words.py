@@ -304,7 +304,7 @@ def _parted(word: str) -> tuple[str, Callable[..., HamiltonianSystem], list[str]
     if name not in scene_names():
         key, equals, value = word.partition("=")
         if equals:
-            raise Usage(f"`system` {word!r} is no system: give a parameter as --{key} {value}.")
+            raise Usage(f"`system` {word!r} is not a system: give a parameter as --{key} {value}.")
         if word in available_methods():
             raise Usage(f"`system` {word!r} is a method: give it as --method {word}.")
         files = [str(path) for path in map(Path, (f"{word}.py", f"{word}.toml")) if path.is_file()]

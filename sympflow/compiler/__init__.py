@@ -9,4 +9,4 @@ __all__ = ["NotCompiled"]
 
 
 class NotCompiled(ValueError):
-    """The reason why there is no compiled code, for which array operations may do."""
+    """The reason why code cannot be compiled; array operations may serve instead."""

@@ -437,7 +437,7 @@ class PairsHamiltonian(LocalHamiltonian):
         return self.n_bodies <= ALL_AT_ONCE and self.cutoff is None
 
     def _ends(self, bodies: Sequence[Array]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Indices i < j of pairs, of all states (..., n, dim) together, of which the first array is of positions."""
+        """Indices i < j of pairs, of all states (..., n, dim) together; the first array holds positions."""
         n = self.n_bodies
         if self.cutoff is not None:
             near, most = self._within_cutoff(to_numpy(bodies[0]).reshape(-1, n, self.dim)), most_pairs(bodies)

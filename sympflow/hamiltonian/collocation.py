@@ -72,7 +72,7 @@ def stages(system: HamiltonianSystem, tableau: Tableau, y: Array, h: Any, times:
         start, length = y.detach(), detached(h)
         K, iterations = _solved_stages(system, start, length, times, A, scale)
         M, _ = newton_matrix(system, start[..., None, :] + A @ K, length, times, A, scale)
-        sizes = variable_sizes(start, K, 0 * M[..., 0])
+        sizes = _kind_sizes(M, y.shape[-1])
         inverse = sizes[..., :, None] * torch.linalg.inv_ex(_scaled(M, sizes))[0] / sizes[..., None, :]
     for _ in range(DIFFERENTIATED):
         K = K - (inverse @ _residual(system, y, K, h, times, A, scale)[..., None])[..., 0].reshape(K.shape)
@@ -167,6 +167,16 @@ def variable_sizes(y: Array, K: Array, residual: Array) -> Array:
     most = int(0.4 * math.log2(float(xp.finfo(y.dtype).max)))  # so that their ratios are numbers
     powers = xp.exp2(xp.clip(xp.round(xp.log2(size)), -most, most)).reshape(*y.shape[:-1], 1, n) + 0 * K
     return powers.reshape(*y.shape[:-1], -1)
+
+
+def _kind_sizes(M: Any, n: int) -> Any:
+    """Sizes of q and p, (..., s·2d), by which each moves the other alike; those of a state may be of its rounding."""
+    s, d = M.shape[-1] // n, n // 2
+    most = abs(M).reshape(*M.shape[:-2], s, 2, d, s, 2, d).amax((-6, -4, -3, -1))
+    ratio = (most[..., 1, 0] / most[..., 0, 1]).sqrt()
+    ratio = library(M).where((ratio > 0) & (ratio < math.inf), ratio, 1 + 0 * most[..., 0, 0])
+    sizes = stack([1 + 0 * ratio, ratio])[..., None, :, None]
+    return sizes.expand(*M.shape[:-2], s, 2, d).reshape(*M.shape[:-2], s * n)
 
 
 def _scaled(M: Array, sizes: Array) -> Array:

@@ -216,6 +216,7 @@ def kepler_changes(x: Sequence[Any], v: Sequence[Any], mu: Any, t: Any, rates: S
 # elements ----------------------------------------------------------------------------------------------------------
 
 
+@np.errstate(all="ignore")
 def elements_of(x: np.ndarray, v: np.ndarray, mu: Any) -> np.ndarray:
     """Osculating elements (..., 6) of x and v (..., 3): a, e, inclination, node, argument of pericentre, M.
 
@@ -236,14 +237,14 @@ def elements_of(x: np.ndarray, v: np.ndarray, mu: Any) -> np.ndarray:
     round_ = e < 1e-14
     peri = np.where(round_, 0.0, np.arctan2((towards * across).sum(-1), (towards * along).sum(-1)))
     f = np.arctan2((x * across).sum(-1), (x * along).sum(-1)) - peri
-    with np.errstate(all="ignore"):
-        bound, root = e < 1, np.sqrt(np.abs(1 - e) / (1 + e)) * np.tan(f / 2)
-        E = np.where(bound, 2 * np.arctan(root), 2 * np.arctanh(np.where(np.abs(root) < 1, root, 0.0)))
-        M = np.where(bound, np.mod(E - e * np.sin(E), 2 * np.pi), e * np.sinh(E) - E)
+    bound, root = e < 1, np.sqrt(np.abs(1 - e) / (1 + e)) * np.tan(f / 2)
+    E = np.where(bound, 2 * np.arctan(root), 2 * np.arctanh(np.where(np.abs(root) < 1, root, 0.0)))
+    M = np.where(bound, np.mod(E - e * np.sin(E), 2 * np.pi), e * np.sinh(E) - E)
     turn = 2 * np.pi
     return np.stack([a, e, inclination, np.mod(node, turn), np.mod(peri, turn), M], axis=-1)
 
 
+@np.errstate(all="ignore")
 def states_of(elements: np.ndarray, mu: Any) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities (..., 3) of elements (..., 6): the pericentre, moved by the time that M tells."""
     a, e, inclination, node, peri, M = np.moveaxis(np.asarray(elements, dtype=float), -1, 0)

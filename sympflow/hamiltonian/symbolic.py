@@ -752,7 +752,7 @@ def _split(H: sp.Expr, q: tuple[sp.Symbol, ...], p: tuple[sp.Symbol, ...]) -> tu
 
 
 def _is_mixed(f: sp.Expr, q: Sequence[sp.Symbol], p: Sequence[sp.Symbol]) -> bool:
-    """True if f is no sum of a function of q and one of p, by its values at four states; False where these fail."""
+    """True if f is not a sum of a function of q and one of p, by its values at four states; False where these fail."""
     others = sorted(f.free_symbols - {*q, *p}, key=str)
     rng = np.random.default_rng(0)
     a, b, c, d, t = (rng.uniform(0.3, 0.9, n).tolist() for n in (*(len(q),) * 4, len(others)))

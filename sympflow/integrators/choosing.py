@@ -137,7 +137,7 @@ def _attractive_pole(system: HamiltonianSystem, states: bytes) -> tuple[str, boo
 
 def _centers(system: HamiltonianSystem, q: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     """Names and positions (n, d) of the zeros that are next to positions q of what vanishes where H is infinite."""
-    yield "q = 0", np.zeros_like(q)
+    yield "q = 0" if system.local is None else "r = 0", np.zeros_like(q)
     poles, d = system.definition.poles, system.ndof
     assert poles is not None
 

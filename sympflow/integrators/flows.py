@@ -39,9 +39,9 @@ if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do withou
 
 T = TypeVar("T")
 
-SEARCH, SEARCH_OF_EACH = 50_000, 2_000
+SEARCH, SEARCH_OF_EACH = 60_000, 2_000
 """Forces that take as long as what a run in another time needs besides, and each trajectory in a batch."""
-AT_A_TIME, AT_A_TIME_OF_EACH = 25, 200
+AT_A_TIME, AT_A_TIME_OF_EACH = 100, 600
 """Forces that take as long as finding the state of one trajectory, or of each in a batch, at a physical time."""
 _KNOWN: dict[tuple[Any, ...], Any] = {}
 

@@ -172,7 +172,7 @@ def _check_steps(stepper: Any) -> None:
     if stepper.problem.followed and not stepper.kernel.steps_tensors:
         raise ValueError(
             "`params` with gradients have no second derivatives, and none at times between two steps, where a system "
-            "has friction or the method is no splitting method: choose times on the grid, or detach them."
+            "has friction or the method is not a splitting method: choose times on the grid, or detach them."
         )
 
 

@@ -375,8 +375,7 @@ class Adaptive(Watched, RungeKutta):
         options: dict[str, Any] = {"max_num_steps": most}
         if trace.system.shortest_piece < math.inf:
             options["max_step"] = trace.system.shortest_piece
-        symbols = trace.system.symbols
-        if symbols is not None and symbols.jumps:
+        if trace.system.definition.may_jump:
             options["step_t"] = s[1:]  # the last step would be longer, and meet a jump beyond
         atol = self.tolerance_of(trace.system, y)
         try:

@@ -359,7 +359,7 @@ def _is_ours(method: Any, func: Any, options: Any) -> bool:
 def _landing(
     func: Any, t: Any, method: Any, options: dict[str, Any] | None, endless: bool = False
 ) -> dict[str, Any] | None:
-    """The options of a method of torchdiffeq by which it ends steps where a HamiltonianSystem jumps in t."""
+    """Options with which a method of torchdiffeq ends steps where a HamiltonianSystem jumps in t."""
     known, name = dict(options or {}), method or "dopri5"
     if not isinstance(func, HamiltonianSystem) or func.autonomous or not isinstance(t, Tensor) or not t.numel():
         return options

@@ -61,7 +61,7 @@ DRIVEN = (
     "Pass drive={} to `learn`."
 )
 NOT_HAMILTONIAN = (
-    "A vector field of cubic polynomials that is not Hamiltonian fits much better: the data are no motion of a "
+    "A vector field of cubic polynomials that is not Hamiltonian fits much better: the data are not a motion of a "
     "Hamiltonian in these coordinates, or these are not canonical."
 )
 FREQUENCIES = 1000
@@ -243,7 +243,7 @@ def hint(
 ) -> str | None:
     """The likeliest reason why the terms do not explain the data, with the remedy; None for none.
 
-    A force and drives that the model has already are no reason; beside any force friction is none.
+    A force and drives that the model already has are not reasons; beside any force, friction is not one either.
     """
     d, scales = data.ndof, data.scales
     smooth = smooth.some(MOST_SLOPES)

@@ -165,13 +165,13 @@ def _polynomial(degree: int, of: str, scales: np.ndarray, periods: np.ndarray) -
 
 
 def _series(harmonics: int, of: str, scales: np.ndarray, periods: np.ndarray) -> Sequence[Part]:
-    """A Fourier series, of degree 2 at least in what is no angle; of p of degree 2."""
+    """A Fourier series in the angles, of degree 2 at least in the other coordinates and of degree 2 in p."""
     degree = max(harmonics, 2) if of == "q" else 2
     return (Waves.up_to(harmonics, degree, of, scales, periods),) if np.isfinite(periods).any() else ()
 
 
 def _network(width: int, of: str, scales: np.ndarray, periods: np.ndarray) -> Sequence[Part]:
-    """A network beside the quadratic polynomials of the coordinates that are no angles."""
+    """A network beside quadratic polynomials of the coordinates that are not angles."""
     whole = Polynomial.up_to(2, of, scales)
     quadratic = whole.subset((whole.exponents[:, np.isfinite(periods)] == 0).all(axis=1))
     return quadratic, Network(of, width, scales, periods)

@@ -57,7 +57,7 @@ class Stepper(ABC):
         """
 
     def orbit(self, over: Over, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray) -> Orbit:
-        """States and derivatives after each of the gaps (k, N) between points, the first of which follows t (N,)."""
+        """States and derivatives after each of the gaps (k, N) between points; the first gap follows t (N,)."""
         for gap in gaps:
             if gap.any():
                 x, X = over(x, X, gap, t)
@@ -219,7 +219,7 @@ class Method:
     def orbit(
         self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray
     ) -> Orbit:
-        """States and derivatives after each of the gaps (k, N) between points, the first of which follows t (N,)."""
+        """States and derivatives after each of the gaps (k, N) between points; the first gap follows t (N,)."""
         return self.stepper.orbit(partial(self.over, model, theta), x, X, gaps, t)
 
 

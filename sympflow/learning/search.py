@@ -62,7 +62,7 @@ from sympflow.training.starts import step_of
 from sympflow.training.trainer import train
 
 SHARE = 3  # of families that are still to be tried, whose time is given to the next
-PRUNINGS = 3  # of a model by smooth curves, after each of which they tell its numbers anew
+PRUNINGS = 3  # of a model by smooth curves; its numbers are fitted anew after each
 HOPELESS = 2.0  # squares of increments, over those of the best model, from which a model is one of the last
 TABLE_STARTS = 8  # of the fit of the flow's numbers: no seconds, for what is found is not to depend on other load
 STEPPED = 100  # states by which the steps of a flow are chosen, where H is not separable

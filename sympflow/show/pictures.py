@@ -62,7 +62,7 @@ def trajectory_figure(
 
 
 def _coarse(y: np.ndarray) -> bool:
-    """True for curves (N, 2, n) that turn so far between points that lines from one to the next are no picture."""
+    """True for curves (N, 2, n) that turn too far between points to be drawn by lines from one to the next."""
     with np.errstate(all="ignore"):
         steps = np.diff(y, axis=-1) / np.ptp(y, axis=-1, keepdims=True)
         turns = np.diff(np.arctan2(steps[:, 1], steps[:, 0]), axis=-1)

@@ -448,7 +448,7 @@ def is_name(name: Any) -> bool:
 
 
 def read_arrays(file: Path, most: int) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file of so many bytes at most, none of which takes more memory than these."""
+    """Return the arrays of an .npz file; neither the file nor one of its arrays is larger than so many bytes."""
     arrays = {}
     if file.stat().st_size > most:
         raise ValueError(f"more than {most:,} bytes")

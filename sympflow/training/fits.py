@@ -85,7 +85,7 @@ def option(check: Check | None = None, default: Any = None, *, left_open: bool =
 
 
 class _Options:
-    """A frozen dataclass of options, the fields of which hold their checks."""
+    """A frozen dataclass of options, whose fields hold their checks."""
 
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]

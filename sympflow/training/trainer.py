@@ -60,7 +60,7 @@ from sympflow.workers import WorkerPool
 
 DRIVEN = ("primed", "sympflow")  # kinds that are fitted to driven systems
 SHORT_BUDGET = 15.0  # seconds of the least that has trials
-STARTS = 72  # of a fit of which nothing is said, where it is compiled: these take a second
+STARTS = 72  # of a compiled fit without options: these take a second
 SOME, SMALL, FEWEST = 24, 6, 3  # of other systems, up to so many degrees of freedom, and of the largest
 BOUGHT = 1000  # starts that a budget buys at most
 

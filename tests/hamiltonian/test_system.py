@@ -465,7 +465,7 @@ def test_parametric_form(text, params, expected, values):
 @pytest.mark.parametrize("domain", [None, Ball([0.0, 0.0], 1.0)])
 @pytest.mark.parametrize("method", ["kahan_li8", "log_kahan_li8", "tao4"])
 def test_without_y0_every_method_takes_the_same_default_step_whatever_was_read_before(domain, method):
-    """That of the fastest motion, of the rate √3|q| here: at the given states, or in the domain if there is one."""
+    """Its source is the fastest motion, here of rate √3|q|: at the given states, or in the domain if there is one."""
     y0 = np.array([[9.0, 0.0], [0.1, 0.1]])
     fresh, read = (made("p**2/2 + q**4/4", domain=domain) for _ in range(2))
     dt = float(f"{0.05 / (np.sqrt(3) * 9):.2g}") if domain is None else read.dt

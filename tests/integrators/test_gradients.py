@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.interpolate import CubicSpline
 
-from sympflow import Box, HamiltonianSystem, solve, systems
+from sympflow import Box, HamiltonianSystem, get, solve, systems
 from sympflow.kernels import reverse
 
 CUBIC = HamiltonianSystem.from_sympy(
@@ -66,6 +66,11 @@ def test_values_are_those_of_arrays_and_gradients_those_of_backpropagation(syste
             assert sol.stats["backend"] == "compiled"
     scale = found["array"].abs().max()
     torch.testing.assert_close(found["compiled"] / scale, found["array"] / scale, rtol=0, atol=1e-11)
+    h, v = 3e-4, np.random.default_rng(2).normal(size=y0.shape)  # differences are right to h⁴, and to rounding over h
+    ends = [weighted(solve(system, method, y0=y0 + k * h * v, **run)) for k in (-2, -1, 1, 2)]
+    difference = float(ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * h)
+    along = float((found["compiled"] * torch.as_tensor(v)).sum())
+    assert along == pytest.approx(difference, rel=0, abs=1e-9 * float(scale) * v.size)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +221,7 @@ def test_gradients_by_times(system, batch, t_eval):
 
 @pytest.mark.parametrize("method", ["verlet", "rk4", "gauss_legendre4"])
 def test_transforms_of_runs(method):
-    """What torch.func makes of a run that is compiled, by tensor operations: Jacobians and Hessians, either way."""
+    """Jacobians and Hessians of a compiled run by torch.func, forward and reverse, by tensor operations."""
     y0 = torch.tensor(start(CUBIC, ()))
 
     def end(y):
@@ -389,3 +394,17 @@ def test_parameters_that_move_jumps_are_refused(force):
     c = torch.tensor(1.234, dtype=torch.float64, requires_grad=True)
     with pytest.raises(ValueError, match="c that requires gradients and moves the times at which H jumps"):
         solve(system, "kahan_li8", (0, 3), dt=0.1, params={"c": c})
+
+
+@pytest.mark.parametrize("method", ["gauss_legendre4", "gauss_legendre6", "gauss_legendre8"])
+def test_gradients_where_forces_are_rounding(method):
+    """The sums of p and q of a ring are P and Q + tP; a step in polar coordinates on a circle is symplectic."""
+    ring = HamiltonianSystem.lattice(shape=16, bond="r**2/2 + r**4/4", y0=np.r_[np.linspace(0, 1, 16), np.zeros(16)])
+    y0 = torch.tensor(ring.y0, requires_grad=True)
+    solve(ring, method, (0, 1), y0, t_eval=[1.0], dt=0.05).y.sum().backward()
+    np.testing.assert_allclose(y0.grad, np.repeat([1.0, 2.0], 16), rtol=1e-12)
+    circle = HamiltonianSystem.from_sympy("p1**2/2 + p2**2/(2*q1**2) - 1/q1", y0=[1.1, 0.0, 0.0, np.sqrt(1.1)])
+    step = get(method)()
+    J = torch.autograd.functional.jacobian(lambda y: step.step(circle, 0.0, y, 0.05), torch.tensor(circle.y0))
+    omega = torch.tensor(np.kron([[0.0, 1.0], [-1.0, 0.0]], np.eye(2)))
+    torch.testing.assert_close(J.T @ omega @ J, omega, rtol=0, atol=1e-13)

@@ -222,8 +222,10 @@ def test_a_file_is_the_recipe_of_its_flow(tmp_path, monkeypatch, capsys):
     assert one.certified.t_end == two.figures["t_end"] == 50.0
     assert two.figures["energy_error_95"] == two.certified.relative_limit < one.figures["energy_error_95"]
     assert two.certified.relative_limit >= two.certified.relative_energy_error.q95
+    assert two.certified.held_out == 1000
     assert two.figures["one_step_error_median"] <= two.figures["one_step_error_max"]
     assert two.figures["cost"] > one.figures["cost"] > 0
+    assert two.recipe["stages"][0]["restarts"] == 2
     listed = ShippedFlow.of(tmp_path / "again" / f"{names[1]}.safetensors")
     assert (listed.stages, listed.dt, listed.cost) == (2, 0.5, two.figures["cost"])
     pretrained.main(["--rung", "primed-2-0.5", "--out", str(tmp_path / "again"), "--measure"])
