@@ -328,11 +328,12 @@ class PairsHamiltonian(LocalHamiltonian):
         """Return True if two of not too many bodies move about along their line, in one of the states (..., 2d)."""
         if self.n_bodies * (self.n_bodies - 1) // 2 > CHEAP_PAIRS:
             return False
-        z = y.reshape(*y.shape[:-1], 2, self.n_bodies, self.dim).astype(float)  # in single precision it would not show
-        z[..., 1, :, :] /= self.inertia[:, None]
-        for i, j in self._ends([z[..., 0, :, :]]):
-            ways = z.take(i, -2) - z.take(j, -2)
-            products = np.einsum("...aik,...bik->ab...i", ways, ways)
+        states = y.reshape(-1, 2, self.n_bodies, self.dim)
+        z = states.transpose(1, 3, 0, 2).astype(float, order="C")  # rounding of single precision would hide such motion
+        z[1] /= self.inertia
+        for i, j in self._ends([states[:, 0]]):
+            ways = z.take(i, -1) - z.take(j, -1)
+            products = np.einsum("ak...,bk...->ab...", ways, ways)
             along, speed = products[0, 1], products[1, 1]
             if ((along * along >= NEARLY * products[0, 0] * speed) & (speed > 0)).any():
                 return True
