@@ -313,7 +313,11 @@ def run(options: argparse.Namespace) -> str:
             if options.json:
                 options.json.write_text(json.dumps([asdict(row) for row in rows], indent=1), encoding="utf-8")
     rows.sort(key=lambda row: [*scenes].index(row.system))
-    fragments.write(options.out, name, fragment(rows))
+    clocked = [row for row in rows if row.system == "kepler"]
+    others = [row for row in rows if row.system != "kepler"]
+    for own, title, section in ((others, name, ""), (clocked, "primed-clock", "--system kepler")):
+        if own:
+            fragments.write(options.out, title, fragment(own), section)
     return "\n" + table(rows)
 
 

@@ -30,7 +30,10 @@ LOW_ORDER = {"adaptive_heun", "bosh3", "fehlberg2"}
 
 
 def pytest_collection_modifyitems(items):
-    """Mark as slow LOW_ORDER, and what long.txt lists: rows of some seconds whose kind a shorter row shows."""
+    """Mark as slow LOW_ORDER, and what long.txt lists.
+
+    These are rows of some seconds whose kind a shorter row shows, and without brackets a few tests that take several.
+    """
     listed = set((TESTS / "long.txt").read_text("utf-8").splitlines())
     for item in items:
         row = item.callspec.params.values() if hasattr(item, "callspec") else ()

@@ -147,6 +147,13 @@ def test_few_kept_states_give_the_outputs_of_all(method, t_end, clocked):
             assert made.stats["n_steps"] == expected.stats["n_steps"]
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_events_are_found_in_physical_time(sign):
+    """An orbit of period 2π crosses its axis each half of it."""
+    sol = solve(systems.kepler(0.9), "log_kahan_li8", (0.0, sign * 20.0), events=lambda t, y: y[1])
+    np.testing.assert_allclose(sol.t_events[0], sign * np.pi * np.arange(7), atol=1e-9)
+
+
 def test_a_trajectory_of_a_batch_is_the_one_alone(monkeypatch):
     kepler, options = systems.kepler(), {"t_span": (0.0, 40.0), "t_eval": [13.0, 40.0], "dt": 0.1}
     y0 = kepler.domain.sample(40, 2)
