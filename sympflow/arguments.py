@@ -233,7 +233,7 @@ def check_one_of(name: str, value: Any, known: Iterable[str]) -> None:
 
 def check_flag(name: str, value: Any) -> None:
     """Raise unless the option `name` is True or False."""
-    if not isinstance(value, bool | np.bool_):
+    if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"`{name}` must be True or False; got {value!r}.")
 
 

@@ -140,7 +140,7 @@ def to_numpy(x: Array) -> np.ndarray:
         `torch.compile` traces for none.
     """
     found = values(x)
-    if found is None or found.ndim != np.ndim(x):
+    if found is None or (found is not x and found.ndim != np.ndim(x)):
         where = "in a graph that torch.compile traces" if found is None else "inside torch.func.vmap"
         raise TypeError(
             f"The values of a tensor of shape {tuple(x.shape)} are needed as numbers, which it has not {where}: make "
@@ -155,7 +155,7 @@ def differentiable(*arrays: Any) -> bool:
     That is a graph (reverse mode), a tangent (forward mode), a transform of `torch.func`, or a graph that
     `torch.compile` traces.
     """
-    return any(_is_followed(x) for x in arrays if is_tensor(x))
+    return any(map(_is_followed, filter(is_tensor, arrays)))
 
 
 def values(x: Any) -> np.ndarray | None:
@@ -163,9 +163,11 @@ def values(x: Any) -> np.ndarray | None:
 
     None where there are none to be read, in a graph that `torch.compile` traces.
     """
-    plain, order = (x, None) if is_tensor(x) and _is_plain(x) else _behind(x)
-    if plain is None or isinstance(plain, np.ndarray):
-        return plain
+    if not is_tensor(x):
+        return np.asarray(x)
+    plain, order = (x, None) if _is_plain(x) else _behind(x)
+    if plain is None:
+        return None
     import torch
 
     with torch._C._DisableFuncTorch():
@@ -227,7 +229,7 @@ def lanes(x: Array) -> int:
 
 def readable(x: Array) -> bool:
     """Return True if the values of `x` are there, one for each entry: not under vmap, nor where a graph is traced."""
-    if is_tensor(x) and _is_plain(x):
+    if not is_tensor(x) or _is_plain(x):
         return True
     plain, order = _behind(x)
     return plain is not None and len(order) == x.ndim

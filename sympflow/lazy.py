@@ -30,7 +30,7 @@ def kept(make: Callable[Concatenate[K, P], T], most: float = inf) -> Callable[Co
         values = known.get(owner)
         if values is None:
             values = known[owner] = {}
-        key = *args, *options.items()
+        key = (*args, *options.items()) if options else args
         if key not in values:
             if len(values) >= most:
                 values.clear()

@@ -288,8 +288,9 @@ def solve(
 
 def _moving_times(t_span: Any, t_eval: Any) -> Any:
     """The times that torch follows, where there are some."""
-    listed = [t for times in (t_span, t_eval) if isinstance(times, tuple | list) for t in times if type(t) is not float]
-    if not differentiable(t_eval, *listed):
+    ends = t_span if isinstance(t_span, (tuple, list)) else ()
+    listed = [t for t in t_eval if type(t) is not float] if isinstance(t_eval, (tuple, list)) else (t_eval,)
+    if not differentiable(*ends, *listed):
         return None
     from sympflow.integrators.tensors import MovingTimes
 

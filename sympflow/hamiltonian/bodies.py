@@ -328,11 +328,14 @@ class PairsHamiltonian(LocalHamiltonian):
         """Return True if two of not too many bodies move about along their line, in one of the states (..., 2d)."""
         if self.n_bodies * (self.n_bodies - 1) // 2 > CHEAP_PAIRS:
             return False
-        y = y.astype(float)  # rounding of single precision would hide such motion
-        for pairs in self._pairs(y[..., : self.ndof], y[..., self.ndof :] / np.repeat(self.inertia, self.dim)):
-            x, w = pairs.x
-            along, speed = _dot(x, w) ** 2, _dot(w, w)
-            if ((along >= NEARLY * pairs.s * speed) & (speed > 0)).any():
+        states = y.reshape(-1, 2, self.n_bodies, self.dim)
+        z = states.transpose(1, 3, 0, 2).astype(float, order="C")  # rounding of single precision would hide such motion
+        z[1] /= self.inertia
+        for i, j in self._ends([states[:, 0]]):
+            ways = z.take(i, -1) - z.take(j, -1)
+            products = np.einsum("ak...,bk...->ab...", ways, ways)
+            along, speed = products[0, 1], products[1, 1]
+            if ((along * along >= NEARLY * products[0, 0] * speed) & (speed > 0)).any():
                 return True
         return False
 
@@ -350,12 +353,12 @@ class PairsHamiltonian(LocalHamiltonian):
         """Bodies may meet at r = 0 without softening."""
         return not self.softening and self.n_bodies > 1
 
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: Any, conserves: bool) -> np.ndarray:
         """By an energy that is off by more than T + |V| of the start, and a T of more than twice that."""
         pairs = self.n_bodies * (self.n_bodies - 1) // 2
-        T0, T = ((self._of_bodies(y[:, self.ndof :]) ** 2).sum(-1) @ (0.5 / self.inertia) for y in (starts, ends))
+        T0, T = np.square(np.array([starts, ends])[..., self.ndof :]) @ np.repeat(0.5 / self.inertia, self.dim)
         found = T > 2 * T0
-        if not conserves or not found.any() or (pairs > CHEAP_PAIRS and n_steps < MANY_STEPS):
+        if not conserves or not found.any() or (pairs > CHEAP_PAIRS and np.max(n_steps) < MANY_STEPS):
             return np.zeros(len(ends), dtype=bool)
         with np.errstate(all="ignore"):
             V0, V = (self.potential(y[:, : self.ndof]) for y in (starts, ends))
@@ -444,8 +447,7 @@ class PairsHamiltonian(LocalHamiltonian):
             return
         rows = n if self._all_at_once else max(1, most_pairs(bodies) // n)
         for start in range(0, n - 1, rows):
-            i, j = _of_triangle(min(rows, n - 1 - start), n - start)
-            yield i + start, j + start
+            yield _of_triangle(start, min(rows, n - 1 - start), n)
 
     def _within_cutoff(self, states: np.ndarray) -> np.ndarray:
         """The pairs (P, 2) that are nearer than the cut-off in one of the states (N, n, dim) at least."""
@@ -489,10 +491,10 @@ def most_pairs(bodies: Sequence[Array]) -> int:
 
 
 @lru_cache(maxsize=16)
-def _of_triangle(rows: int, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices above the diagonal, row by row."""
-    i, j = np.triu_indices(rows, 1, n)
-    return i, j
+def _of_triangle(start: int, rows: int, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices above the diagonal, row by row from a start."""
+    i, j = np.triu_indices(rows, 1, n - start)
+    return i + start, j + start
 
 
 @cache

@@ -99,7 +99,7 @@ class Definition:
         """∇²V(q)·v: (..., d), each, to (..., d)."""
         return (self.potential_hessian(q, *t) @ v[..., None])[..., 0]
 
-    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: int, conserves: bool) -> np.ndarray:
+    def leapt(self, starts: np.ndarray, ends: np.ndarray, n_steps: Any, conserves: bool) -> np.ndarray:
         """Return True for each run of steps from states (n, 2d) to others that leapt over an infinite V: (n,)."""
         raise NotImplementedError(f"{type(self).__name__} must define leapt().")
 

@@ -309,6 +309,10 @@ class TracedPoles:
                 if len(used) == 1 and g is not used[0] and _at_zero(g, used[0]) == 0.0:
                     self._add(used[0])  # which it may touch
 
+    def may_pass(self, y: np.ndarray) -> bool:
+        """Return True: signs and H are looked at in all runs."""
+        return True
+
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         times = () if self._form.time is None else (np.broadcast_to(t, y.shape[:-1]),)
         found = self._program(*times, *np.moveaxis(y, -1, 0))

@@ -29,7 +29,7 @@ class Friction:
 
     def check_sums(self, compensated: bool) -> None:
         """Refuse compensated sums where there is friction."""
-        if self and compensated:
+        if compensated and self:
             raise NotCompiled(
                 "`compensated` sums are for systems without friction, which forgets round-off: leave it out."
             )

@@ -73,6 +73,10 @@ class Poles(Protocol):
         """The places by which runs are judged, where these may have passed one; None if they are not known."""
         return self
 
+    def may_pass(self, y: np.ndarray) -> bool:
+        """Return False if runs between states y (2, N, 2d) passed no place; True where more is to be looked at."""
+        return True
+
     def look(
         self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -251,17 +255,18 @@ class PairsPoles(Poles):
         found, self._meeting = places(self._f, (self._x,)), sp.sign(self._x)
         self._places = [place for place in found if pairs.signed or place.cell != self._meeting]
         self.watched = bool(self._places)
+        self._only_meet = not self._on_a_line and [place.cell for place in self._places] == [self._meeting]
         self.cancelling = cancelling(_with_numbers(self._f, pairs.c, pairs.params), (self._x,))
 
     def __bool__(self) -> bool:
         return self.watched or bool(self.cancelling)
 
+    def may_pass(self, y: np.ndarray) -> bool:
+        return not self._only_meet or self._pairs.may_pass(y)
+
     def look(self, y: np.ndarray, t: Any, numbers: Sequence[Any] = ()) -> tuple[np.ndarray, np.ndarray, None]:
         q, end = y[..., : self._pairs.ndof], self._pairs.cutoff
         sums = np.zeros((*y.shape[:-1], len(self._places)))
-        in_space = not self._on_a_line and [place.cell for place in self._places] == [self._meeting]
-        if in_space and not self._pairs.may_pass(y[:: max(1, len(y) - 1)]):
-            return sums, sums[..., 0], None
         for i, j, x, letters in self._pairs.met(y):
             cells = self._cells(x, letters)
             beyond = self._cells(np.full_like(x, end), letters) if end else [0.0] * len(cells)

@@ -63,7 +63,7 @@ def diagnose_piece(outcome: Outcome, integrator: Integrator, problem: Problem, r
         return
     passed, plain = False, problem.parameter_values is None
     if problem.store is None and looked:
-        if np.any(np.asarray(outcome.status) >= 0):
+        if not failed or np.any(np.asarray(outcome.status) >= 0):
             passed = note_poles(outcome, integrator, problem, rows)
         if plain:
             warn_of_cancelling(outcome, problem)
@@ -128,10 +128,12 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
         return False
     starts = to_numpy(problem.y0).reshape(-1, width)
     outputs = to_numpy(outcome.y).reshape(n, -1, width)
-    every = slice(n - 1, None, -max(1, -(-n // LOOKED_AT), n * starts.size // LOOKED_AT_TOGETHER))  # the last of all
-    y = np.concatenate([starts[None], outputs[every][::-1]])
-    t = np.concatenate([[problem.t0], outcome.t[every][::-1]])
     with np.errstate(all="ignore"):
+        if not poles.may_pass(np.array([starts, outputs[-1]])):
+            return False
+        every = slice(n - 1, None, -max(1, -(-n // LOOKED_AT), n * starts.size // LOOKED_AT_TOGETHER))  # the last too
+        y = np.concatenate([starts[None], outputs[every][::-1]])
+        t = np.concatenate([[problem.t0], outcome.t[every][::-1]])
         try:
             looked = _look(problem.system, poles.look(y, t[:, None], numbers))
             if looked is not None and (exact := poles.exact) is not poles:

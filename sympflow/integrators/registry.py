@@ -190,17 +190,19 @@ def register(name: str, integrator: type[Integrator] | Scheme) -> None:
 
 def build(method: Any, options: dict[str, Any]) -> Integrator:
     """The integrator that `solve(method=..., **options)` means: a name, a class, an instance or a trained flow."""
-    if isinstance(method, Integrator):
-        if options:
-            raise TypeError(
-                f"`{next(iter(options))}` cannot be given with a configured integrator: set it when you build that one."
-            )
-        return method
-    if _is_flow(method):
-        if not options:
-            return get(method.kind)(flow=method)  # type: ignore[call-arg]
-        options = {"flow": method, **options}
-        method = method.kind
+    if not isinstance(method, str):
+        if isinstance(method, Integrator):
+            if options:
+                raise TypeError(
+                    f"`{next(iter(options))}` cannot be given with a configured integrator: set it when you build that "
+                    "one."
+                )
+            return method
+        if _is_flow(method):
+            if not options:
+                return get(method.kind)(flow=method)  # type: ignore[call-arg]
+            options = {"flow": method, **options}
+            method = method.kind
     cls = get(method)
     own = isinstance(method, str) and method in NAMES
     known = cls.options() if own else _made(method, cls.options)
@@ -309,10 +311,9 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
         "system.kicks(t0, t1) to the next",
     )
     mro = type(integrator).__mro__
-    own_words = system.conservative or _speaks_for_itself(mro, "takes_friction")
-    if system.external_force is not None and not (integrator.takes_forces and own_words):
+    if system.external_force is not None and not (integrator.takes_forces and _speaks_itself(mro, "takes_friction")):
         system.check_conservative(f"which method {integrator.name!r} does not take", "")
-    if system.friction and not (integrator.takes_friction and own_words):
+    if system.friction and not (integrator.takes_friction and _speaks_itself(mro, "takes_friction")):
         what = "was trained without it" if integrator.trained else "does not take it"
         system.check_conservative(
             f"and method {integrator.name!r} {what}",
@@ -320,7 +321,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
             "such as 'gauss_legendre6', or a Runge–Kutta method such as 'dop853' or 'dopri5', or solve the system "
             "that sympflow.doubled makes of it",
         )
-    if not (integrator.takes_driving and _speaks_for_itself(mro, "takes_driving")):
+    if not (system.autonomous or (integrator.takes_driving and _speaks_itself(mro, "takes_driving"))):
         what = "was trained for a system without t" if integrator.trained else "does not take the time into account"
         system.check_autonomous(
             f"and method {integrator.name!r} {what}",
@@ -336,7 +337,7 @@ def check_applies(integrator: Integrator, system: HamiltonianSystem, y0: Array |
 
 
 @cache
-def _speaks_for_itself(bases: tuple[type, ...], what: str) -> bool:
+def _speaks_itself(bases: tuple[type, ...], what: str) -> bool:
     """False for a class outside of the package that changes what a built-in class does, and inherits what that says."""
     says = next(i for i, base in enumerate(bases) if what in vars(base))
     others = (base for base in bases[:says] if not base.__module__.startswith("sympflow."))

@@ -363,8 +363,8 @@ class Splitting(FixedStep):
             yield differentiated(jacobian, times, states, lengths)
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        composition, told = self.composed(problem.system), list[str]()
-        compensated = bool(self.compensated)
+        composition, compensated = self.composed(problem.system), bool(self.compensated)
+        told: list[str] = []
         if problem.followed:
             kernel = followed_loops(lambda names: composition.kernel_by(compensated, names), problem)
             return Stepper(self, problem, composition, kernel)

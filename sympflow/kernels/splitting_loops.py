@@ -163,9 +163,7 @@ class SplittingLoops:
 
     def kernel(self, scheme: Scheme, compensated: bool = False, ranges: Ranges | None = None) -> SplittingKernel:
         """The loops of one scheme, with Kahan's `compensated` sums; for `ranges` of positions see `functions`."""
-        kernel = SplittingKernel(self, scheme, compensated, ranges)
-        kernel._functions()  # so that what has no compiled form is refused here, and not by a run
-        return kernel
+        return SplittingKernel(self, scheme, compensated, ranges)
 
     def takes_values(self, level: int, ranges: Ranges | None = None, varied: bool = False) -> bool:
         """True if the values of the system's parameters are numbers of the kicks of a level, not of their code."""
@@ -368,16 +366,17 @@ class SplittingKernel(Kernel):
         self._width, self.tensors = 2 * loops.ndof * (1 + compensated), loops.tensors
         self._values = None if values is None else np.ascontiguousarray(values.T, dtype=np.float64)
         self._of_kind: Any = {"varied": values is not None, "ranges": ranges}
-        self._latest = np.empty((0, 0))
+        self._latest: np.ndarray | None = None
+        self._code: Any = loops.functions(scheme.level, compensated, scheme.monomials, **self._of_kind)
 
     def table(self, h: float, t0: float = 0.0) -> np.ndarray:
         """The numbers of a run whose steps are h, as the loops read them; of a driven system from a time t0 on."""
         return self.loops.rows(run_table(self.scheme, h), h, t0, **self._of_kind)
 
     def runs(self, task: Task) -> Run:
-        code, table, start = self._functions(), self.table(task.h, task.t0), self._rows(task)
+        table, start = self.table(task.h, task.t0), self._rows(task)
         work = table.shape[1] * self.loops.work / (self.loops.abreast if len(task.y0) > 1 else 1.0)
-        return run_states(partial(code.run, table), task, self._width, work, start)
+        return run_states(partial(self._code.run, table), task, self._width, work, start)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
         """One step from each row of `y` (N, 2d), each of its own length `h` (N,): see `Kernel`."""
@@ -387,7 +386,7 @@ class SplittingKernel(Kernel):
         return Steps(self.loops.step_rows(step_table(self.scheme), h, h, rows, self.scheme.monomials, t, varied))
 
     def check_reverse(self) -> None:
-        self._functions().check_reverse()
+        self._code.check_reverse()
 
     def recorded(self, task: Task) -> Recorded:
         """`runs`, as a run of which cotangents can be pulled back: after `check_reverse`."""
@@ -395,8 +394,7 @@ class SplittingKernel(Kernel):
 
         table, rows = self.table(task.h, task.t0), self._rows(task)
         work = table.shape[1] * self.loops.work / self.loops.abreast
-        code: Any = self._functions()
-        return Recorded(code, table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
+        return Recorded(self._code, table, task.y0 if rows is None else rows, task.n_steps, task.save, work)
 
     @property
     def steps_tensors(self) -> bool:
@@ -405,8 +403,7 @@ class SplittingKernel(Kernel):
     def stepped(self, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
         """A step of tensors, with `values` of the parameters, by tensor operations: after `check_reverse`."""
         rows = self.loops.rows(replace(step_table(self.scheme), more=None))[..., 0]
-        code: Any = self._functions()
-        return code.stepped(rows, y, h, t, values)
+        return self._code.stepped(rows, y, h, t, values)
 
     def varied(self, values: np.ndarray) -> SplittingKernel:
         """The loops of batches whose trajectories have these values (k, N) of `SplittingLoops.values`."""
@@ -418,9 +415,10 @@ class SplittingKernel(Kernel):
             return None
         if len(task.y0) % len(self._values):
             raise TypeError("`y0` must be a batch (N, 2d): trajectories have their own parameters.")
-        if not (task.goes_on and len(self._latest) == len(task.y0)):
-            self._latest = self._with_values(task.y0)
-        return self._latest
+        latest = self._latest
+        if latest is None or len(latest) != len(task.y0) or not task.goes_on:
+            latest = self._latest = self._with_values(task.y0)
+        return latest
 
     def _with_values(self, y: np.ndarray) -> np.ndarray:
         """States with the values of their trajectories behind them."""
@@ -429,9 +427,6 @@ class SplittingKernel(Kernel):
         values, times = self._values, len(y) // len(self._values)
         values = values if times == 1 else np.tile(values, (times, 1))
         return np.concatenate([y, values], axis=1, dtype=np.float64)
-
-    def _functions(self) -> SplittingRollouts:
-        return self.loops.functions(self.scheme.level, self.compensated, self.scheme.monomials, **self._of_kind)
 
 
 @lru_cache(maxsize=256)
