@@ -102,9 +102,10 @@ def solve(
     method : str, Integrator, or trained flow, optional
         A name from `sympflow.available()`; or a configured integrator such as ``get("verlet")(dt=0.05)``; or a flow. By
         default one that suits the system, the first of these that applies: a flow that ships for it ("sympflow");
-        "log_kahan_li8" where V < 0 falls without bound towards a place, or "dop853" where it does so as a logarithm or
-        is positive elsewhere; "srkn11b" where T = ½ pᵀM⁻¹p; "kahan_li8" where H is
-        separable; "gauss_legendre6"; "dop853". The message and `stats["chosen"]` say which, and why.
+        "wisdom_holman" for planets about a star; "log_kahan_li8" where V < 0 falls without bound towards a place, or,
+        without `tol`, "dop853" where it does so as a logarithm or is positive elsewhere; "srkn11b" where T = ½ pᵀM⁻¹p;
+        "kahan_li8" where H is separable; "gauss_legendre6"; "dop853". The message and `stats["chosen"]` say which, and
+        why.
     t_span : (float, float), optional
         Start and end; the end may lie before the start. The default is the system's. Gradients flow to tensors, here
         and in `t_eval`, by the field at the start and at the outputs. With a terminal event the end may
