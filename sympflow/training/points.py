@@ -9,7 +9,7 @@ import math
 import warnings
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,31 +47,15 @@ class Stream(IntEnum):
     RUNS = 8
 
 
-@dataclass(frozen=True)
-class Points:
-    """Collocation points: t (N,), x (N, 2d) of the residual, few times (m, 1) with many states each of the matching.
+class Points(NamedTuple):
+    """Points of the losses: times, states, of labels where the flow takes these, and of a driven system times t0.
 
-    Labels are times, states and where the exact flow takes them; of a driven system all have times t0 of the states.
+    Those of the residual are t (N,) and x (N, 2d); of the matching few times (m, 1), with many states each (m, n, 2d).
     """
 
-    t: Tensor
-    x: Tensor
-    matching_t: Tensor
-    matching_x: Tensor
+    residual: tuple[Tensor, ...]
+    matching: tuple[Tensor, ...]
     labels: tuple[Tensor, ...] | None = None
-    t0: Tensor | None = None
-    matching_t0: Tensor | None = None
-
-    @property
-    def residual(self) -> tuple[Tensor, ...]:
-        """t, x, and t0 where there is one."""
-        return (self.t, self.x) if self.t0 is None else (self.t, self.x, self.t0)
-
-    @property
-    def matching(self) -> tuple[Tensor, ...]:
-        """t and x of the matching loss, and t0 where there is one."""
-        given = self.matching_t, self.matching_x
-        return given if self.matching_t0 is None else (*given, self.matching_t0)
 
 
 def stream_seed(seed: int, stream: Stream, block: int = 0) -> int:
@@ -139,15 +123,15 @@ class PointSource:
         self._like = {"dtype": dtype, "device": device}
         self._labels = None if labels is None else tuple(torch.as_tensor(a, **self._like) for a in labels)  # type: ignore[arg-type]
         self._block = -1
-        self._arrays: tuple[Tensor, ...] = ()
+        self._drawn: list[tuple[Tensor, ...]] = []
 
     def __call__(self, index: int) -> Points:
         """The points of the `index`-th draw."""
         block, i = divmod(index, self.block_length)
         if block != self._block:
             self._draw(block)
-        t, x, matching_t, matching_x, *starts = (a[i] for a in self._arrays)
-        return Points(t, x, matching_t, matching_x, self._labelled(index), *starts)
+        residual, matching = (tuple(a[i] for a in arrays) for arrays in self._drawn)
+        return Points(residual, matching, self._labelled(index))
 
     def _labelled(self, index: int) -> Any:
         """All labels, or as many as there are points, drawn anew for each index."""
@@ -166,13 +150,11 @@ class PointSource:
         rng = np.random.default_rng([stream_seed(self.seed, self.streams[0], block), 1])
         t = self.dt * (np.arange(self.points) + rng.random((k, self.points))) / self.points
         tm = self.dt * (np.arange(m) + rng.random((k, m))) / m
-        drawn = [t, x, tm[..., None], xm]
-        for stream, shape in zip(self.streams, ((k, self.points), (k, m, 1)), strict=True):
-            if self._system is None:
-                break
-            t0 = start_times(self._system, self.dt, math.prod(shape), self.seed, stream, block)
-            drawn += [] if t0 is None else [np.reshape(t0, shape)]
-        self._arrays = tuple(torch.as_tensor(a, **self._like) for a in drawn)  # type: ignore[arg-type]
+        drawn = [[t, x], [tm[..., None], xm]]
+        for stream, arrays in zip(self.streams, drawn if self._system is not None else (), strict=False):
+            t0 = start_times(self._system, self.dt, arrays[0].size, self.seed, stream, block)  # type: ignore[arg-type]
+            arrays.extend([] if t0 is None else [t0.reshape(arrays[0].shape)])
+        self._drawn = [tuple(torch.as_tensor(a, **self._like) for a in arrays) for arrays in drawn]  # type: ignore[arg-type]
         self._block = block
 
 

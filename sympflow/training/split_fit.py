@@ -21,11 +21,8 @@ from scipy.linalg import block_diag
 
 from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
-from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.parts import ExactParts, SubFlow
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.parts_loops import PartsLoops, parts_loops
-from sympflow.training.fits import GaussNewton, Resolved
 from sympflow.training.least_squares import Minimum, Problem, Stop, levenberg_marquardt, put_weights
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors, stream_seed
 from sympflow.training.runs import LABEL_SHARE, SearchRun
@@ -39,30 +36,13 @@ PULL = 0.3  # towards equal steps, as a share of the error: it chooses among coe
 ROUGHNESS = 1e-6  # how reluctantly polynomials are made to vary with t
 
 
-@dataclass
 class SplitRun(SearchRun):
-    """The state of a fit of a split flow, and what acts on it."""
+    """The state of a fit of a split flow that is bound to its system, and what acts on it."""
 
     flow: SplitFlow
-    fit: Resolved
-    solver: Resolved
-    problem: SplitProblem
 
-    @classmethod
-    def start(
-        cls,
-        flow: SplitFlow,
-        system: HamiltonianSystem,
-        domain: Domain,
-        fit: Resolved,
-        solver: GaussNewton = GaussNewton(),  # noqa: B008
-        deadline: Deadline | None = None,
-    ) -> SplitRun:
-        """A run of a flow that is bound to its system."""
-        deadline = Session().deadline if deadline is None else deadline
-        solver = solver.but(**fit.OPEN)
-        problem = SplitProblem(flow, system, domain, fit, solver, deadline)
-        return cls(flow, system, domain, None, fit, solver, problem)
+    def prepare(self, deadline: Deadline) -> None:
+        self.problem = SplitProblem(self, deadline)
 
     def searched(self) -> AtEnd:
         return AtEnd(self.problem)
@@ -138,16 +118,9 @@ def _phases(share: np.ndarray) -> np.ndarray:
 class SplitProblem:
     """Labels in modes, and the flow's coefficients as numbers: those of the first half of the palindrome."""
 
-    def __init__(
-        self,
-        flow: SplitFlow,
-        system: HamiltonianSystem,
-        domain: Domain,
-        fit: Resolved,
-        solver: Resolved,
-        deadline: Deadline,
-    ) -> None:
-        self.flow, self.fit, self.solver = flow, fit, solver
+    def __init__(self, run: SplitRun, deadline: Deadline) -> None:
+        flow, system, domain, fit = run.flow, run.system, run.domain, run.fit
+        self.flow, self.fit, self.solver = flow, fit, run.solver
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
         self.n = int(ends[-1]) if len(ends) else 0

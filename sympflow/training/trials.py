@@ -265,7 +265,7 @@ def trial(start: Resolved, system: HamiltonianSystem, domain: Domain, deadline: 
     solver = GaussNewton(restarts=STARTS, steps=STEPS)
     scaling = Scaling.of_samples(states(domain, 1000, SEED, Stream.SCALING), dt)
     try:
-        run = TableRun.start(start.flow(system), system, domain, scaling, fit, solver, deadline=deadline)
+        run = TableRun(start.flow(system), system, domain, scaling, fit, solver, deadline)
     except (ValueError, OutOfTime):  # of no state of Ω the solution exists up to Δt, or it takes too long
         return Trial(start, math.inf)
     frozen = run.frozen
