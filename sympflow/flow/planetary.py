@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -130,6 +130,7 @@ class KeplerFlow(SystemFlow):
     kicks: Tensor
     gradients: Tensor
 
+    PLAN = "kepler"
     MADE = "made of Kepler's motion and the interaction of planets"
 
     def __init__(
@@ -151,9 +152,7 @@ class KeplerFlow(SystemFlow):
         self._kept: Kept[_Kept] = Kept([self._buffers])
         # A tuple, not a ModuleList: the layers own no numbers.
         self.layers = tuple(PlanetLayer(self, *m) for b, a, _ in BETWEEN for m in ((b, 0.0), (0.0, a)) if any(m))
-        if system is not None:
-            self._take(system)
-            self.identify(system)
+        self._made_of(system)
 
     @property
     def frame(self) -> Frame:
@@ -257,19 +256,15 @@ class KeplerFlow(SystemFlow):
         forces = n_steps + kicks * (1 + n_saved) + sum(kick != 0 for kick, *_ in BETWEEN) * n_extra
         return {"force_evaluations": forces, "hessian_evaluations": 2 * len(self.gradients) * (1 + n_saved)}
 
-    def architecture(self) -> dict[str, Any]:
-        shape = {"reach": len(self.kicks) // 2, "gradients": len(self.gradients), "periods": list(self.periods or ())}
-        return {"ndof": self.ndof, "kepler": shape}
+    def plan(self) -> dict[str, Any]:
+        return {"reach": len(self.kicks) // 2, "gradients": len(self.gradients), "periods": list(self.periods or ())}
 
     @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        shape = plan["kepler"]
-        if not isinstance(shape, dict):
-            raise Refused("its plan of a flow of planets is missing")
-        reach = checked_integer(shape.get("reach"), "reach", MOST_REACH)
-        gradients, periods = shape.get("gradients"), shape.get("periods")
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        reach = checked_integer(plan.get("reach"), "reach", MOST_REACH)
+        gradients, periods = plan.get("gradients"), plan.get("periods")
         if gradients != 0:
             gradients = checked_integer(gradients, "number of force gradients", 2 * reach)
         if not (isinstance(periods, list) and len(periods) == ndof // 3 - 1 and all(map(_is_period, periods))):
             raise Refused("its periods are not those of its planets")
-        return cls(ndof, reach, gradients, dt, periods, dtype=dtype)
+        return {"reach": reach, "n_gradients": gradients, "periods": periods}
