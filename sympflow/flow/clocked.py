@@ -70,31 +70,13 @@ class Share:
 
 
 class ClockedFlow(SystemFlow):
-    """A symmetric splitting scheme on a logarithmic Hamiltonian, and after it the trained clock.
+    """A symmetric splitting scheme on a logarithmic Hamiltonian, and after it the trained clock of so many `terms`.
 
-    Both are odd in the flow's time s, and commute: ψ̄_{−s} = (ψ̄_s)⁻¹, continued to negative s by its formulas. What is
-    trained is the clock; it is no approximation of the exact flow in s, for a scheme is early or late there, but in
-    the physical time: ψ̄_s(x) lies on the solution through x, at the time t that it holds.
-
-    Parameters
-    ----------
-    ndof : int
-        Of the transformed system.
-    scheme : str
-        A symmetric one of `sympflow.schemes.SCHEMES`, without force gradients.
-    terms : int
-        Of the clock.
-    dt : float
-        Δ, the longest step in s.
-    system : HamiltonianSystem, optional
-        One of `sympflow.time_transformed`. Without it the flow has no values.
-    dtype, device
-        Of the parameters.
-
-    Raises
-    ------
-    ValueError
-        If the scheme is not symmetric or has force gradients, or the system has no `shift`.
+    Both are odd in the flow's time s, and commute: ψ̄_{−s} = (ψ̄_s)⁻¹, continued to negative s by its formulas. It is
+    no approximation of the exact flow in s, for a scheme is early or late there, but in the physical time: ψ̄_s(x) lies
+    on the solution through x, at the time t that it holds. `dt` is the longest step in s, `ndof` of the transformed
+    system, one of `sympflow.time_transformed`, without which the flow has no values. A ValueError if the scheme is not
+    symmetric or has force gradients, or the system has no `shift`.
     """
 
     PLAN = "clocked"

@@ -104,27 +104,9 @@ class PlanetLayer(OwnLayer):
 class KeplerFlow(SystemFlow):
     """A flow of planets about a star with trained coordinates; made by `sympflow.train` of a system of planets.
 
-    Parameters
-    ----------
-    ndof : int
-    reach : int
-        M, in steps.
-    n_gradients : int
-        The number of force gradients, 0 to 2M.
-    dt : float
-        Δt.
-    periods : sequence of float, optional
-        Periods of the planets; the numbers hold for these orbits alone.
-    system : HamiltonianSystem, optional
-        One of `HamiltonianSystem.planets`, in Jacobi's coordinates. Without it the flow has no values.
-    dtype, device
-        Of the parameters.
-
-    Attributes
-    ----------
-    kicks, gradients : Tensor
-        β (2M,) and γ.
-    periods : tuple of float
+    `reach` is M, in steps, `n_gradients` is 0 to 2M, and `periods` those of the planets, for whose orbits alone the
+    numbers `kicks`, β (2M,), and `gradients`, γ, hold. The system is one of `HamiltonianSystem.planets`, in Jacobi's
+    coordinates; without it the flow has no values.
     """
 
     kicks: Tensor

@@ -637,7 +637,8 @@ class SystemFlow(SympFlow):
         described = plan[cls.PLAN]
         if not isinstance(described, dict):
             raise Refused(f"its plan of a {cls.PLAN} flow is missing")
-        return cls(ndof, **cls.checked_plan(described, ndof), dt=dt, dtype=dtype)
+        made: Any = cls
+        return made(ndof, dt=dt, dtype=dtype, **cls.checked_plan(described, ndof))
 
     def _made_of(self, system: HamiltonianSystem | None) -> None:
         """Become the flow of a system, where there is one."""
