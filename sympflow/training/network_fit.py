@@ -287,8 +287,7 @@ def _labels(
     unseen = max(1, fit.validation_points // fit.label_times)
     sets = []
     for n, stream in ((fit.points, Stream.LABELS), (unseen, Stream.VALIDATION)):
-        t0 = start_times(system, dt, n, fit.seed, stream)
-        labels = Labels.needed(system, states(domain, n, fit.seed, stream), t, deadline, t0)
+        labels = Labels.drawn(system, domain, n, fit.seed, stream, t, deadline)
         x = np.broadcast_to(labels.x, labels.y.shape).reshape(-1, labels.x.shape[1])
         begun = () if labels.t0 is None else (np.tile(labels.t0, len(t)),)
         sets.append((np.repeat(t, len(labels.x)), x, labels.y.reshape(x.shape), *begun))

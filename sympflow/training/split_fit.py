@@ -20,7 +20,7 @@ from sympflow.flow.split import SplitFlow
 from sympflow.hamiltonian.parts import ExactParts, SubFlow
 from sympflow.kernels.parts_loops import PartsLoops, parts_loops
 from sympflow.training.least_squares import Minimum, Problem, Stop, levenberg_marquardt, put_weights
-from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors, stream_seed
+from sympflow.training.points import Labels, Stream, shares_missed, step_errors, stream_seed
 from sympflow.training.runs import LABEL_SHARE, SearchRun
 from sympflow.training.session import Deadline, Session
 
@@ -121,13 +121,13 @@ class SplitProblem:
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
         self.n = int(ends[-1]) if len(ends) else 0
         t = flow.dt * _phases(np.arange(1, fit.label_times + 1) / fit.label_times)
-        x = states(domain, fit.points, fit.seed, Stream.RESIDUAL)
-        labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE))
+        drawn = system, domain, fit.points, fit.seed, Stream.RESIDUAL, t, deadline.part(LABEL_SHARE)
+        labels = Labels.drawn(*drawn)
         self.t, self.z, self.labels = t, self._modes(labels.x), [self._modes(y) for y in labels.y]
         self.unit = self._unit(float(np.std(system.hamiltonian(labels.x))))
-        x = states(domain, fit.reference_states, fit.seed, Stream.REFERENCE)
-        between = _phases((np.arange(2 * fit.label_times) + 1) / (2 * fit.label_times))
-        self.held_out = Labels.of(system, x, flow.dt * between, deadline.part(LABEL_SHARE))
+        t = flow.dt * _phases((np.arange(2 * fit.label_times) + 1) / (2 * fit.label_times))
+        unseen = system, domain, fit.reference_states, fit.seed, Stream.REFERENCE, t
+        self.held_out = Labels.drawn(*unseen, deadline.part(LABEL_SHARE), needed=False)
 
     @property
     def parts(self) -> ExactParts:

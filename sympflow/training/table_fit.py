@@ -33,7 +33,6 @@ from sympflow.training.points import (
     Stream,
     box_without,
     shares_missed,
-    start_times,
     states,
     step_errors,
     stream_seed,
@@ -99,11 +98,10 @@ class TableRun(SearchRun):
             enough = math.ceil(RESIDUALS * numbers / (2 * system.ndof))
             points = options.points or max(enough, min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof)))
             _check_memory(points, options, step.n_coefficients, system.ndof)
-            x = states(domain, points, options.seed, Stream.RESIDUAL)
             t = flow.dt * np.arange(1, options.label_times + 1) / options.label_times
             began = deadline.session.passed
-            t0 = start_times(system, flow.dt, points, options.seed, Stream.RESIDUAL)
-            labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE), t0)
+            drawn = system, domain, points, options.seed, Stream.RESIDUAL, t, deadline.part(LABEL_SHARE)
+            labels = Labels.drawn(*drawn)
             if (deadline.session.passed - began) / len(t) * fractions > HELD_OUT_SHARE * deadline.left:
                 fractions = min(fractions, len(t))
             slope = energy_slope(system, labels, options.energy_weight)
@@ -133,10 +131,9 @@ class TableRun(SearchRun):
             shape = (flow.dt, options.loss_points, options.matching_times, options.seed, flow.dtype, flow.device)
             points_at = PointSource(domain, *shape, block=1)(0)._replace(labels=_tensors(data) if rest else None)
             parts.append((1.0, LossProblem(table, Objective(loss, flow, points_at))))
-        x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
-        t = flow.dt * (np.arange(fractions) + 0.5) / fractions
-        t0 = start_times(system, flow.dt, len(x), options.seed, Stream.REFERENCE)
-        self.held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE), t0)
+        t = np.append(flow.dt * (np.arange(fractions) + 0.5) / fractions, flow.dt)
+        unseen = system, domain, options.reference_states, options.seed, Stream.REFERENCE, t
+        self.held_out = Labels.drawn(*unseen, deadline.part(LABEL_SHARE), needed=False)
         self.whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
         self.runs = None if self._made_runs is None else self._made_runs(flow)
         began = deadline.session.passed
