@@ -62,10 +62,7 @@ OF_METHODS = "rtol", "atol", "max_step", "max_steps", "splitting", "clock", "shi
 
 
 def in_options(message: str, context: typer.Context) -> str:
-    """A message of the library in the options of the command that runs: `t_span` is `--t-end`, backend='array' too.
-
-    Arguments that the command has no option for stay as they are.
-    """
+    """A message of the library in the options of the command: `t_span` is `--t-end`, backend='array' too."""
     parameters = context.command.params
     named = {
         str(p.name): max(p.opts, key=lambda word: (word.startswith("--"), -p.opts.index(word))) for p in parameters
@@ -162,15 +159,7 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], width: int
 
 
 def ready_folder(folder: Path) -> None:
-    """Make the folder of `--out`, and be sure that files and figures can be written there, before anything is computed.
-
-    Raises
-    ------
-    ValueError
-        If the folder cannot be made or written to.
-    ImportError
-        Without matplotlib, which draws the figures.
-    """
+    """Make the folder of `--out`, and be sure that files and figures can be written, before anything is computed."""
     from sympflow.show.style import new_figure
 
     new_figure(1, 1)
@@ -178,13 +167,7 @@ def ready_folder(folder: Path) -> None:
 
 
 def ready_file(path: Path, option: str = "--out") -> None:
-    """Make the folder of the file of an option, and be sure that it can be written, before anything is computed.
-
-    Raises
-    ------
-    ValueError
-        If it cannot.
-    """
+    """Make the folder of an option's file, and be sure that it can be written, before anything is computed."""
     if path.is_dir():
         raise ValueError(f"`{option}` {str(path)!r} is a folder: name a file in it.")
     _ready(path.parent, path, "a file", option)

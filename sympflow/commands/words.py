@@ -104,13 +104,7 @@ def factory_of(scene: str) -> Callable[..., HamiltonianSystem]:
 
 
 def made(scene: str, **params: Any) -> HamiltonianSystem:
-    """The system of a scene; one of a plug-in may fail.
-
-    Raises
-    ------
-    ImportError
-        If a plug-in's cannot be loaded or makes something else.
-    """
+    """The system of a scene; an ImportError if a plug-in's cannot be loaded or makes something else."""
     system = factory_of(scene)(**params)
     if not isinstance(system, HamiltonianSystem):
         what = type(system).__name__
@@ -130,20 +124,7 @@ def _making(scene: str) -> Callable[..., HamiltonianSystem]:
 
 @dataclass(frozen=True)
 class Scene:
-    """A system as asked for.
-
-    Attributes
-    ----------
-    key : str
-        Names its files.
-    system : HamiltonianSystem
-    t_end : float or None
-        Where it should end, if that was said.
-    factory : callable
-        Makes the system of other parameters.
-    params : dict
-        The parameters that were said.
-    """
+    """A system as asked for; its key names its files."""
 
     key: str
     system: HamiltonianSystem
@@ -162,16 +143,7 @@ def _defaults(factory: Callable[..., HamiltonianSystem]) -> dict[str, Any]:
 
 
 def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> list[Scene]:
-    """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10:t_end=5`` and ``--omega 100``.
-
-    A parameter behind two dashes holds for every scene that has it. A scene may be one of a file: ``file.toml``,
-    ``file.py:name``. `own` are more of them.
-
-    Raises
-    ------
-    ValueError
-        For a scene or a parameter that does not exist.
-    """
+    """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10`` and ``--omega 100``."""
     names, shared = _split(words or ())
     names += own or ()
     if not names:
@@ -358,13 +330,7 @@ def varied(scene: Scene, words: str) -> tuple[str, list[Any]]:
 
 
 def methods(words: str) -> list[Any]:
-    """Methods from a list such as ``verlet,rk45:rtol=1e-8,flow.safetensors``, for `compare`.
-
-    Raises
-    ------
-    ValueError, TypeError
-        For an unknown method or option.
-    """
+    """Methods from a list such as ``verlet,rk45:rtol=1e-8,flow.safetensors``, for `compare`."""
     entries = [word.strip() for word in words.split(",") if word.strip()]
     if not entries:
         raise ValueError("`--methods` is empty: give names separated by commas, such as verlet,rk45.")
