@@ -329,9 +329,14 @@ def varied(scene: Scene, words: str) -> tuple[str, list[Any]]:
     return name, [_value("--vary", word, known[name]) for word in values.split(",")]
 
 
+def listed(words: str) -> list[str]:
+    """Words that are separated by commas."""
+    return [word.strip() for word in words.split(",") if word.strip()]
+
+
 def methods(words: str) -> list[Any]:
     """Methods from a list such as ``verlet,rk45:rtol=1e-8,flow.safetensors``, for `compare`."""
-    entries = [word.strip() for word in words.split(",") if word.strip()]
+    entries = listed(words)
     if not entries:
         raise ValueError("`--methods` is empty: give names separated by commas, such as verlet,rk45.")
     return [method(word) for word in entries]
@@ -396,16 +401,18 @@ def state(words: str | None) -> np.ndarray | None:
     return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])
 
 
-def widths(words: str) -> tuple[int, ...]:
-    """Layer widths from ``10,10``."""
+def parsed(option: str, words: str | None, read: Callable[[str], Any], what: str) -> Any:
+    """The value that an option's words are read as, None without any; a ValueError says what they must be."""
     try:
-        return tuple(int(word) for word in words.split(","))
+        return None if words is None else read(words)
     except ValueError as error:
-        raise ValueError(f"`--hidden` must be whole numbers separated by commas; got {words!r}.") from error
+        raise ValueError(f"`{option}` must be {what}; got {words!r}.") from error
+
+
+def numbers(words: str, kind: Callable[[str], Any] = float) -> list[Any]:
+    """Numbers that are separated by commas."""
+    return [kind(word) for word in words.split(",")]
 
 
 def _float(name: str, word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise ValueError(f"`{name}` must be a number; got {word!r}.") from error
+    return parsed(name, word, float, "a number")
