@@ -178,9 +178,7 @@ def train(
         from sympflow.training.trainer import train as train_flow
 
         scene = one_scene(system, own)
-        options = asked(
-            ctx, "kind stages processor pairs hidden activation optimizer steps points learning_rate restarts"
-        )
+        options = asked(ctx, "kind stages processor pairs activation optimizer steps points learning_rate restarts")
         options |= asked(ctx, "residual_weight matching_weight label_weight time_budget workers seed checkpoint resume")
         if hidden is not None:
             whole = "whole numbers separated by commas"
