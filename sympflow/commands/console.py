@@ -23,7 +23,7 @@ out = Console(soft_wrap=True, highlight=False)
 err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
-OPTIONS = {
+OPTIONS = {  # arguments of the library that commands have by other names: the first one counts that the command has
     "t_span": ("t_end",),
     "t_eval": ("n_outputs",),
     "method": ("method_name", "method_names"),
@@ -33,7 +33,6 @@ OPTIONS = {
     "n": ("batch", "orbits"),
     "dtype": ("dtypes",),
 }
-"""Arguments of the library that commands have by other names: the first one counts that the command has."""
 COMMANDS = {"poincare_section": "section", "work_precision": "bench", "available": "methods", "shipped_flows": "flows"}
 """Functions of the library that are commands by other names."""
 PHRASES: dict[str, str | Callable[[re.Match[str]], str]] = {

@@ -101,8 +101,7 @@ def methods(
 
 
 TITLES = ("order", "symplectic", "forces a step", "source")
-LISTED = 100
-"""Columns of the list of methods, where the terminal has no more."""
+LISTED = 100  # columns of the list of methods, where the terminal has no more
 
 
 def _cells(cls: type[Integrator]) -> tuple[str, ...]:

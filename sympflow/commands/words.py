@@ -220,7 +220,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
 
 
 SYSTEM = "name a scene, of those that `sympflow systems` lists, an own one, file.py:name or file.toml, or write H"
-MEANT = {
+MEANT = {  # options by the names that users try
     **dict.fromkeys(("solver", "integrator", "scheme"), "method"),
     **dict.fromkeys(("steps", "n_steps", "step", "h", "stepsize", "step_size"), "dt"),
     **dict.fromkeys(("t", "tmax", "t_max", "tend", "t_span", "time", "duration", "end"), "t-end"),
@@ -228,9 +228,7 @@ MEANT = {
     **dict.fromkeys(("q0", "p0", "x0", "q", "p", "initial", "ic"), "y0"),
     **dict.fromkeys(("output", "save", "plot", "file", "csv", "o"), "out"),
 }
-"""Options by the names that users try."""
-FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
-"""A word that is H, and not the name of a scene."""
+FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")  # a word that is H, and not the name of a scene
 
 
 def _formula(text: str) -> Callable[..., HamiltonianSystem]:

@@ -20,8 +20,7 @@ from sympflow.solver import solve
 
 BLOCK = 64
 """Rows that array operations take together: what they round depends on their number, and on a row's place in them."""
-MOST_VALUES = 1 << 21
-"""Values of states that are held at a time, of 16 MB."""
+MOST_VALUES = 1 << 21  # values of states that are held at a time, of 16 MB
 FAILED = -1
 LONGEST_MESSAGE = 400
 

@@ -174,10 +174,8 @@ class Layout:
         }
 
 
-MOST_SHOWN = 10_000_000
-"""Numbers of an ensemble beyond which a notebook shows no figure of it."""
-NOT_RUN = 2
-"""The status of orbits of a store that have not been run yet."""
+MOST_SHOWN = 10_000_000  # numbers of an ensemble beyond which a notebook shows no figure of it
+NOT_RUN = 2  # the status of orbits of a store that have not been run yet
 
 
 class Keeper(Protocol):

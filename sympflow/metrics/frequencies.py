@@ -23,8 +23,7 @@ from sympflow.systems.given import GivenSystem, given_system
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOST_SAMPLES = 1 << 16
-"""Samples of an orbit, unless more are asked for: at every step, or at every few of a longer run."""
+MOST_SAMPLES = 1 << 16  # samples of an orbit, unless more are asked for: at every step, or at every few of a longer run
 FEWEST_SAMPLES = 16
 OF_OTHER_METHODS = 4096  # samples, where steps are of no fixed length
 MOST_VALUES = 1 << 21  # numbers that are held at a time
