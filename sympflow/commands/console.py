@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.console import Console
+from typer import Option
 
 from sympflow.commands.words import Scene, Usage
 from sympflow.show.cards import cut
@@ -125,9 +126,7 @@ def _set_quiet(quiet: bool) -> bool:
 
 Quiet = Annotated[
     bool,
-    typer.Option(
-        "--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."
-    ),
+    Option("--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."),
 ]
 
 
