@@ -20,10 +20,8 @@ from numpy.typing import ArrayLike
 from sympflow.arrays import differentiable, is_tensor, to_numpy, without_torch
 
 MAX_SAVED_VALUES = 10_000_000
-MAX_ASKED_VALUES = 1_000_000_000
-"""Values of a batch, or of outputs that were asked for one by one: 8 GB."""
-LONGEST_STEP = 1e100
-"""Beyond it the powers of dt in a step are no floating-point numbers."""
+MAX_ASKED_VALUES = 1_000_000_000  # values of a batch, or of outputs that were asked for one by one: 8 GB
+LONGEST_STEP = 1e100  # beyond it the powers of dt in a step are no floating-point numbers
 _FLOAT64 = np.dtype(np.float64)
 _PLAIN = {float, int}
 FEWEST_TIMES = 8  # floating-point numbers that an interval must span

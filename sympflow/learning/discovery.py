@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RADIANS = 6.0  # Length of the pieces that are shot through, in the mean angular rate of the data: about one period
-FLOOR = 1e-6
-"""Least noise, over the spread of a coordinate: below it a formula would explain the errors of the scheme."""
+FLOOR = 1e-6  # least noise, over the spread of a coordinate: below it a formula would explain the errors of the scheme
 STEP = 0.1  # Step of the system that is made, in the mean angular rate of the data
 STEP_SHARE = 0.02  # Error of the scheme from one point to the next, over the noise
 STEPS = 40  # Most steps of a fit
@@ -500,11 +499,7 @@ class _Search:
         return None if found is None else found[1]
 
     def _first(self, most: int, steps: int) -> list[int]:
-        """The best model of several regressions whose predictions do not diverge; pieces are shortened until it is so.
-
-        Where terms are nearly alike, as cosines, powers and distances, adding them one at a time ends elsewhere than
-        dropping them, and than the same among a part of the library. The best of the regressions are fitted.
-        """
+        """The best fit of several regressions; pieces are shortened until one of them does not diverge."""
         regression = Regression.of_slopes(self.library, self.smooth, self.data.scales)
         most = min(most, self.most_terms)
         found = [way(most, part) for part in self._parts() for way in (regression.forward, regression.backward)]

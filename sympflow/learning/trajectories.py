@@ -49,8 +49,7 @@ FAR, LARGEST = 1e3, 1e60
 POINTS, LONG = 24, 10
 """Points of a piece by which models are compared, and such pieces in a part of a trajectory that is smoothed."""
 COMPARED = 2000  # Points in all such pieces
-ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}
-"""Periods of angles that are looked for."""
+ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}  # periods of angles that are looked for
 
 
 @dataclass(frozen=True, repr=False)
@@ -398,13 +397,7 @@ class Trajectories(Shown):
 
 
 def periods_of(period: Any, ndof: int) -> np.ndarray:
-    """The period of each q (d,), infinite where there is none.
-
-    Raises
-    ------
-    ValueError
-        If it is not positive, or of another shape.
-    """
+    """The period of each q (d,), infinite where there is none; a ValueError if it is not positive."""
     given = floats("period", period)
     if given.shape not in ((), (ndof,)) or (given <= 0).any():
         raise ValueError(f"`period` must be positive, one for all q or one for each of {ndof}; got {period!r}.")
