@@ -20,7 +20,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from sympflow.arguments import checked_count, floats
+from sympflow.arguments import checked_count, floats, plain
 from sympflow.arrays import per_state
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.layers import OwnLayer
@@ -122,10 +122,8 @@ class CollocatedFlow(SystemFlow):
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__(ndof, dt, dtype, device)
-        counts = ("stages", stages, MOST_STAGES), ("steps", steps, MOST_STEPS)
-        self.stages, self.steps = (
-            checked_count(n, v, 1, most, f"an integer from 1 to {most}") for n, v, most in counts
-        )
+        self.stages = checked_count("stages", plain(stages), 1, MOST_STAGES, f"an integer from 1 to {MOST_STAGES}")
+        self.steps = checked_count("steps", plain(steps), 1, MOST_STEPS, f"an integer from 1 to {MOST_STEPS}")
         self.tableau = collocation.gauss_legendre(self.stages)
         _, B, scale = self.tableau
         weights = [b * unit for b, unit in zip(B, scale, strict=True)] if self.stages > 2 else list(B)

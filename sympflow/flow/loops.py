@@ -97,7 +97,7 @@ class PrimedFlowKernel(Kernel):
         return self._splitting.functions(tables.level, self._compensated, tables.monomials, ranges=self._ranges)
 
     def _processed(self, h: float, t0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The tables of χ⁻¹, of a run of K, and of χ from the last stage of K on, of steps |h|; h < 0: their inverse."""
+        """The tables of χ⁻¹, of a run of K, and of χ from the last stage of K on; for h < 0 of the inverse."""
         loops = self._splitting
 
         def stages() -> tuple[StageTable, StageTable, StageTable]:
