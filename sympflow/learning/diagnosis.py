@@ -165,11 +165,7 @@ def free_reading(scales: np.ndarray, degree: int) -> Reading:
 
 
 def best_by_increments(
-    data: Trajectories,
-    held: Trajectories,
-    models: Sequence[Model],
-    drives: Sequence[Drive] = (),
-    stop: Stop = never,
+    data: Trajectories, held: Trajectories, models: Sequence[Model], drives: Sequence[Drive] = (), stop: Stop = never
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
     """The place of the model that explains held-out increments best, a doubt, and the squares by places; or None."""
     scales, d = data.scales, data.ndof
@@ -224,11 +220,7 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
 
 
 def hint(
-    library: Library,
-    smooth: Smooth,
-    data: Trajectories,
-    force: Force | None = None,
-    drives: Sequence[Drive] = (),
+    library: Library, smooth: Smooth, data: Trajectories, force: Force | None = None, drives: Sequence[Drive] = ()
 ) -> str | None:
     """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
     d, scales = data.ndof, data.scales

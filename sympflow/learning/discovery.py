@@ -244,10 +244,7 @@ class Discovery:
         ax.axvline(len(self.terms), color="#333333", lw=0.8, ls=":")
         chosen = next(model for model in self.path if len(model.terms) == len(self.terms))
         ax.annotate(
-            f"chosen: {len(self.terms)} terms",
-            (len(self.terms), chosen.residual),
-            (6, 18),
-            textcoords="offset points",
+            f"chosen: {len(self.terms)} terms", (len(self.terms), chosen.residual), (6, 18), textcoords="offset points"
         )
         ax.axhline(1.0, color="#999999", lw=0.8)
         ax.set(xlabel="number of terms", ylabel="residual / noise", yscale="log")

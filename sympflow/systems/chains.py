@@ -109,11 +109,7 @@ def toda_lattice(n: int = 3) -> HamiltonianSystem:
     y0 = np.zeros(2 * n)
     y0[n], y0[n + 1 :] = 1.0, -1 / (n - 1)
     return HamiltonianSystem.from_sympy(
-        f"({kinetic})/2 + {springs} - {n}",
-        name="toda_lattice",
-        domain=Ball(np.zeros(2 * n), 2.0),
-        y0=y0,
-        dt=0.05,
+        f"({kinetic})/2 + {springs} - {n}", name="toda_lattice", domain=Ball(np.zeros(2 * n), 2.0), y0=y0, dt=0.05
     )
 
 
