@@ -121,7 +121,7 @@ class ClockedFlow(SystemFlow):
         """Return the c_k that the clock has now, the last one first."""
         return self._numbers.current(lambda: tuple(doubles(self.clock.numbers)[::-1].tolist()))
 
-    def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> ClockedFlowKernel:
         from sympflow.flow.loops import ClockedFlowKernel
 
         return ClockedFlowKernel(self.scheme, system, self.advance)

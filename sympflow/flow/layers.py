@@ -63,7 +63,7 @@ class Layer(nn.Module):
 
 
 class OwnLayer(Layer):
-    """A layer that takes its numbers and functions from its flow."""
+    """A layer that takes its numbers and functions from its flow, and moves rows of states by `moved`."""
 
     def __init__(self, flow: Any) -> None:
         super().__init__()
@@ -73,6 +73,17 @@ class OwnLayer(Layer):
     @property
     def flow(self) -> Any:
         return self._of[0]
+
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        """φ_t(y), or φ_t⁻¹(y), of rows (N, 2d)."""
+        raise NotImplementedError
+
+    def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
+        q, p = self.moved(t, torch.cat([q, p]).T, back).T.chunk(2)
+        return q, p
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self.forward(t, q, p, back=True)
 
 
 class Binding:
