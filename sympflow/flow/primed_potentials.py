@@ -76,10 +76,7 @@ _FUNCTIONS: dict[str, tuple[Callable[..., Tensor], Callable[..., Tensor]]] = {
             lambda x, s: system.hessian_vector(x, system.velocity(system.force(x, s)), s), system, q, t
         ),
     ),
-    "curvature": (
-        lambda system, q, t: system.curvature(q, t),
-        lambda system, q, t: system.curvature_gradient(q, t),
-    ),
+    "curvature": (lambda system, q, t: system.curvature(q, t), lambda system, q, t: system.curvature_gradient(q, t)),
 }
 
 

@@ -225,9 +225,7 @@ class SplitFlow(SystemFlow):
     def _coefficient_maps(self) -> list[SubFlow]:
         """The maps with the coefficients of the columns, (K, …), in place of their values."""
         return self._assemble(
-            lambda column: doubles(column.table),
-            lambda entries: np.stack(entries, axis=-1),
-            np.eye(1, self.terms)[0],
+            lambda column: doubles(column.table), lambda entries: np.stack(entries, axis=-1), np.eye(1, self.terms)[0]
         )
 
     def _assemble(self, values: Any, stack: Any, unity: Any = None) -> list[SubFlow]:
