@@ -130,11 +130,12 @@ class PotentialLayer(Layer):
     def _moved(self, q: Tensor, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
         return (q, p - g) if self.kind == "kick" else (q + g, p)
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(q, p, self.potential.impulse(t, self._argument(q, p)))
+    def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
+        g = self.potential.impulse(t, self._argument(q, p))
+        return self._moved(q, p, -g if back else g)
 
     def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(q, p, -self.potential.impulse(t, self._argument(q, p)))
+        return self.forward(t, q, p, back=True)
 
     def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         g, dg = self.potential.impulse_and_tangent(t, self._argument(q, p), self._argument(dq, dp))

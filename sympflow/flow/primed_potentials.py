@@ -173,16 +173,10 @@ class PrimedDrift(Drift):
         d = system.ndof
         return torch.cat([q[:d] + system.velocity(mean).T, q[d:] + passed]), end
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
         if self._plain:
-            return super().forward(t, q, p)
-        s = self._time.value(t)
-        return self._drifted(s, q, p, s)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        if self._plain:
-            return super().inverse(t, q, p)
-        s = -self._time.value(t)
+            return super().forward(t, q, p, back)
+        s = -self._time.value(t) if back else self._time.value(t)
         return self._drifted(s, q, p, s)
 
     def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
