@@ -50,9 +50,6 @@ class ClockPotential(Potential):
         advance = sum((c * t ** (3 + 2 * k) * B**k for k, c in enumerate(self.numbers)), 0 * B)
         return torch.cat([torch.zeros_like(x[:-1]), advance[None]])
 
-    def to_dict(self) -> dict[str, Any]:
-        return {"type": "clock"}
-
 
 @dataclass(frozen=True)
 class Share:

@@ -45,8 +45,6 @@ TOLERANCE = 1e-10
 class CollocationLayer(OwnLayer):
     """One step χ_{t/m} of a Gauss method."""
 
-    kind = "collocation"
-
     def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
         h = (-t if back else t) / self.flow.steps
         return self.flow.ended(y, self.flow.stages_of(y, h)[0], h)
@@ -59,9 +57,6 @@ class CollocationLayer(OwnLayer):
         mean = (flow.weights * flow.bound_system.hamiltonian(y[:, None, :] + A @ K)).sum(-1)
         q, p = flow.ended(y, K, h).T.chunk(2)
         return q, p, mean / flow.steps
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind}
 
 
 class CollocatedFlow(SystemFlow):

@@ -88,9 +88,6 @@ class PlanetLayer(OwnLayer):
         kepler = self.flow.frame.kepler_energy(y)
         return q, p, kick * (self.flow.system.hamiltonian(y) - kepler) if kick else drift * kepler
 
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "kepler"}
-
 
 class KeplerFlow(SystemFlow):
     """A flow of planets about a star with trained coordinates; made by `sympflow.train` of a system of planets.

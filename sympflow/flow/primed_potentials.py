@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
@@ -252,6 +252,3 @@ class PrimedPotential(Potential):
             impulse = impulse + slope
             tangent = tangent + self._polynomial.gradient(self._polynomial.rate(t, x), q) + change
         return impulse, tangent
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"type": "primed"}

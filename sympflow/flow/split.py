@@ -66,8 +66,7 @@ class SplitLayer(OwnLayer):
 
     def __init__(self, flow: SplitFlow, index: int) -> None:
         super().__init__(flow)
-        self.index, self.part = index, flow.sequence[index]
-        self.kind = "linear" if self.part == LINEAR else flow.kinds[self.part - 1]  # type: ignore[misc]
+        self.index = index
 
     def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
         m, parts = self.flow.maps(t)[self.index], self.flow.parts
@@ -89,9 +88,6 @@ class SplitLayer(OwnLayer):
             return V
 
         return q, p, by_time(generator, q)[1]
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind, "part": self.part}
 
 
 class SplitFlow(SystemFlow):

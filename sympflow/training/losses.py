@@ -213,7 +213,8 @@ class _Compiled:
 
     def _values(self) -> tuple[np.ndarray, np.ndarray]:
         """ψ̄_t(x), and d/dt ψ̄_t(x) where it counts."""
-        return self.tangents.values(self._parameters, *self._points, self.ends is None)
+        t, x, constants = self._points
+        return self.tangents.values(self._parameters, t, x, constants, self.ends is None)
 
     def _at(self, y: np.ndarray, velocity: np.ndarray) -> Tensor:
         r = velocity - self._field("vector_field", y) if self.ends is None else y - self.ends

@@ -478,11 +478,9 @@ class Table:
         kicks = [i for i, kind in enumerate(flow.sequence) if kind == "kick"]
         n = len(flow.sequence)
         self.n = n + flow.terms * len(kicks)
-        named = [flow.kicks, flow.drifts, flow.gradients, flow.curvatures, *(flow.polynomials or ())]
-        outside = [flow.processor_kicks, flow.processor_drifts, flow.processor_gradients, flow.processor_curvatures]
-        outside += flow.processor_polynomials or ()
-        self.columns = [c for c in (*named, *outside) if c is not None]
-        self._kernel = len([c for c in named if c is not None])
+        named = dict(flow.columns())
+        self.columns = [*named.values()]
+        self._kernel = sum(not name.startswith("processor_") for name in named)
         self._places = [np.zeros((self.n, c.offset.shape[0])) for c in self.columns]
         index = {id(c): place for c, place in zip(self.columns, self._places, strict=True)}
         for i, substep in enumerate(flow.substeps):
