@@ -15,6 +15,7 @@ from sympflow.arguments import check_flag, warn
 from sympflow.arrays import Array, concatenate, is_tensor, to_numpy
 from sympflow.hamiltonian.scales import known_scale, size_of_terms, weights
 from sympflow.integrators.contract import method_text
+from sympflow.integrators.interpolants import Mapped
 from sympflow.show.cards import Answering, Card
 from sympflow.show.pictures import KINDS, trajectory_figure
 from sympflow.show.style import saved
@@ -421,21 +422,9 @@ def physical_solution(sol: Solution) -> Solution:
         system=doubled.physical,
         y0=limit(sol.y0),
         stats={**sol.stats, "difference": float(apart)},
-        sol=None if sol.sol is None else _PhysicalOutput(sol.sol, limit),
+        sol=None if sol.sol is None else Mapped(sol.sol, limit),
         y_events=None if sol.y_events is None else [limit(y) for y in sol.y_events],
     )
-
-
-@dataclass(frozen=True)
-class _PhysicalOutput:
-    """The physical part of the dense output of a doubled system."""
-
-    sol: Callable[[Any], Array]
-    limit: Callable[[Array], Array]
-
-    def __call__(self, t: Any) -> Array:
-        y = self.sol(t)
-        return self.limit(y) if np.ndim(t) == 0 else self.limit(y.swapaxes(-1, -2)).swapaxes(-1, -2)
 
 
 def check_solution(sol: object, name: str = "sol") -> None:

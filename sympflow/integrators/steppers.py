@@ -63,8 +63,6 @@ class Stepper:
     """One run of a fixed-step integrator: all that a run changes or counts is here, its kernel and its arrays.
 
     `kernel` are its compiled loops, None where it is made of array operations; `arrays` the same steps by these.
-    `saves_finite` is True if the states that `rollout` saves up to the last finite one are known to be finite. `remark`
-    says why a run of a formula is not compiled, for its message; `why` why functions of Python run as such.
     """
 
     def __init__(
@@ -77,8 +75,8 @@ class Stepper:
     ) -> None:
         self.integrator, self.system, self.problem = integrator, problem.system, problem
         self.arrays, self.kernel = arrays, kernel
-        self.saves_finite = kernel is not None and kernel.saves_finite
-        self.remark = self.why = ""
+        self.saves_finite = kernel is not None and kernel.saves_finite  # of saved states up to the last finite one
+        self.remark = self.why = ""  # the reasons why a formula is not compiled, and functions of Python run as such
         y0, untraced = problem.y0, None if kernel is not None or problem.system is None else problem.system.untraced
         if untraced and problem.backend == "auto" and y0.dtype == np.float64:
             name = "potential" if problem.system.separable else "hamiltonian"
@@ -167,19 +165,31 @@ class Stepper:
         return {"newton_iterations": self.arrays.iterations} if self.arrays.stages else {}
 
 
+def stepper_of(
+    integrator: Any, problem: Problem, arrays: ArraySteps, make: Callable[..., Any], compensated: bool = False
+) -> Stepper:
+    """Return the stepper of the loops that `make` gives, for names of parameters where gradients flow to these."""
+    if problem.followed:
+        return Stepper(integrator, problem, arrays, _followed_loops(make, problem))
+    told: list[str] = []
+    kernel = compiled_loops(make, problem.y0, problem.backend, compensated, told, problem.system)
+    if problem.parameter_values is not None:
+        kernel = kernel.varied(problem.parameter_values)
+    return Stepper(integrator, problem, arrays, kernel, told)
+
+
 def compiled_loops(
     make: Callable[[], Any],
     y0: Array,
     backend: str,
     compensated: bool = False,
-    reason: str | None = None,
     told: list[str] | None = None,
     system: Any = None,
 ) -> Any:
     """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
-
     Tensors need these, but where the `system` is given: there those on the CPU are compiled.
     """
+    reason = None
     if backend == "array":
         reason = "`backend` is 'array': choose 'auto'."
     elif is_tensor(y0):
@@ -205,7 +215,7 @@ def compiled_loops(
     return None
 
 
-def followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
+def _followed_loops(make: Callable[[tuple[str, ...]], Any], problem: Problem) -> Any:
     """The compiled loops, that `make` gives for names, of a run through which gradients flow to parameters."""
     names, array = tuple(problem.followed), problem.backend == "array"
     try:
