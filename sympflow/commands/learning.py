@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sympflow.commands.console import Quiet, out, print_table, ready_file, reporting, show
-from sympflow.commands.words import Usage, one_scene
+from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, reporting, show
+from sympflow.commands.words import Usage, numbers, one_scene, parsed
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.learning.trajectories import Trajectories
 
 
 def learn(
@@ -78,28 +77,16 @@ def learn(
         if damping and drag:
             raise ValueError("`--drag` is learned in place of `--damping`: leave out one of them.")
         ready_file(to)
-        if plot is not None:
-            ready_file(plot, "--plot")
+        ready_file(plot, "--plot")
         runs = Trajectories.read(data, ndof, units=_units(unit), order=order, period=period, observed=observed)
         out.print(f"{len(runs.runs)} trajectories, {runs.n_points} points, {runs.ndof} degree(s) of freedom")
-        flow = learn_flow(
-            runs,
-            dt=dt,
-            noise=noise,
-            period=period,
-            separable=separable,
-            mass=_masses(mass),
-            damping="quadratic" if drag else damping,
-            drive=_drive(drive),
-            known=_known(known),
-            family=family,
-            loss=loss,
-            seed=seed,
-            time_budget=time_budget,
-            checkpoint=checkpoint,
-            resume=resume,
-            progress=not quiet,
-        )
+        options = asked(ctx, "dt noise period separable family loss seed time_budget checkpoint resume")
+        options["damping"] = "quadratic" if drag else damping
+        found = drive in (None, "find")
+        options["drive"] = bool(drive) if found else parsed("--drive", drive, float, "an angular frequency, or find")
+        masses = parsed("--mass", mass, numbers, "a number, or numbers with commas, as 1,2.5")
+        options["mass"] = masses[0] if masses and len(masses) == 1 else masses
+        flow = learn_flow(runs, known=_known(known), progress=not quiet, **options)
         flow.save(to)
         titles = ["model", "numbers", "held-out loss", "correlation"]
         rows = [
@@ -119,7 +106,9 @@ def learn(
         out.print(", ".join(f"{k} = {v:.3g}" for k, v in shown.items() if v is not None))
         out.print(f"Written: {to}")
         if plot is not None:
-            _draw(flow, runs, seed, plot)
+            from sympflow.learning.figures import held_out_figure
+
+            held_out_figure(flow, runs.split(seed=seed)[1]).savefig(plot, dpi=110)
             out.print(f"Written: {plot}")
 
 
@@ -134,37 +123,9 @@ def _units(given: list[str] | None) -> dict[str, str]:
     return made
 
 
-def _masses(given: str | None) -> float | list[float] | None:
-    """One mass for all coordinates, or one for each."""
-    if given is None:
-        return None
-    try:
-        masses = [float(number) for number in given.split(",")]
-    except ValueError:
-        raise ValueError(f"`--mass` must be a number, or numbers with commas, as 1,2.5; got {given!r}.") from None
-    return masses[0] if len(masses) == 1 else masses
-
-
-def _drive(word: str | None) -> bool | float:
-    """The angular frequency of a drive, True for one that is to be found."""
-    if word is None or word == "find":
-        return word is not None
-    try:
-        return float(word)
-    except ValueError:
-        raise ValueError(f"`--drive` must be an angular frequency, or find; got {word!r}.") from None
-
-
 def _known(word: str | None) -> HamiltonianSystem | None:
     """The part of H that is known."""
     try:
         return None if word is None else one_scene([word]).system
     except ValueError as error:
         raise Usage(str(error).replace("`system`", "`--known`")) from error
-
-
-def _draw(flow: Any, runs: Trajectories, seed: int, path: Path) -> None:
-    """Predictions of the flow beside held-out trajectories, and H along both."""
-    from sympflow.learning.figures import held_out_figure
-
-    held_out_figure(flow, runs.split(seed=seed)[1]).savefig(path, dpi=110)

@@ -3,29 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
 
 from sympflow.arguments import MAX_ASKED_VALUES, check_counts
-from sympflow.commands import completion
-from sympflow.commands.console import Quiet, in_options, out, print_table, ready_file, reporting, show, write_solution
-from sympflow.commands.words import (
-    Backend,
-    OneMethod,
-    Own,
-    State,
-    Step,
-    Systems,
-    TEnd,
-    TStart,
-    configured,
-    interval,
-    one_scene,
-    state,
-    widths,
-)
+from sympflow.commands import completion, console, words
+from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, reporting, show
+from sympflow.commands.words import Backend, OneMethod, Own, State, Step, Systems, TEnd, TStart, interval, one_scene
 
 
 def solve(
@@ -87,30 +73,19 @@ def solve(
         if to is not None and to.suffix not in (".csv", ".npz"):
             raise ValueError(f"`--out` must end in .csv or .npz; got {str(to)!r}.")
         scene = one_scene(system, own)
-        chosen = None if method_name is None else configured(method_name)
+        chosen = None if method_name is None else words.configured(method_name)
         span = interval(scene, t_start, t_end)
         times = None if n_outputs is None else _instants(*span, n_outputs)
+        ready_file(to)
+        options = asked(ctx, "dt tol save_every store checkpoint_every backend resume")
+        options["progress"] = progress and not quiet
+        sol = solve_system(scene.system, chosen, span, words.state(y0), t_eval=times, **options)
         if to is not None:
-            ready_file(to)
-        asked = {"dt": dt, "tol": tol, "save_every": save_every, "store": store, "checkpoint_every": checkpoint_every}
-        options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-        sol = solve_system(
-            scene.system,
-            chosen,
-            span,
-            state(y0),
-            t_eval=times,
-            backend=backend,
-            resume=resume,
-            progress=progress and not quiet,
-            **options,
-        )
-        if to is not None:
-            write_solution(sol, to)
+            console.write_solution(sol, to)
         worst = "" if store is None else f" in {store}"
         if store is None and scene.system.shows_energy:
             worst = f", largest energy error {max_energy_error(sol) if len(sol.t) else np.nan:.2e}"
-        out.print(in_options(sol.message, ctx), markup=False)
+        out.print(console.in_options(sol.message, ctx), markup=False)
         out.print(f"{len(sol.t)} outputs{worst}")
         out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
         if store is None and len(sol.t):
@@ -203,32 +178,17 @@ def train(
         from sympflow.training.trainer import train as train_flow
 
         scene = one_scene(system, own)
-        chosen = {
-            "kind": kind,
-            "stages": stages,
-            "processor": processor,
-            "pairs": pairs,
-            "hidden": None if hidden is None else widths(hidden),
-            "activation": activation,
-            "optimizer": optimizer,
-            "steps": steps,
-            "points": points,
-            "learning_rate": learning_rate,
-            "residual_weight": residual_weight,
-            "matching_weight": matching_weight,
-            "label_weight": label_weight,
-            "restarts": restarts,
-            "time_budget": time_budget,
-            "workers": workers,
-        }
-        options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
+        options = asked(ctx, "kind stages processor pairs activation optimizer steps points learning_rate restarts")
+        options |= asked(ctx, "residual_weight matching_weight label_weight time_budget workers seed checkpoint resume")
+        if hidden is not None:
+            whole = "whole numbers separated by commas"
+            options["hidden"] = tuple(words.parsed("--hidden", hidden, lambda text: words.numbers(text, int), whole))
         to = to or Path(f"{scene.key}-{kind or 'sympflow'}.safetensors")
         if to.suffix != ".safetensors":
             raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
         ready_file(to)
-        if checkpoint is not None:
-            ready_file(checkpoint, "--checkpoint")
-        flow = train_flow(scene.system, dt, seed=seed, checkpoint=checkpoint, resume=resume, **options)
+        ready_file(checkpoint, "--checkpoint")
+        flow = train_flow(scene.system, dt, **options)
         flow.save(to)
         figures = [
             (k.replace("_", " "), f"{v:.3g}" if isinstance(v, float) else str(v)) for k, v in flow.figures.items()
@@ -283,10 +243,9 @@ def certificate(
             flow = load(flow_name, system=scene.system)
         else:
             flow = named(flow_name).load(scene.system)
-        if to is not None:
-            ready_file(to)
+        ready_file(to)
         end = t_end if scene.t_end is None else scene.t_end
-        found = flow.certificate(scene.system, states=states, times=times, held_out=held_out, t_end=end, seed=seed)
+        found = flow.certificate(scene.system, t_end=end, **asked(ctx, "states times held_out seed"))
         show(str(found))
         if to is not None:
             if to.suffix == ".json":

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
 
 from sympflow.arguments import check_counts
-from sympflow.commands import completion
-from sympflow.commands.console import Quiet, out, progress, ready_folder, reporting, show, write_comparisons
+from sympflow.commands import completion, console, words
+from sympflow.commands.console import Quiet, asked, out, progress, ready_folder, reporting, show
 from sympflow.commands.words import (
     Backend,
     OneMethod,
@@ -21,13 +21,11 @@ from sympflow.commands.words import (
     Systems,
     TEnd,
     TStart,
-    configured,
     interval,
+    listed,
     methods,
-    one_scene,
     scenes,
     state,
-    varied,
 )
 
 Methods = Annotated[
@@ -89,31 +87,21 @@ def compare(
         from sympflow.studies.comparison import compare as compare_methods
 
         chosen, found = methods(method_names), scenes(systems, own)
-        start = state(y0)
-        if to is not None:
-            ready_folder(to)
+        options = asked(ctx, "dt n_outputs repeats match backend") | {"y0": state(y0)}
+        measured = None if metrics is None else listed(metrics)
+        ready_folder(to)
         with progress() as say:
+            options["progress"] = say
+            spans = [interval(scene, t_start, t_end) for scene in found]
             comparisons = [
-                compare_methods(
-                    scene.system,
-                    chosen,
-                    None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()],
-                    t_span=interval(scene, t_start, t_end),
-                    y0=start,
-                    dt=dt,
-                    n_outputs=n_outputs,
-                    repeats=repeats,
-                    match=match,
-                    backend=backend,
-                    progress=say,
-                )
-                for scene in found
+                compare_methods(scene.system, chosen, measured, t_span=span, **options)
+                for scene, span in zip(found, spans, strict=True)
             ]
         show(combined_table(comparisons, out.width if out.is_terminal else None))
         if to is not None:
             with progress() as say:
-                written = write_comparisons(comparisons, found, to, say)
-            out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
+                written = console.write_comparisons(comparisons, found, to, say)
+            console.tell(to, written)
         if not any(row.status == "ok" for c in comparisons for row in c.rows):
             raise typer.Exit(1)
 
@@ -151,30 +139,20 @@ def bench(
         from sympflow.show.style import save
         from sympflow.studies.precision import work_precision
 
-        chosen, found, start = methods(method_names), scenes(systems, own), state(y0)
-        if to is not None:
-            ready_folder(to)
+        chosen, found = methods(method_names), scenes(systems, own)
+        options = asked(ctx, "n_outputs repeats budget backend") | {"y0": state(y0)}
+        ready_folder(to)
         for scene in found:
+            many = (1000 if batch is None and scene.system.domain is not None else batch) or None
+            span = interval(scene, t_start, t_end)
             with progress() as say:
-                report = work_precision(
-                    scene.system,
-                    chosen,
-                    t_span=interval(scene, t_start, t_end),
-                    y0=start,
-                    batch=(1000 if batch is None and scene.system.domain is not None else batch) or None,
-                    n_outputs=n_outputs,
-                    repeats=repeats,
-                    budget=budget,
-                    backend=backend,
-                    progress=say,
-                )
+                report = work_precision(scene.system, chosen, t_span=span, batch=many, progress=say, **options)
             show(report.table())
             if to is not None:
                 name = f"{scene.key}-work-precision"
                 written = [report.to_csv(to / f"{name}.csv"), report.to_json(to / f"{name}.json")]
                 figures = {to / f"{name}.png": report.measure, to / f"{name}-state.png": "error"}
-                written += [save(report.figure(measure), path) for path, measure in figures.items()]
-                out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
+                console.tell(to, written + [save(report.figure(measure), path) for path, measure in figures.items()])
 
 
 def stability(
@@ -216,33 +194,22 @@ def stability(
         from sympflow.studies.step_stability import stability as find_stability
 
         chosen, found = methods(method_names), scenes(systems, own)
-        lengths = None if steps is None else [_number("--steps", word) for word in steps.split(",")]
-        if to is not None:
-            ready_folder(to)
+        options = asked(ctx, "bound limits") | {"dtypes": listed(dtypes), "metrics": listed(metrics)}
+        options["steps"] = words.parsed("--steps", steps, words.numbers, "numbers separated by commas")
+        ready_folder(to)
         for scene in found:
             family = [scene.system]
             if vary is not None:
-                name, values = varied(scene, vary)
+                name, values = words.varied(scene, vary)
                 family = [scene.factory(**(scene.params | {name: value})) for value in values]
             span = None if (scene.t_end, t_start, t_end) == (None, None, None) else interval(scene, t_start, t_end)
             with progress() as say:
-                report = find_stability(
-                    family,
-                    chosen,
-                    steps=lengths,
-                    t_span=span,
-                    y0=state(y0),
-                    dtypes=[word.strip() for word in dtypes.split(",") if word.strip()],
-                    metrics=[word.strip() for word in metrics.split(",") if word.strip()],
-                    bound=bound,
-                    limits=limits,
-                    progress=say,
-                )
+                report = find_stability(family, chosen, t_span=span, y0=state(y0), progress=say, **options)
             show(report.table())
             if to is not None:
-                written = [report.to_csv(to / f"{scene.key}-stability.csv")]
-                report.plot(to / f"{scene.key}-stability.png")
-                out.print(f"\nWritten to {to}: {written[0].name}, {scene.key}-stability.png")
+                written, picture = report.to_csv(to / f"{scene.key}-stability.csv"), to / f"{scene.key}-stability.png"
+                report.plot(picture)
+                console.tell(to, [written, picture])
 
 
 def section(
@@ -307,7 +274,7 @@ def section(
         from sympflow.show.style import save
         from sympflow.studies.poincare import names, poincare_section
 
-        scene, chosen = one_scene(system, own), None if method_name is None else configured(method_name)
+        scene, chosen = words.one_scene(system, own), None if method_name is None else words.configured(method_name)
         span = interval(scene, t_start, t_end)
         start = None if energy is not None and not y0 else _starts(scene, y0, orbits, seed)
         if direction is not None and direction not in DIRECTIONS:
@@ -317,14 +284,12 @@ def section(
             known = ", ".join(names(scene.system.ndof))
             raise ValueError(f"`--axes` must be two of {known}, separated by a comma; got {axes!r}.")
         check_counts(limit=limit)
-        if to is not None:
-            ready_folder(to)
-        way = None if direction is None else DIRECTIONS[direction]
-        asked = {"dt": dt, "tol": tol, "coordinate": coordinate, "level": level, "direction": way, "sample": sample}
-        asked |= {"period": period}
+        ready_folder(to)
+        options = asked(ctx, "dt tol coordinate level sample period energy")
+        if direction is not None:
+            options["direction"] = DIRECTIONS[direction]
         if energy is not None:
-            asked |= {"energy": energy, "n": orbits, "seed": seed}
-        options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+            options |= {"n": orbits, "seed": seed}
         with progress() as say:
             say(f"{scene.key}: {method_name or 'section'}")
             found = poincare_section(scene.system, chosen, span, start, **options)
@@ -334,8 +299,8 @@ def section(
         if to is not None:
             name = to / f"{scene.key}-section"
             figure = found.figure(pair[0], pair[1], turn)
-            written = [found.to_csv(f"{name}.csv"), found.to_json(f"{name}.json"), save(figure, Path(f"{name}.png"))]
-            out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
+            files = [found.to_csv(f"{name}.csv"), found.to_json(f"{name}.json"), save(figure, Path(f"{name}.png"))]
+            console.tell(to, files)
         if not found.success:
             raise typer.Exit(1)
 
@@ -355,10 +320,3 @@ def _starts(scene: Scene, y0: list[str] | None, orbits: int | None, seed: int) -
     if seed < 0:
         raise ValueError(f"`--seed` must be a whole number from 0 on; got {seed}.")
     return scene.system.domain.sample(orbits, seed=seed)
-
-
-def _number(option: str, word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise ValueError(f"`{option}` must hold numbers separated by commas; got {word!r}.") from error

@@ -104,13 +104,7 @@ def factory_of(scene: str) -> Callable[..., HamiltonianSystem]:
 
 
 def made(scene: str, **params: Any) -> HamiltonianSystem:
-    """The system of a scene; one of a plug-in may fail.
-
-    Raises
-    ------
-    ImportError
-        If a plug-in's cannot be loaded or makes something else.
-    """
+    """The system of a scene; an ImportError if a plug-in's cannot be loaded or makes something else."""
     system = factory_of(scene)(**params)
     if not isinstance(system, HamiltonianSystem):
         what = type(system).__name__
@@ -130,20 +124,7 @@ def _making(scene: str) -> Callable[..., HamiltonianSystem]:
 
 @dataclass(frozen=True)
 class Scene:
-    """A system as asked for.
-
-    Attributes
-    ----------
-    key : str
-        Names its files.
-    system : HamiltonianSystem
-    t_end : float or None
-        Where it should end, if that was said.
-    factory : callable
-        Makes the system of other parameters.
-    params : dict
-        The parameters that were said.
-    """
+    """A system as asked for; its key names its files."""
 
     key: str
     system: HamiltonianSystem
@@ -162,16 +143,7 @@ def _defaults(factory: Callable[..., HamiltonianSystem]) -> dict[str, Any]:
 
 
 def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> list[Scene]:
-    """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10:t_end=5`` and ``--omega 100``.
-
-    A parameter behind two dashes holds for every scene that has it. A scene may be one of a file: ``file.toml``,
-    ``file.py:name``. `own` are more of them.
-
-    Raises
-    ------
-    ValueError
-        For a scene or a parameter that does not exist.
-    """
+    """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10`` and ``--omega 100``."""
     names, shared = _split(words or ())
     names += own or ()
     if not names:
@@ -357,15 +329,14 @@ def varied(scene: Scene, words: str) -> tuple[str, list[Any]]:
     return name, [_value("--vary", word, known[name]) for word in values.split(",")]
 
 
-def methods(words: str) -> list[Any]:
-    """Methods from a list such as ``verlet,rk45:rtol=1e-8,flow.safetensors``, for `compare`.
+def listed(words: str) -> list[str]:
+    """Words that are separated by commas."""
+    return [word.strip() for word in words.split(",") if word.strip()]
 
-    Raises
-    ------
-    ValueError, TypeError
-        For an unknown method or option.
-    """
-    entries = [word.strip() for word in words.split(",") if word.strip()]
+
+def methods(words: str) -> list[Any]:
+    """Methods from a list such as ``verlet,rk45:rtol=1e-8,flow.safetensors``, for `compare`."""
+    entries = listed(words)
     if not entries:
         raise ValueError("`--methods` is empty: give names separated by commas, such as verlet,rk45.")
     return [method(word) for word in entries]
@@ -430,16 +401,18 @@ def state(words: str | None) -> np.ndarray | None:
     return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])
 
 
-def widths(words: str) -> tuple[int, ...]:
-    """Layer widths from ``10,10``."""
+def parsed(option: str, words: str | None, read: Callable[[str], Any], what: str) -> Any:
+    """The value that an option's words are read as, None without any; a ValueError says what they must be."""
     try:
-        return tuple(int(word) for word in words.split(","))
+        return None if words is None else read(words)
     except ValueError as error:
-        raise ValueError(f"`--hidden` must be whole numbers separated by commas; got {words!r}.") from error
+        raise ValueError(f"`{option}` must be {what}; got {words!r}.") from error
+
+
+def numbers(words: str, kind: Callable[[str], Any] = float) -> list[Any]:
+    """Numbers that are separated by commas."""
+    return [kind(word) for word in words.split(",")]
 
 
 def _float(name: str, word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise ValueError(f"`{name}` must be a number; got {word!r}.") from error
+    return parsed(name, word, float, "a number")

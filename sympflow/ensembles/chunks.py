@@ -106,10 +106,7 @@ class Chunk:
         return Grid(*self.t_span, length).outputs(None, 1)
 
     def windows(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), one window after another.
-
-        States of an orbit from where it failed are NaN.
-        """
+        """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), window by window."""
         times = self.times
         stepper = self._stepper
         most = max(1, MOST_VALUES // self.y0.size)

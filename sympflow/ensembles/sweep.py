@@ -252,11 +252,7 @@ def _runs_together(
     y0: np.ndarray,
     backend: str,
 ) -> bool:
-    """True if one compiled run takes orbits with different parameters; else each value has runs of its own.
-
-    It does not depend on the chunk, so that each orbit is run alike in any of them: a value that leaves its part of H
-    as it is, other than 0, 1 and −1, tells for all.
-    """
+    """True if one compiled run takes orbits with different parameters; else each value has runs of its own."""
     from sympflow.hamiltonian.parameter_rows import ParameterRows
 
     if not axes or system.symbols is None:

@@ -75,10 +75,7 @@ MOST_DRIVES, SWEEPS = 2, 2
 
 
 class Cause(Enum):
-    """Reasons why no H(q, p) explains data, each in words and with advice that has a place for the factors of forces.
-
-    The plainest come first.
-    """
+    """Reasons why no H(q, p) explains data, in words and with advice, the plainest first."""
 
     FRICTION = (
         "the best H with friction p' = -γp",
@@ -149,10 +146,7 @@ class Reading:
 
 
 def forced(model: Model, drives: Sequence[Drive] = ()) -> list[Reading]:
-    """The model with forces that no H(q, p) gives: friction, what turns p, quadratic drag, drives; from plain to rich.
-
-    Of a model that has a force only a drive is of interest.
-    """
+    """The model with forces that no H(q, p) gives, from plain to rich; of one that has a force only with a drive."""
     rows = tuple(range(2 * model.ndof))
     forces = [(frictions, Cause.FRICTION), (turns, Cause.TURNED), (drags, Cause.DRAG)]
     made = []
@@ -179,10 +173,7 @@ def best_by_increments(
     drives: Sequence[Drive] = (),
     stop: Stop = never,
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
-    """The place of the model that explains held-out increments best, a doubt, if any, and the squares by places.
-
-    The doubt is a reading of the data that leaves much less than all models. None in place of all for too few points.
-    """
+    """The place of the model that explains held-out increments best, a doubt, and the squares by places; or None."""
     scales, d = data.scales, data.ndof
     fitted, others = data.sample, held.sample
     affordable = [k for k, model in enumerate(models) if affords(fitted, model)]
@@ -241,10 +232,7 @@ def hint(
     force: Force | None = None,
     drives: Sequence[Drive] = (),
 ) -> str | None:
-    """The likeliest reason why the terms do not explain the data, with the remedy; None for none.
-
-    A force and drives that the model already has are not reasons; beside any force, friction is not one either.
-    """
+    """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
     d, scales = data.ndof, data.scales
     smooth = smooth.some(MOST_SLOPES)
     x, v = smooth.points, smooth.slopes
@@ -354,10 +342,7 @@ def _columns(X: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> float:
-    """The angular frequency at which a drive explains most of what the fields X (n, 2d, K) leave of slopes.
-
-    The peaks of the periodograms with each of its terms are compared by a fit of all, and the best is refined.
-    """
+    """The ω at which a drive explains most of what the fields X (n, 2d, K) leave of slopes."""
     d = X.shape[1] // 2
     most = min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
     frequencies = np.pi / smooth.longest * np.arange(0.5, max(most, 2) / 2, 0.25)
@@ -389,10 +374,7 @@ def _refined(
 def driven(
     X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive, known: Sequence[Drive] = ()
 ) -> tuple[float, list[float]]:
-    """The share of squares that drives leave, and their ω; of other trajectories than those that they were fitted to.
-
-    One trajectory cannot tell a drive from its own motion: infinite.
-    """
+    """The share of other trajectories' squares that drives leave, infinite of a single trajectory, and their ω."""
     first, v, near = smooth.owner % 2 == 0, smooth.slopes, 0.5 * np.pi / smooth.longest
 
     def theirs(A: np.ndarray) -> float:

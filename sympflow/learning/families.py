@@ -300,13 +300,7 @@ neural potentials, which are fitted to the data themselves, and no H is learned.
 
 
 def families(constraints: Constraints, name: str | None) -> list[str]:
-    """The names of the families that fit what is known, or of the one that is asked for.
-
-    Raises
-    ------
-    ValueError
-        If there is no such family, or it contradicts what is known.
-    """
+    """The names of the families that fit what is known; a ValueError if the one asked for does not."""
     if name is not None and name not in FAMILIES:
         raise ValueError(f"`family` {name!r} is unknown: choose from {', '.join(FAMILIES)}, or leave it out.")
     if name is not None and constraints.separable and not FAMILIES[name].separable:
@@ -358,15 +352,7 @@ def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate 
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:
-    """The same model without the terms of sums that the data do not ask for; None if they ask for all.
-
-    Terms are left out one by one, that one first which, by the quadratic approximation of χ² at its minimum, raises it
-    least, as long as Schwarz's criterion gains: by less than the logarithm of the number of values.
-
-    References
-    ----------
-    .. [1] G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461–464.
-    """
+    """The same model without the terms that Schwarz's criterion does not ask for; None if it asks for all."""
     model = candidate.model
     droppable = np.zeros(model.n, dtype=bool)
     for part, place in zip(model.parts, model.places, strict=True):

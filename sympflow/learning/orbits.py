@@ -51,10 +51,7 @@ class Stepper(ABC):
     def step(
         self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
     ) -> Any:
-        """The states (2d, N) and derivatives (2d, c, N) a time h (N,) after x and X at t, which may be overwritten.
-
-        The first 2d columns of X are those by the initial state, the others those by θ, if there are any.
-        """
+        """The states (2d, N) and derivatives (2d, c, N), by the start, then by θ, a time h (N,) after x and X at t."""
 
     def orbit(self, over: Over, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray) -> Orbit:
         """States and derivatives after each of the gaps (k, N) between points; the first gap follows t (N,)."""
@@ -263,10 +260,7 @@ def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
 
 
 def first_states(data: Trajectories, model: VectorField | None = None, theta: Any = None) -> np.ndarray:
-    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing.
-
-    Momenta are those of a model where velocities are observed.
-    """
+    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing."""
     values = np.concatenate([run.y for run in data.runs], axis=1)
     middle = np.nanmean(np.where(np.isnan(values).all(axis=1, keepdims=True), 0.0, values), axis=1)
     states = np.empty((len(data.runs), 2 * data.ndof))

@@ -380,11 +380,7 @@ class _Arrow(LinearModel):
 def chosen_method(
     model: Field, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray, halvings: int = 12, stop: Stop = never
 ) -> Method:
-    """The cheapest scheme and step whose error over the gaps between points is below a tolerance (2d,).
-
-    The error is that over single gaps, from observed states, against half the step. The step is the widest gap, halved
-    so many times at most.
-    """
+    """The cheapest scheme and step whose error over single gaps, against half the step, is below a tolerance (2d,)."""
     if model.stepper is not None:
         return Method(model.stepper, model.stepper.longest)
     starts, gaps, times = _gaps(data)
@@ -444,11 +440,7 @@ def _ends(
 def matched(
     model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1, stop: Stop = never
 ) -> np.ndarray:
-    """θ by which the observed increments are the integrals of the field along the observed states, by least squares.
-
-    No orbit is computed: y(t) − ∫ f_θ(y) dt is compared with a constant for each piece. That is linear where f is
-    linear in θ, and one step solves it.
-    """
+    """θ by least squares of y(t) − ∫ f_θ(y) dt along the observed states, less a constant for each piece."""
     pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
     if not pieces:
         return theta

@@ -398,13 +398,7 @@ class Trajectories(Shown):
 
 
 def periods_of(period: Any, ndof: int) -> np.ndarray:
-    """The period of each q (d,), infinite where there is none.
-
-    Raises
-    ------
-    ValueError
-        If it is not positive, or of another shape.
-    """
+    """The period of each q (d,), infinite where there is none; a ValueError if it is not positive."""
     given = floats("period", period)
     if given.shape not in ((), (ndof,)) or (given <= 0).any():
         raise ValueError(f"`period` must be positive, one for all q or one for each of {ndof}; got {period!r}.")

@@ -125,13 +125,7 @@ def escape_times(
 
 
 def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
-    """The function of states that `outside` means.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If it is none.
-    """
+    """The function of states that `outside` means; a ValueError or TypeError if it is none."""
     if outside is None:
         if system.domain is None:
             raise ValueError(
@@ -185,13 +179,7 @@ def _inside(region: Outside, y: np.ndarray) -> np.ndarray:
 
 
 def escapes(orbits: Orbits, region: Outside, backend: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The times (N,), states (N, 2d) and statuses (N,), some rows after others.
-
-    Raises
-    ------
-    ValueError
-        If the method has no fixed steps.
-    """
+    """The times (N,), states (N, 2d) and statuses (N,), some rows after others; a ValueError without fixed steps."""
     integrator = orbits.integrator
     if not (isinstance(integrator, FixedStep) and integrator.on_grid):
         raise ValueError(

@@ -214,13 +214,7 @@ def _growing(q: np.ndarray, times: np.ndarray) -> str:
 
 
 def signals(signal: Signal, y: np.ndarray, m: int) -> np.ndarray:
-    """The signals (N, c, m) of states (N, 2d, m).
-
-    Raises
-    ------
-    ValueError, TypeError
-        If the function returns something else.
-    """
+    """The signals (N, c, m) of states (N, 2d, m); a ValueError or TypeError if the function returns something else."""
     z = np.asarray(signal(y))
     if z.dtype.kind not in "biufc":
         raise TypeError(f"`signal` must return real or complex numbers; got dtype {z.dtype}.")

@@ -318,16 +318,7 @@ class SmallOscillations:
 def small_oscillations(
     system: HamiltonianSystem, y0: np.ndarray, orbit: Callable[[], np.ndarray]
 ) -> SmallOscillations | None:
-    """Return the frequencies about a stable equilibrium, else the largest along an orbit; None if there are none.
-
-    Parameters
-    ----------
-    system : HamiltonianSystem
-    y0 : ndarray (2d,)
-        The equilibrium, of no higher energy, is sought from the origin and from there.
-    orbit : callable
-        Gives states (n, 2d) along the orbit, which are looked at where there is no equilibrium.
-    """
+    """The frequencies about a stable equilibrium, else the largest along an orbit; None if there are none."""
     with np.errstate(all="ignore"):
         try:
             center = _equilibrium(system, y0)

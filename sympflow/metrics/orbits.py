@@ -91,13 +91,7 @@ def checked_orbits(
     options: Mapping[str, Any],
     purpose: str,
 ) -> Orbits:
-    """Orbits, the arguments as those of `solve`; `purpose` is what NumPy arrays are needed for, as a clause.
-
-    Raises
-    ------
-    ValueError, TypeError
-        For bad arguments, and where the method does not apply to the system.
-    """
+    """Orbits, the arguments checked as those of `solve`; `purpose` is what NumPy arrays are needed for, as a clause."""
     system = given_system(system)
     span = check_t_span(system.t_span if t_span is None else t_span)
     check_array(y0, f"{purpose} NumPy arrays")

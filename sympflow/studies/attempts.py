@@ -50,20 +50,7 @@ class Candidate:
 
 
 def candidates(methods: Sequence[Any], dt: float | None = None) -> list[Candidate]:
-    """Make the candidates that a list of methods means; their labels are distinct.
-
-    Parameters
-    ----------
-    methods : sequence
-        Names, integrators, trained flows, or pairs (label, any of these).
-    dt : float, optional
-        Step of the fixed-step classical methods that are given by name.
-
-    Raises
-    ------
-    ValueError, TypeError
-        For an unknown name, or no methods at all. A plug-in that cannot be loaded is a candidate with a problem.
-    """
+    """Candidates with distinct labels, of names, integrators, flows, or pairs (label, any of these)."""
     if isinstance(methods, str) or not isinstance(methods, Sequence):
         raise TypeError(f"`methods` must be a list of methods; got {methods!r}. Put it in brackets.")
     if not methods:
@@ -112,12 +99,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 def instants(t0: float, t1: float, n: int, dt: float) -> np.ndarray:
-    """The times (n,) at which methods are compared: one in each n-th of the interval, the last at its end.
-
-    Their places within these parts go on by the golden section, so that they meet all phases of an oscillation even
-    where its period divides the parts. They are ends of steps dt where a part holds two of these or more, so that a
-    method makes no other steps for them.
-    """
+    """The times (n,) of a comparison: one in each n-th of the interval, by the golden section, the last at its end."""
     k = np.arange(1, n)
     elapsed = (k - 1 + (GOLDEN * k) % 1) * (abs(t1 - t0) / n)
     if 2 * dt * n <= abs(t1 - t0):
@@ -332,10 +314,7 @@ class Attempt:
     def warm_up(
         self, run: Callable[[Any, tuple[float, float], np.ndarray], object], t: np.ndarray, t0: float, dt: float
     ) -> None:
-        """Compile what the candidate's runs need, and enter the time that it took; a run that fails is left to `run`.
-
-        `dt` is a step of the system, for methods that choose theirs.
-        """
+        """Compile what the candidate's runs need, and enter the time that it took; `dt` is a step of the system."""
         integrator = self.candidate.integrator
         if integrator is None:
             return
@@ -461,10 +440,7 @@ class RunTime:
 
 
 def interleaved(calls: Sequence[Callable[[], object]], repeats: int) -> list[RunTime]:
-    """Time every call `repeats` times, going round over all of them, so that a slow spell of the machine hits each.
-
-    The calls should have run before, or been warmed up: see `warm_up`.
-    """
+    """Time every call `repeats` times, going round over all of them, so that a slow spell of the machine hits each."""
     if not calls:
         return []
     passed = np.empty((repeats, len(calls)))
@@ -491,24 +467,7 @@ WARM_STEPS = 3.5
 
 
 def warm_up(run: Callable[[tuple[float, float], np.ndarray], object], step: float, t: np.ndarray, t0: float) -> float:
-    """Make a run twice over a few steps, so that all that a long one needs is compiled; the seconds of doing so.
-
-    Parameters
-    ----------
-    run : callable
-        Solves over an interval with outputs at some instants.
-    step : float
-        Length of a step, about.
-    t : ndarray (n,)
-        The instants of the long run, up to its end: the short one has as many.
-    t0 : float
-        Its start.
-
-    Returns
-    -------
-    float
-        The time of the first run beyond that of the second.
-    """
+    """Make a run twice over a few steps, so that all is compiled; the seconds of the first beyond the second."""
     length = float(t[-1]) - t0
     short = math.copysign(min(abs(length), WARM_STEPS * step), length)
     times = t0 + (t - t0) * (short / length)

@@ -340,19 +340,7 @@ def matched(
     target: float,
     grows: bool,
 ) -> tuple[Integrator, float]:
-    """Tune the integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure.
-
-    Parameters
-    ----------
-    measure : callable
-        A positive figure of a run; inf if the run fails, which asks for smaller steps.
-    grows : bool
-        True if the figure grows with the step (an error), False if it falls (a cost).
-
-    Notes
-    -----
-    The secant method on the logarithms, safeguarded by the nearest points found on either side.
-    """
+    """Tune an integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure."""
     x, slope = 0.0, (2.0 if grows else -1.0)
     below: tuple[float, float] | None = None  # (x, f) with too small a step, and with too large a one
     above: tuple[float, float] | None = None
@@ -484,10 +472,7 @@ class Comparison(Report):
 
 
 def combined_table(comparisons: Sequence[Comparison], width: int | None = None) -> str:
-    """The rows of several comparisons as one table, with the settings above and the reasons below.
-
-    Where `width` characters do not hold it, there is a table for each system with the methods as columns.
-    """
+    """The rows of several comparisons as one table; the methods as columns where `width` does not hold it."""
     rows = [row for c in comparisons for row in c.rows]
     several = len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]

@@ -74,17 +74,7 @@ class Compared(Protocol):
 
 
 def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
-    """One figure of a comparison: "overview", "energy", "volume", "error" or "portrait".
-
-    The overview of a comparison that measured none of its panels is the portrait.
-
-    Raises
-    ------
-    ValueError
-        For an unknown kind, or one whose metric was not asked for.
-    ImportError
-        Without matplotlib.
-    """
+    """One figure of a comparison, of the kinds in `KINDS`; a ValueError if it was not measured."""
     check_one_of("kind", kind, KINDS)
     if kind == "overview":
         return portrait(comparison) if _drawable(comparison) == ("portrait",) else overview([comparison])
@@ -104,13 +94,7 @@ def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
 def save_comparison(
     comparison: Compared, path: str | os.PathLike[str], kind: str = "overview", prefix: str = ""
 ) -> list[Path]:
-    """Save one figure to a file (.png, .pdf or .svg); into a folder the overview saves every kind that was measured.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-    """
+    """Save one figure to a file; into a folder the overview saves every kind that was measured. The files written."""
     path = Path(path)
     if path.suffix.lower() in FIGURE_FILES:
         return [save(comparison_figure(comparison, kind), path)]
@@ -121,10 +105,7 @@ def save_comparison(
 
 
 def overview(comparisons: Sequence[Compared]) -> Figure:
-    """One row for each system: error against run time, energy error over time, volume error over time.
-
-    Panels of metrics that were not asked for are left out.
-    """
+    """One row for each system: error against run time, energy and volume errors over time, as far as asked for."""
     kinds = [k for k in _PANELS if any(k in _panels(c) for c in comparisons)]
     if not kinds:
         raise ValueError("`comparisons` hold nothing to draw: ask compare() for 'error', 'energy' or 'volume'.")
@@ -384,15 +365,7 @@ def _reference_points(comparison: Compared) -> np.ndarray:
 
 
 def precision_figure(rows: Sequence[Row], heading: str, measure: str = "energy_error") -> Figure:
-    """Cost against error, log–log: run time on the left, evaluations on the right; a row for each batch size.
-
-    Points whose error the reference cannot resolve are hollow. Trained flows have no evaluations of the force.
-
-    Raises
-    ------
-    ValueError
-        For another measure than "energy_error", "balance_error" or "error".
-    """
+    """Cost against error, log–log: run time and evaluations; a row for each batch size."""
     check_one_of("measure", measure, MEASURES)
     sizes = sorted({row.trajectories for row in rows})
     figure = new_figure(9.6, 0.8 + 3.9 * len(sizes))
@@ -490,15 +463,7 @@ def _shown(row: Row) -> float:
 def stability_map(
     all_rows: Sequence[Row], limits: Mapping[str, Sequence[tuple[float, float]]], missing: Sequence[str]
 ) -> Figure:
-    """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing.
-
-    Parameters
-    ----------
-    limits : mapping
-        For each label the points (longest stable step, stiffness) of its line.
-    missing : sequence of str
-        Sentences on the methods without a limit, for the foot of the figure.
-    """
+    """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing."""
     from matplotlib.colors import LogNorm
 
     labels = list(dict.fromkeys(r.label for r in all_rows if r.energy_error is not None and r.dt is not None))

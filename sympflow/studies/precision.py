@@ -324,11 +324,7 @@ def _figure(point: Row, measure: str) -> float:
 
 
 def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure: str = "energy_error") -> float:
-    """Return the cost of one method for an error: between two of its points by interpolation of the logarithms.
-
-    The cheapest point that is more accurate is taken where that costs less; inf if no point is accurate enough. A step
-    or a tolerance is the largest that reaches the error.
-    """
+    """The cost of one method for an error, by interpolation of the logarithms; inf if no point is accurate enough."""
     known = [(getattr(p, measure), getattr(p, cost)) for p in points]
     known = sorted((e, c) for e, c in known if e and c and math.isfinite(e))
     best = max if cost in SETTINGS else min

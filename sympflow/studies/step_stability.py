@@ -352,10 +352,7 @@ class Study:
         )
 
     def stable(self, h: float) -> tuple[bool, float]:
-        """Tell whether all runs with this step stay below the bound and in a flow's domain, and their largest error.
-
-        Most unstable steps show in the first `min_steps` of them.
-        """
+        """Tell whether all runs with this step stay below the bound and in a flow's domain, and their largest error."""
         self.say(f"longest stable step: dt = {h:.6g}")
         t0, t1 = span = self.span(h)
         if abs(t1 - t0) > 4 * h * self.min_steps:
@@ -446,18 +443,7 @@ MEASURES: dict[str, Metric] = {
 
 @dataclass(frozen=True)
 class BlowUp:
-    """The end of a run that could not go on.
-
-    Attributes
-    ----------
-    time : float
-        Of the singularity, as `solve` estimates it; or of the last finite state, where there is none.
-    singular : bool
-        True if the solution itself becomes infinite.
-    growth : float or None
-        Else the factor by which ‖y‖ grew with each step, the median over the last steps before the overflow; None for
-        an adaptive method, whose steps differ.
-    """
+    """The end of a run that could not go on, and the factor by which ‖y‖ grew with each of its last steps."""
 
     time: float
     singular: bool
@@ -558,16 +544,7 @@ def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
 
 @dataclass
 class Search:
-    """The search for the first step that is unstable.
-
-    Attributes
-    ----------
-    study : Study
-    bad : list of float
-        Steps that are known to be unstable.
-    found : dict
-        What was found, stable or not, for each step that was tried.
-    """
+    """The search for the first step that is unstable."""
 
     study: Study
     bad: list[float]
