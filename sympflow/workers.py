@@ -34,13 +34,11 @@ from typing import Any
 
 from sympflow._version import __version__
 
-TRIES = 3
-"""Times in a row that workers may die before anything was done."""
+TRIES = 3  # times in a row that workers may die before anything was done
 LOOK = 0.2  # seconds between two looks at the processes of a pool that does not tell when they die
 LOST = {"KilledWorker", "FutureCancelledError", "TerminatedWorkerError"}
 """Names of the errors by which engines say that a worker died: of dask and joblib, which need not be installed."""
-SAME = ("numpy", "llvmlite")
-"""Distributions whose versions may decide the last bits of a result."""
+SAME = ("numpy", "llvmlite")  # distributions whose versions may decide the last bits of a result
 
 
 class LostWorkers(RuntimeError):

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.console import Console
+from typer import Option
 
 from sympflow.commands.words import Scene, Usage
 from sympflow.show.cards import cut
@@ -23,7 +24,7 @@ out = Console(soft_wrap=True, highlight=False)
 err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
-OPTIONS = {
+OPTIONS = {  # arguments of the library that commands have by other names: the first one counts that the command has
     "t_span": ("t_end",),
     "t_eval": ("n_outputs",),
     "method": ("method_name", "method_names"),
@@ -33,7 +34,6 @@ OPTIONS = {
     "n": ("batch", "orbits"),
     "dtype": ("dtypes",),
 }
-"""Arguments of the library that commands have by other names: the first one counts that the command has."""
 COMMANDS = {"poincare_section": "section", "work_precision": "bench", "available": "methods", "shipped_flows": "flows"}
 """Functions of the library that are commands by other names."""
 PHRASES: dict[str, str | Callable[[re.Match[str]], str]] = {
@@ -126,9 +126,7 @@ def _set_quiet(quiet: bool) -> bool:
 
 Quiet = Annotated[
     bool,
-    typer.Option(
-        "--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."
-    ),
+    Option("--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."),
 ]
 
 

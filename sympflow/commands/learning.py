@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Option
 
 from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, reporting, show
-from sympflow.commands.words import Usage, numbers, one_scene, parsed
+from sympflow.commands.words import File, Number, Text, Usage, numbers, one_scene, parsed
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -17,43 +18,40 @@ if TYPE_CHECKING:
 def learn(
     ctx: typer.Context,
     data: Annotated[Path, typer.Argument(help="A CSV, Parquet, npz, NetCDF or zarr file: t, q1 …, p1 …, the orbit.")],
-    ndof: Annotated[int | None, typer.Option(help="Degrees of freedom, where columns bear other names.")] = None,
-    dt: Annotated[float | None, typer.Option(help="Δt of the flow. Default: what suits its frequencies.")] = None,
-    noise: Annotated[float | None, typer.Option(help="Standard deviation of the data. Default: estimated.")] = None,
-    period: Annotated[float | None, typer.Option(help="Of all q, if these are angles.")] = None,
-    damping: Annotated[bool, typer.Option("--damping", help="Learn a rate of friction as well.")] = False,
-    drag: Annotated[bool, typer.Option("--drag", help="Learn quadratic drag in place of that.")] = False,
-    drive: Annotated[
-        str | None, typer.Option(help="Learn a drive as well: its angular frequency, about, or find.")
-    ] = None,
+    ndof: Annotated[int | None, Option(help="Degrees of freedom, where columns bear other names.")] = None,
+    dt: Annotated[Number, Option(help="Δt of the flow. Default: what suits its frequencies.")] = None,
+    noise: Annotated[Number, Option(help="Standard deviation of the data. Default: estimated.")] = None,
+    period: Annotated[Number, Option(help="Of all q, if these are angles.")] = None,
+    damping: Annotated[bool, Option("--damping", help="Learn a rate of friction as well.")] = False,
+    drag: Annotated[bool, Option("--drag", help="Learn quadratic drag in place of that.")] = False,
+    drive: Annotated[Text, Option(help="Learn a drive as well: its angular frequency, about, or find.")] = None,
     separable: Annotated[
         bool | None,
-        typer.Option("--separable/--not-separable", help="H = T(p) + V(q), or known not to be. Default: by the data."),
+        Option("--separable/--not-separable", help="H = T(p) + V(q), or known not to be. Default: by the data."),
     ] = None,
-    mass: Annotated[str | None, typer.Option(help="M of T = p²/2M, one number or d of them, as 1,2.5.")] = None,
+    mass: Annotated[Text, Option(help="M of T = p²/2M, one number or d of them, as 1,2.5.")] = None,
     known: Annotated[
-        str | None, typer.Option(help="A system that is a part of H, as own.toml or pendulum; the rest is learned.")
+        Text, Option(help="A system that is a part of H, as own.toml or pendulum; the rest is learned.")
     ] = None,
     family: Annotated[
-        str | None, typer.Option(help="The only family of models, as polynomial, network or sympflow. Default: all.")
+        Text, Option(help="The only family of models, as polynomial, network or sympflow. Default: all.")
     ] = None,
     order: Annotated[
-        str, typer.Option(help="Of columns without the names q1 …: halves, q1 q2 p1 p2, or pairs, q1 p1 q2 p2.")
+        str, Option(help="Of columns without the names q1 …: halves, q1 q2 p1 p2, or pairs, q1 p1 q2 p2.")
     ] = "halves",
     observed: Annotated[
-        str,
-        typer.Option(help="qp, states; qv, positions and velocities, of a mass that is not known; q, positions alone."),
+        str, Option(help="qp, states; qv, positions and velocities, of a mass that is not known; q, positions alone.")
     ] = "qp",
-    loss: Annotated[str, typer.Option(help="squares, or huber for data with outliers.")] = "squares",
+    loss: Annotated[str, Option(help="squares, or huber for data with outliers.")] = "squares",
     unit: Annotated[
-        list[str] | None, typer.Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
+        list[str] | None, Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Which trajectories are held out.")] = 0,
-    time_budget: Annotated[float, typer.Option(help="Seconds that it may take.")] = 60.0,
-    checkpoint: Annotated[Path | None, typer.Option(help="File to keep the state of the run in.")] = None,
-    resume: Annotated[Path | None, typer.Option(help="Checkpoint to go on from.")] = None,
-    to: Annotated[Path, typer.Option("--out", help="File for the flow.")] = Path("flow.safetensors"),
-    plot: Annotated[Path | None, typer.Option(help="File for a figure: predictions and energies, held out.")] = None,
+    seed: Annotated[int, Option(help="Which trajectories are held out.")] = 0,
+    time_budget: Annotated[float, Option(help="Seconds that it may take.")] = 60.0,
+    checkpoint: Annotated[File, Option(help="File to keep the state of the run in.")] = None,
+    resume: Annotated[File, Option(help="Checkpoint to go on from.")] = None,
+    to: Annotated[Path, Option("--out", help="File for the flow.")] = Path("flow.safetensors"),
+    plot: Annotated[File, Option(help="File for a figure: predictions and energies, held out.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Learn a flow, and the H behind it, from trajectories.

@@ -44,12 +44,7 @@ def systems(ctx: typer.Context, quiet: Quiet = False) -> None:
         print_table(("name", "H", "parameters", "interval", "step", "trained flows"), rows)
 
 
-def flows(
-    ctx: typer.Context,
-    system: Systems = None,
-    own: Own = None,
-    quiet: Quiet = False,
-) -> None:
+def flows(ctx: typer.Context, system: Systems = None, own: Own = None, quiet: Quiet = False) -> None:
     """List the flows that ship, all or those of one system, the cheapest of a system first, with what each achieves.
 
     The cost is that of a unit of time in force evaluations.
@@ -101,8 +96,7 @@ def methods(
 
 
 TITLES = ("order", "symplectic", "forces a step", "source")
-LISTED = 100
-"""Columns of the list of methods, where the terminal has no more."""
+LISTED = 100  # columns of the list of methods, where the terminal has no more
 
 
 def _cells(cls: type[Integrator]) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from typing import Annotated, Any, overload
 
 import numpy as np
 import typer
+from typer import Option
 
 from sympflow.arguments import check_t_span, is_number_word
 from sympflow.commands import completion
@@ -25,6 +26,11 @@ from sympflow.systems import SYSTEMS, harmonic_oscillator
 from sympflow.systems import available as available_systems
 from sympflow.systems import get as system_named
 from sympflow.systems.user_files import factory as file_factory
+
+Text = str | None
+Number = float | None
+Count = int | None
+File = Path | None
 
 FILE = re.compile(r"(?P<path>.+?\.(?:py|toml))(?::(?P<rest>.*))?", re.DOTALL)
 """A system in a file: file.toml, file.py:name, and parameters behind them."""
@@ -50,7 +56,7 @@ Systems = Annotated[
 ]
 Own = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--system",
         metavar="SYSTEM",
         help="A system, as the argument is; several times for several.",
@@ -58,18 +64,18 @@ Own = Annotated[
     ),
 ]
 OneMethod = Annotated[
-    str | None,
-    typer.Option(
+    Text,
+    Option(
         "--method",
         "--methods",
         help="A name, name:option=value, or a .safetensors file. Default: one that suits the system.",
         autocompletion=completion.one_method,
     ),
 ]
-TStart = Annotated[float | None, typer.Option(help="Start of the interval. Default: the system's.")]
-TEnd = Annotated[float | None, typer.Option(help="End of the interval. Default: the system's.")]
-State = Annotated[str | None, typer.Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
-Step = Annotated[float | None, typer.Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
+TStart = Annotated[Number, Option(help="Start of the interval. Default: the system's.")]
+TEnd = Annotated[Number, Option(help="End of the interval. Default: the system's.")]
+State = Annotated[Text, Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
+Step = Annotated[Number, Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
 BACKENDS = ("auto", "compiled", "array")
 
 
@@ -80,7 +86,7 @@ def _backend(word: str) -> str:
 
 
 Backend = Annotated[
-    str, typer.Option(help="auto, compiled or array.", callback=_backend, autocompletion=completion.of(BACKENDS))
+    str, Option(help="auto, compiled or array.", callback=_backend, autocompletion=completion.of(BACKENDS))
 ]
 
 
@@ -220,7 +226,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
 
 
 SYSTEM = "name a scene, of those that `sympflow systems` lists, an own one, file.py:name or file.toml, or write H"
-MEANT = {
+MEANT = {  # options by the names that users try
     **dict.fromkeys(("solver", "integrator", "scheme"), "method"),
     **dict.fromkeys(("steps", "n_steps", "step", "h", "stepsize", "step_size"), "dt"),
     **dict.fromkeys(("t", "tmax", "t_max", "tend", "t_span", "time", "duration", "end"), "t-end"),
@@ -228,9 +234,7 @@ MEANT = {
     **dict.fromkeys(("q0", "p0", "x0", "q", "p", "initial", "ic"), "y0"),
     **dict.fromkeys(("output", "save", "plot", "file", "csv", "o"), "out"),
 }
-"""Options by the names that users try."""
-FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
-"""A word that is H, and not the name of a scene."""
+FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")  # a word that is H, and not the name of a scene
 
 
 def _formula(text: str) -> Callable[..., HamiltonianSystem]:

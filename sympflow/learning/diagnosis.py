@@ -43,8 +43,7 @@ PER_NUMBER = 3.0  # Values that there are at least for a number of a model
 MOST_NUMBERS = 400
 LIKELY = 8  # Models beside which forces are tried
 BETTER = 0.5  # Share of the misfit that another reading of the data must leave at most, to be worth a word
-MUCH_BETTER = 0.1
-"""The same of a vector field that is not Hamiltonian: a sum that has more terms leaves less by itself."""
+MUCH_BETTER = 0.1  # the same of a vector field that is not Hamiltonian: a sum that has more terms leaves less by itself
 ALIKE = 1.2  # Factor by which a reading may leave more than the best, and is named if it stands before it
 FRICTION = (
     "Friction p' = -γp with γ = {} would leave much less: the data are dissipative, areas of phase space shrink as "
@@ -64,8 +63,7 @@ NOT_HAMILTONIAN = (
     "A vector field of cubic polynomials that is not Hamiltonian fits much better: the data are not a motion of a "
     "Hamiltonian in these coordinates, or these are not canonical."
 )
-FREQUENCIES = 1000
-"""Halves of the angular frequency π over the longest time, up to which that of a drive is looked for."""
+FREQUENCIES = 1000  # halves of the angular frequency π over the longest time, up to which that of a drive is looked for
 MOST_SLOPES = 3000  # Points by which reasons are looked for
 MOST_DRIVES, SWEEPS = 2, 2
 """Drives that are looked for, and how often the frequency of each is refined beside the others."""

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RADIANS = 6.0  # Length of the pieces that are shot through, in the mean angular rate of the data: about one period
-FLOOR = 1e-6
-"""Least noise, over the spread of a coordinate: below it a formula would explain the errors of the scheme."""
+FLOOR = 1e-6  # least noise, over the spread of a coordinate: below it a formula would explain the errors of the scheme
 STEP = 0.1  # Step of the system that is made, in the mean angular rate of the data
 STEP_SHARE = 0.02  # Error of the scheme from one point to the next, over the noise
 STEPS = 40  # Most steps of a fit

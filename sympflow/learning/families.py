@@ -30,8 +30,7 @@ POWERS = ((-1,), (-2, -1, 0, 1, 2))  # Powers of distances, 0 for the logarithm
 CHANGING = 0.5
 """Variance of the total momentum along a trajectory, over the sum of those of its parts, where it is not constant."""
 MOST_TERMS = 400
-ASSUMED = {"radians": 2 * np.pi, "degrees": 360.0}
-"""Periods of angles that are tried where none is known."""
+ASSUMED = {"radians": 2 * np.pi, "degrees": 360.0}  # periods of angles that are tried where none is known
 FLAT = 0.02  # Spread of an angle, over its period, from which its cosine is told from a parabola
 
 

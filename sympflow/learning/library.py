@@ -21,8 +21,7 @@ COLLINEAR = 1e-7
 MOST_PRODUCTS = 2
 """Degrees of freedom up to which all products of powers are in the library; beyond, those of one and of pairs."""
 
-KINDS = "qpy"
-"""Kinds of terms: of q alone, of p alone, of both."""
+KINDS = "qpy"  # kinds of terms: of q alone, of p alone, of both
 
 Coordinates = tuple[sp.Symbol, ...]
 

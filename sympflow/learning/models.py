@@ -22,8 +22,7 @@ NEWTON = 8  # steps by which momenta are found of velocities
 class VectorField:
     """A vector field of states [q, p], which are observed as they are; by default linear in nothing."""
 
-    velocities: bool = False
-    """True if [q, q'] are observed."""
+    velocities: bool = False  # True if [q, q'] are observed
 
     def at(self, t: np.ndarray) -> Any:
         """The field at times t (N,), one for each of the states that it is asked for."""
@@ -91,8 +90,7 @@ class Model(VectorField):
     parts: tuple[Part, ...]
     force: Force | None = None
     velocities: bool = False  # True if q' = ∂H/∂p is observed in place of p
-    stepper: ClassVar[Any] = None
-    """The steps of a map of its own; None where schemes follow a field."""
+    stepper: ClassVar[Any] = None  # the steps of a map of its own; None where schemes follow a field
 
     @property
     def n(self) -> int:

@@ -18,8 +18,7 @@ from sympflow.learning.reading import Run
 from sympflow.learning.trajectories import Trajectories
 from sympflow.schemes import Scheme, scheme_named
 
-Field = Model | FreeField
-"""A vector field with numbers θ."""
+Field = Model | FreeField  # a vector field with numbers θ
 
 MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the cache
 SLOPE_POINTS = 10  # of a piece, that give a velocity which was not observed
@@ -38,10 +37,8 @@ Over = Callable[[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray], Any]
 class Stepper(ABC):
     """One step of a scheme, with the derivatives of its end by the initial state and by θ."""
 
-    cost: float
-    """Cost of a step, in evaluations of the force with its derivatives."""
-    longest: float | None = None
-    """Δt of a map that is fitted itself, whose steps have no error; None of a scheme."""
+    cost: float  # cost of a step, in evaluations of the force with its derivatives
+    longest: float | None = None  # Δt of a map that is fitted itself, whose steps have no error; None of a scheme
 
     def within(self, tolerance: np.ndarray) -> Stepper:
         """The same scheme, whose equations are solved no better than is needed for an error (2d,) of a step."""

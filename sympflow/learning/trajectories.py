@@ -49,8 +49,7 @@ FAR, LARGEST = 1e3, 1e60
 POINTS, LONG = 24, 10
 """Points of a piece by which models are compared, and such pieces in a part of a trajectory that is smoothed."""
 COMPARED = 2000  # Points in all such pieces
-ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}
-"""Periods of angles that are looked for."""
+ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}  # periods of angles that are looked for
 
 
 @dataclass(frozen=True, repr=False)

@@ -43,8 +43,7 @@ TURNS = 1e-5  # imaginary part of an eigenvalue that is simple, whose rounding i
 NEWTON_STEPS = 50
 SCALES = (0.1, 1.0, 10.0, 100.0)  # of the states at which Hessians are compared, in units of y0
 
-Polynomial = Sequence[Any]
-"""Coefficients, the constant one first."""
+Polynomial = Sequence[Any]  # coefficients, the constant one first
 
 
 class Window(NamedTuple):

@@ -14,12 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KINDS = ("orbit", "phase", "energy")
-MOST_LINES, MOST_POINTS = 16, 20_000
-"""Trajectories of a batch that are drawn, and points of each."""
-COARSE = 0.5
-"""Radians between two points of a phase plane beyond which these are not joined."""
-MANY = 12
-"""Degrees of freedom from which the orbit is a map of q over time."""
+MOST_LINES, MOST_POINTS = 16, 20_000  # trajectories of a batch that are drawn, and points of each
+COARSE = 0.5  # radians between two points of a phase plane beyond which these are not joined
+MANY = 12  # degrees of freedom from which the orbit is a map of q over time
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F3C8D", "#666666")
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 ORBIT, DOF, TIME = "orbit", "dof", "time"
 RESERVED = ("q", "p", "q0", "p0", "status", ORBIT, DOF, TIME)
 """Names of the arrays and dimensions that each Dataset has, or may have."""
-NAMED = {
+NAMED = {  # the attributes of arrays, by their names
     "q": {"long_name": "positions"},
     "p": {"long_name": "momenta"},
     "q0": {"long_name": "initial positions"},
@@ -31,9 +31,7 @@ NAMED = {
     "status": {"long_name": "0: the end was reached, 1: an event ended it, 2: not run yet, -1: failed"},
     DOF: {"long_name": "i of q_i and p_i"},
 }
-"""The attributes of arrays, by their names."""
-UNITS = "those of the system's definition"
-"""The units of all numbers, which no system states."""
+UNITS = "those of the system's definition"  # the units of all numbers, which no system states
 
 
 def halves(ndof: int) -> tuple[tuple[str, slice], tuple[str, slice]]:

@@ -23,10 +23,8 @@ from sympflow.storage.identity import Known
 from sympflow.storage.layout import DOF, NAMED, TIME, batch_dims, dofs, halves
 from sympflow.storage.store import Appender, Field, Store
 
-KNOWN = "sympflow_run"
-"""The attribute that says of which run a store is."""
-SECONDS = 10.0
-"""Between two commits, by default."""
+KNOWN = "sympflow_run"  # the attribute that says of which run a store is
+SECONDS = 10.0  # between two commits, by default
 CHUNK = 2**19  # numbers in a chunk of q and p together, about
 
 

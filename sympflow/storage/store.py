@@ -41,14 +41,12 @@ from sympflow.storage.identity import Known
 __all__ = ["Appender", "Field", "Store", "StoreError"]
 
 METADATA, ATTRIBUTES, ARRAY = ".zmetadata", ".zattrs", ".zarray"
-KEPT = "sympflow_state"
-"""The attribute that names the file of the state which was kept at the last commit."""
+KEPT = "sympflow_state"  # the attribute that names the file of the state which was kept at the last commit
 TOLD = 90  # characters of what differs between two calls
 STATE = re.compile(r"\.state-([1-9]\d{0,17})\.npz")
 MOST_METADATA = 2**26  # bytes
 MOST_STATES = 64  # bytes that are kept to go on, over those of a chunk of each array
-STORABLE = "biufc"
-"""Kinds of dtypes that a store takes: truth values and numbers."""
+STORABLE = "biufc"  # kinds of dtypes that a store takes: truth values and numbers
 
 
 class StoreError(OSError):

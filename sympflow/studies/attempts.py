@@ -12,7 +12,8 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from sympflow.metrics.energy_balance import energy_balance_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.symplectic import conformal_defect, symplecticity_defect, volume_error
 from sympflow.solution import Solution
-from sympflow.studies.reports import seconds
+from sympflow.studies.reports import Column, number, plain, seconds
 
 REFUSALS = (ValueError, TypeError, ImportError, NotImplementedError)
 """Errors by which a method says that it does not apply; any other is a failure."""
@@ -227,6 +228,46 @@ class Row:
         return f"Row({', '.join(filled)})"
 
 
+NEGLIGIBLE = 0.1  # seconds of compilation that tables leave out
+CELLS: dict[str, Callable[[Any], str]] = {  # the cells of tables of rows, by the titles of their columns
+    "method": lambda row: row.label,
+    "batch": lambda row: f"{row.trajectories:,}",
+    "step": lambda row: plain(row.dt),
+    "rtol": lambda row: "" if row.tolerance is None else f"{row.tolerance:.0e}",
+    "backend": lambda row: row.backend or "",
+    "run time": lambda row: seconds(row.run_time),
+    "±": lambda row: seconds(row.run_time_spread),
+    "steps": lambda row: counted(row.n_steps),
+    "forces": lambda row: counted(row.force_evaluations),
+    "Hessians": lambda row: counted(row.hessian_evaluations),
+    "error": lambda row: number(row.error),
+    "energy error": lambda row: number(row.energy_error),
+    "energy balance": lambda row: number(row.balance_error),
+    "drift per unit t": lambda row: f"{number(row.energy_drift)} ± {number(row.energy_drift_error, 1)}".strip(" ±"),
+    "leaves domain at t": lambda row: plain(row.domain_exit),
+    "volume error": lambda row: number(row.volume_error),
+    "sympl. defect": lambda row: number(row.symplecticity_defect),
+    "conf. defect": lambda row: number(row.conformal_defect),
+    "reversal": lambda row: number(row.time_reversal_error),
+    "training": lambda row: seconds(row.training_time),
+    "compiled in": lambda row: seconds(row.compile_time) if (row.compile_time or 0.0) >= NEGLIGIBLE else "",
+    "status": lambda row: "" if row.status == "ok" else row.status,
+}
+
+
+def counted(x: float | None) -> str:
+    """A count: 12,000; empty for none."""
+    return f"{x:,.0f}" if x else ""
+
+
+def columns(
+    rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Callable[[Any], str]] | None = None
+) -> list[Column]:
+    """Columns of these titles, with cells of `CELLS` or of their own."""
+    cells, left = CELLS | dict(own or {}), ("method", "backend", "status")
+    return [Column(title, [cells[title](row) for row in rows], title in left) for title in titles]
+
+
 @contextmanager
 def any_step() -> Iterator[None]:
     """Run without warnings of steps that are too long: studies sweep these, and a row has its energy error."""
@@ -357,8 +398,7 @@ def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
 
 # metrics ----------------------------------------------------------------------------------------------------------
 
-Metric = Callable[[Attempt], None]
-"""A function that measures an attempt which has run, and fills in its row."""
+Metric = Callable[[Attempt], None]  # a function that measures an attempt which has run, and fills in its row
 
 
 def accuracy(attempt: Attempt, truth: Reference) -> None:
@@ -405,18 +445,13 @@ def volume(attempt: Attempt) -> None:
     attempt.fill(volume_error=float(last[np.argmax(np.abs(last))]))
 
 
-def symplecticity(attempt: Attempt) -> None:
-    """The largest defect of a step, relative to the step's norm."""
+def defect(attempt: Attempt, of: Callable[..., Any]) -> None:
+    """The largest defect of a step, relative to the step's norm: of `symplecticity_defect` or `conformal_defect`."""
     (sol,) = attempt.sols
-    lost = attempt.lost
-    attempt.fill(symplecticity_defect=np.inf if lost else float(np.max(symplecticity_defect(sol, relative=True))))
+    attempt.fill(**{of.__name__: np.inf if attempt.lost else float(np.max(of(sol, relative=True)))})
 
 
-def conformality(attempt: Attempt) -> None:
-    """The largest defect of a step of a damped system, relative to the step's norm."""
-    (sol,) = attempt.sols
-    lost = attempt.lost
-    attempt.fill(conformal_defect=np.inf if lost else float(np.max(conformal_defect(sol, relative=True))))
+symplecticity, conformality = (partial(defect, of=of) for of in (symplecticity_defect, conformal_defect))
 
 
 def reversal(attempt: Attempt) -> None:
@@ -431,8 +466,7 @@ def reversal(attempt: Attempt) -> None:
 # run times --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class RunTime:
+class RunTime(NamedTuple):
     """Median and interquartile range of the repeats, in seconds."""
 
     median: float
@@ -454,16 +488,7 @@ def interleaved(calls: Sequence[Callable[[], object]], repeats: int) -> list[Run
     return [RunTime(float(m), float(h - lo)) for lo, m, h in zip(low, median, high, strict=True)]
 
 
-NEGLIGIBLE = 0.1  # seconds of compilation that tables leave out
-
-
-def shown_compile_time(row: Row) -> str:
-    """The compile time as tables show it: empty where it is negligible."""
-    return seconds(row.compile_time) if (row.compile_time or 0.0) >= NEGLIGIBLE else ""
-
-
-WARM_STEPS = 3.5
-"""Steps of a run that compiles: whole ones, and the shorter ones of the outputs between them."""
+WARM_STEPS = 3.5  # steps of a run that compiles: whole ones, and the shorter ones of the outputs between them
 
 
 def warm_up(run: Callable[[tuple[float, float], np.ndarray], object], step: float, t: np.ndarray, t0: float) -> float:

@@ -792,24 +792,9 @@ class StabilityReport(Report):
         ]
 
     def _columns(self) -> list[Column]:
-        rows = self.rows
-        drifts = [
-            "" if r.energy_drift is None else f"{number(r.energy_drift)} ± {number(r.energy_drift_error, 1)}"
-            for r in rows
-        ]
-        ends = ["" if r.blow_up is None else f"{r.blow_up:.6g}{' (singular)' if r.singular else ''}" for r in rows]
-        return [
-            *self._names(rows),
-            Column("step", [plain(r.dt) for r in rows]),
-            Column("steps", [f"{r.n_steps:,}" if r.n_steps else "" for r in rows]),
-            Column("energy error", [number(r.energy_error) for r in rows]),
-            Column("drift per unit t", drifts),
-            Column("blow-up at t", ends),
-            Column("leaves domain at t", [plain(r.domain_exit) for r in rows]),
-            Column("volume error", [number(r.volume_error) for r in rows]),
-            Column("sympl. defect", [number(r.symplecticity_defect) for r in rows]),
-            Column("status", [r.status for r in rows], left=True),
-        ]
+        titles = ("step", "steps", "energy error", "drift per unit t", "blow-up at t", "leaves domain at t")
+        more = ("volume error", "sympl. defect", "status")
+        return [*self._names(self.rows), *attempts.columns(self.rows, titles + more, {"blow-up at t": _end})]
 
     def _names(self, rows: Sequence[Row | StepLimit]) -> list[Column]:
         several = len(self.systems) > 1
@@ -819,6 +804,10 @@ class StabilityReport(Report):
             Column("method", [r.label for r in rows], left=True),
             Column("dtype", [r.dtype if len(precisions) > 1 else "" for r in rows], left=True),
         ]
+
+
+def _end(row: Row) -> str:
+    return "" if row.blow_up is None else f"{row.blow_up:.6g}{' (singular)' if row.singular else ''}"
 
 
 def _intervals(intervals: Sequence[tuple[float, float]]) -> str:

@@ -228,17 +228,15 @@ def three_body() -> HamiltonianSystem:
     )
 
 
-G = 2.95912208286e-4
-"""Gravitational constant in AU³ per day² and solar mass."""
+G = 2.95912208286e-4  # gravitational constant in AU³ per day² and solar mass
 
 BODIES = ("Sun", "Jupiter", "Saturn", "Uranus", "Neptune", "Pluto")
 
-PLANET_MASSES = np.array(
+PLANET_MASSES = np.array(  # in solar masses; the Sun's includes the inner planets
     [1.00000597682, 0.000954786104043, 0.000285583733151, 0.0000437273164546, 0.0000517759138449, 1 / 1.3e8]
 )
-"""In solar masses; the Sun's includes the inner planets."""
 
-POSITIONS = np.array(
+POSITIONS = np.array(  # heliocentric, in astronomical units, on 5 September 1994 at 0 h
     [
         [0.0, 0.0, 0.0],
         [-3.5023653, -3.8169847, -1.5507963],
@@ -248,9 +246,8 @@ POSITIONS = np.array(
         [-15.5387357, -25.2225594, -3.1902382],
     ]
 )
-"""Heliocentric, in astronomical units, on 5 September 1994 at 0 h."""
 
-VELOCITIES = np.array(
+VELOCITIES = np.array(  # heliocentric, in astronomical units per day
     [
         [0.0, 0.0, 0.0],
         [0.00565429, -0.00412490, -0.00190589],
@@ -260,7 +257,6 @@ VELOCITIES = np.array(
         [0.00276725, -0.00170702, -0.00136504],
     ]
 )
-"""Heliocentric, in astronomical units per day."""
 
 _PERIOD = 90_600.0  # of Pluto, in days: the longest
 _THICKNESS = 0.2  # of the tube, relative to each planet's distance and speed

@@ -129,24 +129,20 @@ def lax_eigenvalues(y: Array) -> np.ndarray:
     return np.linalg.eigvalsh(p[..., None] / 2 * np.eye(n) + to_next + to_next.swapaxes(-1, -2))
 
 
-EPSILON = 119.8
-"""Depth of the potential in kelvin (times Boltzmann's constant)."""
+EPSILON = 119.8  # depth of the potential in kelvin (times Boltzmann's constant)
 
-SIGMA = 0.341
-"""Distance at which the potential is zero, in nanometres."""
+SIGMA = 0.341  # distance at which the potential is zero, in nanometres
 
 MASS = 66.34e-27 / 1.380658e-23
 """The mass of an atom, in K·ns²/nm²: kilograms over Boltzmann's constant, 1 nm/ns being 1 m/s."""
 
-POSITIONS = np.array(
+POSITIONS = np.array(  # in nanometres: one atom in the middle, six around it
     [[0.0, 0.0], [0.02, 0.39], [0.34, 0.17], [0.36, -0.21], [-0.02, -0.40], [-0.35, -0.16], [-0.31, 0.21]]
 )
-"""In nanometres: one atom in the middle, six around it."""
 
-VELOCITIES = np.array(
+VELOCITIES = np.array(  # in nanometres per nanosecond
     [[-30.0, -20.0], [50.0, -90.0], [-70.0, -60.0], [90.0, 40.0], [80.0, 90.0], [-40.0, 100.0], [-80.0, -60.0]]
 )
-"""In nanometres per nanosecond."""
 
 
 def lennard_jones() -> HamiltonianSystem:

@@ -192,8 +192,7 @@ def fodo_cell(strength: float = 0.8, quadrupole: float = 0.5, drift: float = 2.0
     )
 
 
-MOST_PIECES = 1000
-"""Steps of a cell beyond which the lengths in it have no step in common."""
+MOST_PIECES = 1000  # steps of a cell beyond which the lengths in it have no step in common
 
 
 def fodo_matrices(strength: float = 0.8, quadrupole: float = 0.5, drift: float = 2.0) -> np.ndarray:

@@ -19,14 +19,13 @@ from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.scene import UNNAMED
 from sympflow.hamiltonian.system import HamiltonianSystem
 
-DOMAINS: dict[str, tuple[str, ...]] = {
+DOMAINS: dict[str, tuple[str, ...]] = {  # the kinds of domains in a TOML file, and the keys of each
     "Ball": ("center", "radius"),
     "Box": ("low", "high"),
     "EnergySublevel": ("energy", "box", "above", "angular_momentum"),
     "Tube": ("orbit", "radius", "groups"),
 }
-"""The kinds of domains in a TOML file, and the keys of each."""
-KEYS: dict[str, tuple[Any, str]] = {
+KEYS: dict[str, tuple[Any, str]] = {  # the keys of a TOML file: the type of each, and that in words
     "hamiltonian": (str, "a formula in quotes, such as 'p**2/2 - cos(q)'"),
     "params": (dict, "a table of numbers, such as { omega = 2.0 }"),
     "time": (str, "the name of the time in the formula, such as 't'"),
@@ -39,7 +38,6 @@ KEYS: dict[str, tuple[Any, str]] = {
     "energy_scale": (float, "a number"),
     "domain": (dict, "a table with a kind, such as { kind = 'Box', low = [-1, -1], high = [1, 1] }"),
 }
-"""The keys of a TOML file: the type of each, and that in words."""
 
 
 def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSystem:
