@@ -284,16 +284,11 @@ def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
         return np.isfinite(y).all(-1)
     if y.device.type == "cpu" and (found := values(y)) is not None and found.ndim == y.ndim:
         return np.isfinite(found).all(-1)
-    finite = values(all_finite(y))
+    finite = values(library(y).isfinite(y).all(-1))
     if finite is None:
         return np.ones(y.shape[:-1], dtype=bool)
     hidden = tuple(range(finite.ndim - y.ndim + 1))
     return np.asarray(finite.any(hidden) if in_any_lane else finite.all(hidden))
-
-
-def all_finite(y: Array) -> Array:
-    """Return True for each of the states y (..., k) that is finite: (...) booleans of the library of y."""
-    return library(y).isfinite(y).all(-1)
 
 
 def full_of_nan(y: Array) -> Array:

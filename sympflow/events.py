@@ -84,8 +84,8 @@ def _parse_one(g: Any, label: str) -> Event:
 class EventSearch:
     """The events of one run. The integrator hands over every step; the zeros inside are located by Brent's method.
 
-    A zero that falls exactly on the end of a step counts once, in that step; one at t0 counts, as in SciPy. Longer steps
-    than `max_interval` are sampled in between, at equal parts; the default is the integrator's choice.
+    A zero that falls exactly on the end of a step counts once, in that step; one at t0 counts, as in SciPy. Steps
+    longer than `max_interval` are sampled in between, at equal parts; the default is the integrator's choice.
     """
 
     def __init__(self, events: tuple[Event, ...], max_interval: float | None = None) -> None:

@@ -340,25 +340,23 @@ class Solution(Answering):
         return self
 
 
+def _stored(name: str, read: Callable[[RunStore], Any]) -> property:
+    """A field, kept under a name, that is read from the store unless it is set."""
+
+    def get(sol: StoredSolution) -> Any:
+        known = vars(sol)[name]
+        return read(sol.store) if sol.store is not None and known is None else known
+
+    return property(get, lambda sol, value: vars(sol).update({name: value}))
+
+
 class StoredSolution(Solution):
     """A solution whose outputs are in a store, from which `t` and `y` are read whenever they are asked for."""
 
     store: RunStore | None = None
 
-    def _get_t(self) -> np.ndarray:
-        return self.store.times() if self.store is not None and self._t is None else self._t
-
-    def _set_t(self, t: np.ndarray | None) -> None:
-        self._t: Any = t
-
-    def _get_y(self) -> Array:
-        return self.store.states() if self.store is not None and self._y is None else self._y
-
-    def _set_y(self, y: Array | None) -> None:
-        self._y: Any = y
-
-    t = property(_get_t, _set_t)
-    y = property(_get_y, _set_y)
+    t = _stored("_t", lambda store: store.times())
+    y = _stored("_y", lambda store: store.states())
 
 
 COUNTS = ("backend", "dt", "n_steps", "force_evaluations", "hessian_evaluations", "newton_iterations", "difference")

@@ -211,11 +211,11 @@ class PairsHamiltonian(LocalHamiltonian):
     # a few of many ----------------------------------------------------------------------------------------------------
 
     @property
-    def uniform(self) -> bool:
+    def uniform(self) -> bool:  # type: ignore[override]
         return all((x == x[0]).all() for x in (self.masses, *self.columns))
 
     @property
-    def apart(self) -> float:
+    def apart(self) -> float:  # type: ignore[override]
         """A power of two near six bonds: bodies nearer than one repel each other, beside which all else is rounding."""
         return (
             1.0 if self.box is not None or self.bond_length is None else 2.0 ** round(math.log2(6 * self.bond_length))

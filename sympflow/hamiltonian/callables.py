@@ -643,7 +643,7 @@ def _time_difference(value: Callable[[Any], Array], t: Any) -> Array:
 
 
 class NumbaFunction:
-    """V, ∇V or ∇²V·v of Numba functions, by the order, for any batch of states; of a driven one the time comes first."""
+    """V, ∇V or ∇²V·v of Numba functions, by the order, for any batch of states; the time comes first."""
 
     def __init__(self, functions: tuple[Any, Any, Any | None], order: int, times: tuple[float, ...] = ()) -> None:
         self.functions, self.order, self.times = functions, order, times

@@ -27,7 +27,6 @@ import numpy as np
 from sympflow.arguments import warn
 from sympflow.arrays import Array, as_tensor, concatenate, is_tensor, jacobian, of_library
 from sympflow.hamiltonian.domain import Box, Domain
-from sympflow.hamiltonian.hamiltonian import ExternalForce
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 Force = Callable[[Array, Array], Array]
@@ -157,7 +156,7 @@ def doubled(
                 f"`force` is given by symbols, but `system` {system.name!r} by functions: give it as a function "
                 "F(q, p), written with torch."
             )
-        F: ExternalForce = GivenForce(force if given else lambda q, p: 0 * p)
+        F: Any = GivenForce(force if given else lambda q, p: 0 * p)
         made = DoubledSystem(hamiltonian=_DoubledFunctions(system, F), ndof=2 * system.ndof, check=False, **scene)
     else:
         from sympflow.hamiltonian.forces import SymbolicForce, doubled_hamiltonian
@@ -176,7 +175,7 @@ def doubled(
 
 
 class GivenForce:
-    """F(q, p) of a user, written with torch functions: see `ExternalForce`."""
+    """F(q, p) of a user, written with torch functions."""
 
     expressions: Sequence[Any] = ()
 
@@ -203,7 +202,7 @@ class GivenForce:
 class _DoubledFunctions:
     """A of a system that is given by functions, or has a force that is."""
 
-    def __init__(self, system: HamiltonianSystem, force: ExternalForce) -> None:
+    def __init__(self, system: HamiltonianSystem, force: Any) -> None:
         self.system, self.force = system, force
 
     def __call__(self, Q: Array, P: Array) -> Array:

@@ -211,4 +211,4 @@ class _Logarithmic(Definition):
 def _bordered(S: Array) -> Array:
     """S (..., d, d) with a row and a column of zeros added."""
     wide = concatenate([S, 0 * S[..., :1]])
-    return concatenate([wide.swapaxes(-1, -2), 0 * wide.swapaxes(-1, -2)[..., :1]]).swapaxes(-1, -2)
+    return concatenate([wide, 0 * wide[..., :1, :]], -2)

@@ -251,7 +251,11 @@ class KineticPotential(Composition):
                     U = U + c * h[..., None] * _velocities(system, p, P)
                 q, p = system.drifted(q, p, at, c * h)
             else:
-                change = (c * h)[..., None] * _hessian_products(system, q, U, at)
+                if system.local is None:
+                    products = system.potential_hessian(q, at) @ U
+                else:  # without the matrix
+                    products = system.hessian_vector(q[..., None, :], U.swapaxes(-1, -2), at).swapaxes(-1, -2)
+                change = (c * h)[..., None] * products
                 if substep.three:
                     G = (substep.three * h**3)[..., None] * _force_gradient_jvp(system, q, U, at)
                     change = change + G
@@ -302,13 +306,6 @@ def _velocities(system: HamiltonianSystem, p: Array, P: np.ndarray) -> np.ndarra
     if not system.quadratic_kinetic:
         return system.kinetic_hessian(p) @ P
     return system.velocity(P.swapaxes(-1, -2)).swapaxes(-1, -2)
-
-
-def _hessian_products(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
-    """∇²V(q)·U of vectors (..., d, k), of a system by one piece without the matrix."""
-    if system.local is None:
-        return system.potential_hessian(q, t) @ U
-    return system.hessian_vector(q[..., None, :], U.swapaxes(-1, -2), t).swapaxes(-1, -2)
 
 
 def _force_gradient_jvp(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:

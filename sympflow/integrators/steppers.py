@@ -160,10 +160,6 @@ class Stepper:
         known = arrays.counts if self.kernel is None else self.kernel.evaluations(n_steps, n_saved, n_extra)
         return arrays.evaluations(n_steps, n_saved, n_extra, self.backend) if known is None else dict(known)
 
-    def more_stats(self) -> dict[str, int]:
-        """Further entries of the statistics."""
-        return {"newton_iterations": self.arrays.iterations} if self.arrays.stages else {}
-
 
 def stepper_of(
     integrator: Any, problem: Problem, arrays: ArraySteps, make: Callable[..., Any], compensated: bool = False
@@ -296,7 +292,7 @@ def checked_state(y_next: Any, y: Array) -> Array:
     """Return the result of a step from y, checked to be of the same kind, shape and dtype: it may be a plug-in's."""
     shape = getattr(y_next, "shape", None)
     if shape == y.shape and y_next.dtype == y.dtype:
-        if is_tensor(y) and y.requires_grad and not y_next.requires_grad and _gradients_are_on():
+        if is_tensor(y) and differentiable(y) and not (y_next.requires_grad or transformed(y)):
             raise TypeError(
                 "`step` loses the gradient of the tensors that it is given: pass NumPy arrays, or y0.detach(). A class "
                 "whose step takes arrays only says so by `arrays_only`."
@@ -307,12 +303,6 @@ def checked_state(y_next: Any, y: Array) -> Array:
         f"`step` must return states as those that it is given, of {y.dtype} and shape {tuple(y.shape)}; got "
         f"{type(y_next).__name__}{what}. Mend the integrator: check_integrator tests it."
     )
-
-
-def _gradients_are_on() -> bool:
-    import torch
-
-    return torch.is_grad_enabled()
 
 
 def shorter_steps(stepper: Stepper, grid: Grid, y: Array, count: np.ndarray, remainder: np.ndarray) -> Array:
