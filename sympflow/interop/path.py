@@ -373,10 +373,7 @@ class _PulledBack(torch.autograd.Function):
                 of_start = of_start if of_t is None else of_start + of_t
                 if of_lengths is not None:
                     of_s[i] = of_lengths.sum()
-        times = (
-            of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None,
-            of_start if ctx.needs_input_grad[2] else None,
-        )
+        times = (of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None, of_start if ctx.needs_input_grad[2] else None)
         return None, *times, a, *of_parameters
 
 

@@ -244,10 +244,7 @@ class Discovery:
         ax.axvline(len(self.terms), color="#333333", lw=0.8, ls=":")
         chosen = next(model for model in self.path if len(model.terms) == len(self.terms))
         ax.annotate(
-            f"chosen: {len(self.terms)} terms",
-            (len(self.terms), chosen.residual),
-            (6, 18),
-            textcoords="offset points",
+            f"chosen: {len(self.terms)} terms", (len(self.terms), chosen.residual), (6, 18), textcoords="offset points"
         )
         ax.axhline(1.0, color="#999999", lw=0.8)
         ax.set(xlabel="number of terms", ylabel="residual / noise", yscale="log")
@@ -578,9 +575,8 @@ class _Search:
         before = self._known(origin)
         theta = self._carried(active, origin, before)
         problem = self._problem(active, theta, before.problem.sigma)
-        return self._minimized(problem, theta, before.states, steps) or self._minimized(
-            problem, theta, self.starts, steps
-        )
+        fits = (self._minimized(problem, theta, states, steps) for states in (before.states, self.starts))
+        return next(filter(None, fits), None)
 
     def _tell(self, active: Sequence[int]) -> None:
         fit = self.fits[frozenset(active)]
@@ -634,11 +630,8 @@ class _Search:
             known = frozenset(rest) in self.fits
             made = self._fit(rest, active, steps)
             promised = self._criterion(active) - self.penalty + significance[weakest]
-            if (
-                known
-                and self._criterion(rest) > promised + WORTH * self.penalty
-                and significance[weakest] < self.penalty
-            ):
+            worse = self._criterion(rest) > promised + WORTH * self.penalty
+            if known and worse and significance[weakest] < self.penalty:
                 made = self._again(rest, active, steps)  # a former fit from elsewhere ended too early, or elsewhere
             if made is not None:
                 return rest

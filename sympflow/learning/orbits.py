@@ -140,11 +140,8 @@ class Gauss(Stepper):
             moved = np.abs(h * (new - K))
             change = float(moved.max(initial=0.0))
             K = new
-            if (
-                not math.isfinite(change)
-                or (moved <= near).all()
-                or (change >= before and change < 1e-9 * np.abs(x).max())
-            ):
+            rounding = change >= before and change < 1e-9 * np.abs(x).max()
+            if rounding or not math.isfinite(change) or (moved <= near).all():
                 break
             before = change
         end = x + h * np.einsum("j,mjn->mn", b, K)

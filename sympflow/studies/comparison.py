@@ -203,11 +203,7 @@ def _instants(reference: object, t0: float, t1: float, n: int, dt: float) -> np.
 
 
 def _given(
-    reference: Reference | Solution | ArrayLike,
-    system: HamiltonianSystem,
-    t0: float,
-    y0: np.ndarray,
-    t: np.ndarray,
+    reference: Reference | Solution | ArrayLike, system: HamiltonianSystem, t0: float, y0: np.ndarray, t: np.ndarray
 ) -> Reference:
     """The reference that was given, if it is one and fits."""
     if isinstance(reference, Reference | Solution):

@@ -16,17 +16,7 @@ from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
-from sympflow.show.style import (
-    TEXT,
-    dress,
-    filled,
-    frame,
-    labelled,
-    legend_above,
-    method_styles,
-    new_figure,
-    save,
-)
+from sympflow.show.style import TEXT, dress, filled, frame, labelled, legend_above, method_styles, new_figure, save
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies.attempts import Attempt, Row, any_step
@@ -260,13 +250,7 @@ def _annotate(ax: Axes, points: Sequence[tuple[float, float, str]], styles: dict
         _, dx, dy, align, low = min(choices, key=lambda choice: choice[0])
         placed.append((low, low + size))
         ax.annotate(
-            label,
-            (x, y),
-            xytext=(dx, dy),
-            textcoords="offset points",
-            ha=align,
-            fontsize=8,
-            color=styles[label][0],
+            label, (x, y), xytext=(dx, dy), textcoords="offset points", ha=align, fontsize=8, color=styles[label][0]
         )
 
 
