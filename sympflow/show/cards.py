@@ -117,21 +117,10 @@ def legible(text: str) -> str:
     return plain.encode(encoding, "replace").decode(encoding)
 
 
-SPELLED = {
-    "…": "...",
-    "µ": "u",
-    "±": "+-",
-    "─": "-",
-    "–": "-",
-    "—": "-",
-    "−": "-",
-    "×": "x",
-    "·": "*",
-    "∞": "inf",
-    "≤": "<=",
-    "≥": ">=",
-    "→": "->",
-}
+SPELLED = {"…": "...", "µ": "u", "±": "+-", "×": "x", "·": "*", "∞": "inf", "≤": "<=", "≥": ">=", "→": "->"}
+SPELLED |= dict.fromkeys("─–—−", "-")
+    zip("…µ±─–—−×·∞≤≥→", ["...", "u", "+-", "-", "-", "-", "-", "x", "*", "inf", "<=", ">=", "->"], strict=True)
+)
 
 
 def _spelled(character: str) -> str:

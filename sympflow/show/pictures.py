@@ -85,15 +85,8 @@ def _orbit(ax: Axes, t: np.ndarray, y: np.ndarray, error: np.ndarray, marker: st
     else:
         q = y[0, :d]
         largest = float(np.nanmax(np.abs(q), initial=0.0)) or 1.0
-        shown = ax.pcolormesh(
-            t if t.ndim == 1 else t[0],
-            np.arange(1, d + 1),
-            q,
-            cmap="RdBu_r",
-            vmin=-largest,
-            vmax=largest,
-            rasterized=True,
-        )
+        times, sites = t if t.ndim == 1 else t[0], np.arange(1, d + 1)
+        shown = ax.pcolormesh(times, sites, q, cmap="RdBu_r", vmin=-largest, vmax=largest, rasterized=True)
         ax.figure.colorbar(shown, ax=ax, shrink=0.8).set_label("q", color=TEXT)
         dress(ax, "t", "coordinate")
 
