@@ -119,8 +119,6 @@ def legible(text: str) -> str:
 
 SPELLED = {"…": "...", "µ": "u", "±": "+-", "×": "x", "·": "*", "∞": "inf", "≤": "<=", "≥": ">=", "→": "->"}
 SPELLED |= dict.fromkeys("─–—−", "-")
-    zip("…µ±─–—−×·∞≤≥→", ["...", "u", "+-", "-", "-", "-", "-", "x", "*", "inf", "<=", ">=", "->"], strict=True)
-)
 
 
 def _spelled(character: str) -> str:
