@@ -396,13 +396,7 @@ class Search:
             checkpoints.write(session.checkpoint, self.identity | state)
 
     def resume(self, path: Path) -> None:
-        """Take over the models that were fitted before a run was ended.
-
-        Raises
-        ------
-        ValueError
-            If the file is not a checkpoint, or one of other trajectories or options.
-        """
+        """Take over the models of a checkpoint; a ValueError if it is one of other trajectories or options."""
         self.done = checkpoints.read_same(path, self.identity)["optimizer"]
 
     def diagnose(self, session: Session) -> None:

@@ -28,21 +28,7 @@ def trajectory_figure(
     kinds: Sequence[str] = KINDS,
     marker: str = "",
 ) -> Figure:
-    """Panels of trajectories side by side.
-
-    Parameters
-    ----------
-    t : ndarray (n,) or (N, n)
-    y : ndarray (N, 2d, n)
-    energy_error : ndarray (N, n) or None
-        Relative; without it there is no panel "energy".
-    title : str
-    kinds : sequence of str
-        Of "orbit": q₁ against q₂, or q over t of one degree of freedom, or a map of all q of many; "phase": q₁ against
-        p₁; "energy": the energy error over t.
-    marker : str
-        Of points, where states are samples.
-    """
+    """Panels of trajectories y (N, 2d, n) at t, (n,) or (N, n), with a `marker` where states are samples."""
     unknown = [kind for kind in kinds if kind not in KINDS]
     if unknown or not kinds:
         raise ValueError(f"`kinds` must be some of {', '.join(map(repr, KINDS))}; got {list(kinds)!r}.")

@@ -55,11 +55,7 @@ class StoreError(OSError):
 
 @dataclass(frozen=True)
 class Field:
-    """An array of a store, of numbers or truth values; fields that share a dimension have the same length along it.
-
-    `chunks` is by default the whole array. `missing` is the number where nothing has been written, which a reader of
-    zarr may show as NaN; the default is NaN, or 0 of other numbers than floats.
-    """
+    """An array of a store; `chunks` is by default all of it, `missing` the number where nothing was written."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
@@ -146,10 +142,7 @@ class Store:
         attributes: Mapping[str, Any],
         values: Mapping[str, np.ndarray] | None = None,
     ) -> Store:
-        """Make a store, with the values of some arrays of one chunk; the others have none.
-
-        It is made beside its place, and moved there: it is whole, or it is not there.
-        """
+        """Make a store beside its place, and move it there, with the values of some arrays of one chunk."""
         place = Path(path)
         for name in fields:
             if not is_name(name):
@@ -249,15 +242,7 @@ class Store:
         return self._file(name, index).exists()
 
     def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
-        """Write one chunk; at the edge of the array, or of one that is to grow, `values` may be smaller than a chunk.
-
-        Raises
-        ------
-        ValueError
-            If the values do not fit into the chunk.
-        StoreError
-            If they cannot be written, as on a full disk.
-        """
+        """Write one chunk, into which `values` must fit; at the edge of the array they may be smaller."""
         known = self.fields[name]
         assert known.chunks is not None
         values = np.asarray(values)

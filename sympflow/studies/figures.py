@@ -273,11 +273,7 @@ def _overlap(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.nda
 
 
 def portrait(comparison: Compared) -> Figure:
-    """Phase space, a panel for each method with the reference behind in grey.
-
-    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0 with q₁ increasing along the
-    run, on each method's own map. More: q₁ against q₂. Of a driven system the states after each period, q₁ against p₁.
-    """
+    """Phase space, a panel for each method with the reference in grey: (q, p), the section q₁ = 0, or q₁ against q₂."""
     system = comparison.system
     runs = [run for run in comparison.runs if run.sol is not None]
     rows = -(-len(runs) // 5)
