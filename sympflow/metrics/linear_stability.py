@@ -27,7 +27,6 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.polynomial.polynomial import polyadd, polyder, polymul, polyval
 
 from sympflow.hamiltonian.scales import weights
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -44,6 +43,7 @@ TURNS = 1e-5  # imaginary part of an eigenvalue that is simple, whose rounding i
 NEWTON_STEPS = 50
 SCALES = (0.1, 1.0, 10.0, 100.0)  # of the states at which Hessians are compared, in units of y0
 
+series: Any = np.polynomial.polynomial  # of fractions and decimals, which its stubs do not know
 Polynomial = Any  # a sequence or an array of coefficients, the constant one first
 
 
@@ -144,21 +144,23 @@ def _of_table(scheme: Scheme) -> LinearStability:
     with localcontext() as context:
         context.prec = DIGITS
         p = [Decimal(c.numerator) / Decimal(c.denominator) for c in exact]
-        turns = _positive_roots(polyder(p))
+        turns = _positive_roots(series.polyder(p))
         points, values = [Decimal(0)], [Decimal(1)]
         resonances: list[Decimal] = []
         for x in turns:
-            value = polyval(x, p)
+            value = series.polyval(x, p)
             if abs(abs(value) - 1) <= Decimal(ROUNDING * _sensitivity(scheme, float(x))):
                 value = Decimal(1).copy_sign(value)
                 resonances.append(x)
             points.append(x)
             values.append(value)
         last = points[-1] + 1
-        while len(p) > 1 and polyval(last, p) * Decimal(1).copy_sign(p[-1]) <= 1:  # from the last extremum on monotone
+        while (
+            len(p) > 1 and series.polyval(last, p) * Decimal(1).copy_sign(p[-1]) <= 1
+        ):  # from the last extremum on monotone
             last *= 2
         points.append(last)
-        values.append(polyval(last, p))
+        values.append(series.polyval(last, p))
         windows = _windows(p, points, values)
         inside = LinearStability(windows)
         return LinearStability(windows, tuple(z for x in resonances if not inside.window_of(z := math.sqrt(x))))
@@ -201,11 +203,11 @@ def half_trace(scheme: Scheme) -> tuple[Fraction, ...]:
     p: list[Polynomial] = [[Fraction(0)], [Fraction(1)]]
     for kind, b, g, c, *_ in scheme.substeps:
         if kind == "drift":
-            q = [polyadd(mine, polymul([Fraction(b)], other)) for mine, other in zip(q, p, strict=True)]
+            q = [series.polyadd(mine, series.polymul([Fraction(b)], other)) for mine, other in zip(q, p, strict=True)]
         else:  # a kick by −(b x − g x² + c x³) q
             kick = [Fraction(0), Fraction(-b), Fraction(g), Fraction(-c)]
-            p = [polyadd(mine, polymul(kick, other)) for mine, other in zip(p, q, strict=True)]
-    trace = [x / 2 for x in polyadd(q[0], p[1])]
+            p = [series.polyadd(mine, series.polymul(kick, other)) for mine, other in zip(p, q, strict=True)]
+    trace = [x / 2 for x in series.polyadd(q[0], p[1])]
     while len(trace) > 1 and trace[-1] == 0:
         trace.pop()
     return tuple(trace)
@@ -238,8 +240,8 @@ def _positive_roots(p: Polynomial) -> list[Decimal]:
     if len(p) < 2:
         return []
     bound = 1 + max(abs(c / p[-1]) for c in p[:-1])  # Cauchy's
-    points = [Decimal(0), *_positive_roots(polyder(p)), bound]
-    values = [polyval(x, p) for x in points]
+    points = [Decimal(0), *_positive_roots(series.polyder(p)), bound]
+    values = [series.polyval(x, p) for x in points]
     found = []
     for (a, b), (u, v) in zip(pairwise(points), pairwise(values), strict=True):
         if u * v < 0:
@@ -251,11 +253,11 @@ def _positive_roots(p: Polynomial) -> list[Decimal]:
 
 def _crossing(p: Polynomial, level: Decimal, a: Decimal, b: Decimal) -> Decimal:
     """The x between a and b where p, monotone there, passes a level, to half of the digits."""
-    rising = polyval(b, p) > polyval(a, p)
-    slope = polyder(p)
+    rising = series.polyval(b, p) > series.polyval(a, p)
+    slope = series.polyder(p)
     x = (a + b) / 2
     while b - a > b * Decimal(10) ** (-DIGITS // 2):
-        off, steep = polyval(x, p) - level, polyval(x, slope)
+        off, steep = series.polyval(x, p) - level, series.polyval(x, slope)
         a, b = (a, x) if (off > 0) == rising else (x, b)
         newton = x - off / steep if steep else a
         if a < newton < b and abs(newton - x) <= b * Decimal(10) ** (-DIGITS // 2):
