@@ -14,7 +14,6 @@ import json
 import math
 import os
 import struct
-import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +26,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from sympflow._version import __version__
-from sympflow.arguments import naming_path, writable
+from sympflow.arguments import naming_path, put_file, writable
 from sympflow.flow.families import family_of
 from sympflow.flow.potentials import Unregistered
 from sympflow.flow.records import (
@@ -100,15 +99,7 @@ def write(
             "Describe its domain with fewer numbers, for instance a Tube around fewer states."
         )
     with naming_path(writable(file)):
-        handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
-    try:
-        with os.fdopen(handle, "wb") as temporary:
-            temporary.write(content)
-        Path(name).chmod(0o644)
-        os.replace(name, file)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+        put_file(file, content, durable=False)
 
 
 def _finite(value: Any) -> Any:

@@ -45,11 +45,9 @@ class PrimedFlowKernel(Kernel):
         self._ranges = None if system.friction else self._splitting.ranges(tables.level, compensated)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int) -> dict[str, int]:
-        """Count those of the numbers that the kernel has: see `Kernel`."""
         return self._tables.evaluations(n_steps, n_saved, n_extra, "compiled")
 
     def runs(self, task: Task) -> Run:
-        """`n_steps` times ψ̄_h from every row, of a driven system at the time t0: see `Kernel`."""
         if not self._tables.processed:
             return self._kernel(task.h).runs(task._replace(h=abs(task.h)))
         tables, (N, size) = self._processed(task.h, task.t0), task.y0.shape
@@ -67,7 +65,6 @@ class PrimedFlowKernel(Kernel):
         return Steps(both_ways(one_way, lengths, y))
 
     def tangents(self, h: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """ψ̄_h of each row of `y` (N, 2d), and its Jacobians (N, 2d, 2d): see `Kernel`."""
         from sympflow.kernels.tangents import step_tangents
 
         tables, out, A = self._tables, y.copy(), np.broadcast_to(np.eye(y.shape[1]), (*y.shape, y.shape[1])).copy()
@@ -149,11 +146,9 @@ class SplitFlowKernel(Kernel):
         self._kernel = self._loops.kernel(lambda h: maps.maps(float(h)))
 
     def runs(self, task: Task) -> Run:
-        """`n_steps` times ψ̄_h from every row: see `Kernel`."""
         return self._kernel.runs(task)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         lengths = np.broadcast_to(np.asarray(h, dtype=np.float64), y.shape[:1])
 
         def one_way(rows: Any, back: bool) -> np.ndarray:
@@ -177,13 +172,11 @@ class ClockedFlowKernel(Kernel):
         self._advance, self._time = advance, system.ndof - 1
 
     def runs(self, task: Task) -> Run:
-        """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
         Y, n_finite, _ = self._kernel.runs(task)
         Y[:, :, self._time] += np.asarray(task.save) * np.reshape(self._advances(task.h, task.y0), (-1, 1))
         return Run(Y, n_finite)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         out = self._kernel.step(h, y).states
         out[:, self._time] += self._advances(h, y)
         return Steps(out)
@@ -205,7 +198,6 @@ class CollocatedFlowKernel(Kernel):
         self._kernel, self._steps = implicit_kernel(system, tableau), steps
 
     def runs(self, task: Task) -> Run:
-        """`n_steps` times ψ̄_h from every row, for h < 0 the inverse of ψ̄_|h|: see `Kernel`."""
         m, carry = self._steps, task.carry
         inner = None if carry is None else RunCheckpoint(m * carry.steps, carry.running, carry.spare)
         asked = task._replace(h=task.h / m, n_steps=m * task.n_steps, save=m * np.asarray(task.save), carry=inner)
@@ -215,7 +207,6 @@ class CollocatedFlowKernel(Kernel):
         return Run(states, n_finite // m, iterations)
 
     def step(self, h: ArrayLike, y: np.ndarray, t: ArrayLike = 0.0) -> Steps:
-        """ψ̄_h of each row of `y` (N, 2d), each with its own h (N,)."""
         share, iterations = np.asarray(h, dtype=np.float64) / self._steps, 0
         for _ in range(self._steps):
             y, taken = self._kernel.step(share, y)

@@ -70,6 +70,8 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         The maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
+    PLAN = "primed"
+
     def __init__(
         self,
         ndof: int,
@@ -79,7 +81,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(ndof, dt, system)
+        super().__init__(ndof, dt)
         self.shape = shape
         like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
 
@@ -95,8 +97,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         self._tables: Kept[Tables] = Kept(column._parameters for column in columns_of(self.substeps))
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(map(self._layer, range(len(self.substeps))))
-        if system is not None:
-            self.identify(system)
+        self._made_of(system)
 
     @classmethod
     def untrained(cls, system: HamiltonianSystem, *, dt: float, dtype: Any, device: Any, **given: Any) -> Self:
@@ -166,11 +167,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         return flow
 
     @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        return cls(ndof, PrimedShape.from_dict(plan["primed"], ndof), dt, dtype=dtype)
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        return {"shape": PrimedShape.from_dict(plan, ndof)}
 
-    def architecture(self) -> dict[str, Any]:
-        return {"ndof": self.kept_ndof, "primed": self.shape.to_dict()}
+    def plan(self) -> dict[str, Any]:
+        return self.shape.to_dict()
 
     @property
     def palindromic(self) -> bool:
@@ -259,10 +260,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     def _partly(self, t: Time, x: Tensor, part: slice, back: bool = False) -> Tensor:
         t, y, batch = self._columns(t, x)
-        q, p = y.chunk(2)
-        for layer in reversed(self.layers[part]) if back else self.layers[part]:
-            q, p = layer.inverse(t, q, p) if back else layer(t, q, p)  # type: ignore[operator]
-        return self._states(torch.cat([q, p]), batch)
+        return self._states(self._applied(self.layers[part], t, y, back), batch)
 
     # its system ---------------------------------------------------------------------------------------------
 

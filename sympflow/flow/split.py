@@ -113,6 +113,7 @@ class SplitFlow(SystemFlow):
     `gradients`, part by part. Without a system the flow has maps, but no values.
     """
 
+    PLAN = "split"
     MADE = "made of the parts of a system"
 
     def __init__(
@@ -167,9 +168,7 @@ class SplitFlow(SystemFlow):
         self._maps: Kept[KeptMaps] = Kept(column._parameters for column in self.columns())
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))
-        if system is not None:
-            self._take(system)
-            self.identify(system)
+        self._made_of(system)
 
     @classmethod
     def untrained(cls, system: HamiltonianSystem, *, parts: Sequence[str] | None, **given: Any) -> Self:
@@ -205,11 +204,6 @@ class SplitFlow(SystemFlow):
             system=system,
             **like,
         )
-
-    @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        shape = _checked_plan(plan["split"])
-        return cls(ndof, dt=dt, dtype=dtype, **shape)
 
     def columns(self) -> list[Column]:
         """Return all coefficients: s, w, φ, γ."""
@@ -323,19 +317,34 @@ class SplitFlow(SystemFlow):
         if self.gradient_kicks and not parts.has_force_gradient:
             raise ValueError("`force_gradient` needs H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): leave it out.")
 
-    def architecture(self) -> dict[str, Any]:
-        return {
-            "ndof": self.ndof,
-            "split": {
-                "sequence": list(self.sequence),
-                "kinds": list(self.kinds),
-                "classes": list(self.classes),
-                "terms": self.terms,
-                "filters": self.filtered,
-                "gradients": list(self.gradient_kicks),
-                "expressions": None if self.expressions is None else list(self.expressions),
-            },
-        }
+    def plan(self) -> dict[str, Any]:
+        told = {"terms": self.terms, "filters": self.filtered, "gradients": list(self.gradient_kicks)}
+        told |= {name: list(getattr(self, name)) for name in ("sequence", "kinds", "classes")}
+        return told | {"expressions": None if self.expressions is None else list(self.expressions)}
+
+    @classmethod
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        if not isinstance(plan.get("filters"), bool):
+            raise Refused("its filters are neither true nor false")
+        gradients = plan.get("gradients")
+        if not isinstance(gradients, list) or not all(isinstance(i, int) and 0 <= i < MAX_LAYERS for i in gradients):
+            raise Refused("its gradients are not a list of kicks")
+        for name, admissible in (("kinds", ("kick", "shear")), ("classes", KINDS_OF_MODES)):
+            value = plan.get(name)
+            if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(each in admissible for each in value):
+                raise Refused(f"its {name} are not a list of {', '.join(admissible)}")
+        sequence, expressions, n = plan.get("sequence"), plan.get("expressions"), len(plan["kinds"])
+        if not isinstance(sequence, list) or not 1 <= len(sequence) <= MAX_LAYERS:
+            raise Refused("its sequence of maps is missing or absurdly long")
+        if not all(isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= n for k in sequence):
+            raise Refused("its sequence of maps does not consist of numbers of parts")
+        if expressions is not None:
+            _check_expressions(expressions, n)
+        terms = checked_integer(plan.get("terms"), "number of terms", MAX_DEGREE)
+        if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
+            raise Refused("its architecture is absurdly large")
+        names = ("sequence", "kinds", "classes", "terms", "filters", "gradients", "expressions")
+        return {name: plan.get(name) for name in names}
 
 
 def part_kinds(parts: ExactParts) -> tuple[str, ...]:
@@ -348,33 +357,6 @@ def class_kinds(parts: ExactParts) -> tuple[str, ...]:
     if parts.linear is None:
         return ()
     return tuple(parts.linear.kinds[j] for j in parts.linear.representatives)
-
-
-def _checked_plan(plan: Any) -> dict[str, Any]:
-    """Return the arguments of a `SplitFlow` that a file describes, all of which are checked."""
-    if not isinstance(plan, dict):
-        raise Refused("its plan of a split flow is missing")
-    if not isinstance(plan.get("filters"), bool):
-        raise Refused("its filters are neither true nor false")
-    gradients = plan.get("gradients")
-    if not isinstance(gradients, list) or not all(isinstance(i, int) and 0 <= i < MAX_LAYERS for i in gradients):
-        raise Refused("its gradients are not a list of kicks")
-    for name, admissible in (("kinds", ("kick", "shear")), ("classes", KINDS_OF_MODES)):
-        value = plan.get(name)
-        if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(entry in admissible for entry in value):
-            raise Refused(f"its {name} are not a list of {', '.join(admissible)}")
-    sequence, expressions = plan.get("sequence"), plan.get("expressions")
-    if not isinstance(sequence, list) or not 1 <= len(sequence) <= MAX_LAYERS:
-        raise Refused("its sequence of maps is missing or absurdly long")
-    if not all(isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= len(plan["kinds"]) for k in sequence):
-        raise Refused("its sequence of maps does not consist of numbers of parts")
-    if expressions is not None:
-        _check_expressions(expressions, len(plan["kinds"]))
-    terms = checked_integer(plan.get("terms"), "number of terms", MAX_DEGREE)
-    if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
-        raise Refused("its architecture is absurdly large")
-    names = ("sequence", "kinds", "classes", "terms", "filters", "gradients", "expressions")
-    return {name: plan.get(name) for name in names}
 
 
 def _check_expressions(expressions: Any, kinds: int) -> None:

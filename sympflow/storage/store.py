@@ -22,7 +22,6 @@ import json
 import os
 import re
 import shutil
-import tempfile
 import uuid
 import zipfile
 import zlib
@@ -36,6 +35,7 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import put_file
 from sympflow.storage.identity import Known
 
 __all__ = ["Appender", "Field", "Store", "StoreError"]
@@ -157,7 +157,7 @@ class Store:
                 unfinished.mkdir(parents=True)
                 for name in fields:
                     (unfinished / name).mkdir()
-                _replace(unfinished / ".zgroup", b'{"zarr_format": 2}')
+                put_file(unfinished / ".zgroup", b'{"zarr_format": 2}')
                 for name, array in (values or {}).items():
                     store.write(name, (0,) * np.ndim(array), array)
                 store.commit(attributes=attributes)
@@ -254,12 +254,12 @@ class Store:
             chunk = np.full(known.chunks, known.filled, dtype=known.dtype)
             chunk[tuple(map(slice, values.shape))] = values
         with _told(self.path):
-            _replace(self._file(name, index), zlib.compress(chunk.data, 0))
+            put_file(self._file(name, index), zlib.compress(chunk.data, 0))
 
     def write_text(self, name: str, text: str) -> None:
         """Write a file beside the arrays, whole or not at all."""
         with _told(self.path):
-            _replace(self.path / name, text.encode())
+            put_file(self.path / name, text.encode())
 
     def read(self, name: str, index: tuple[int, ...] | None = None) -> np.ndarray:
         """Return a chunk, or the whole array; `Field.filled` where nothing has been written."""
@@ -307,15 +307,15 @@ class Store:
                 changed[KEPT] = f".state-{1 + int(last[1]) if last else 1}.npz"
                 buffer = io.BytesIO()
                 np.savez(buffer, **dict(state))  # type: ignore[arg-type]
-                _replace(self.path / changed[KEPT], buffer.getvalue())
+                put_file(self.path / changed[KEPT], buffer.getvalue())
             described: dict[str, Any] = {".zgroup": {"zarr_format": 2}, ATTRIBUTES: changed}
             for name, known in fields.items():
                 described[f"{name}/{ARRAY}"] = known.metadata()
                 described[f"{name}/{ATTRIBUTES}"] = {"_ARRAY_DIMENSIONS": list(known.dims), **known.attributes}
-            _replace(self.path / METADATA, _json({"metadata": described, "zarr_consolidated_format": 1}))
+            put_file(self.path / METADATA, _json({"metadata": described, "zarr_consolidated_format": 1}))
             self.fields, self.attributes = fields, changed
             for key, value in described.items():  # for readers that do not take consolidated metadata
-                _replace(self.path / key, _json(value), durable=False)
+                put_file(self.path / key, _json(value), durable=False)
             if state is not None and before:
                 (self.path / before).unlink(missing_ok=True)
 
@@ -477,22 +477,6 @@ def _read(path: Path, most: int) -> bytes:
     if len(content) > most:
         raise ValueError(f"more than {most:,} bytes")
     return content
-
-
-def _replace(path: Path, data: bytes, durable: bool = True) -> None:
-    """Write a file beside its place and move it there; `durable` once the disk has it."""
-    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".new-")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            if durable:
-                os.fsync(file.fileno())
-        os.chmod(unfinished, 0o644)
-        os.replace(unfinished, path)
-    except BaseException:
-        Path(unfinished).unlink(missing_ok=True)
-        raise
 
 
 def _is_taken(place: Path) -> bool:

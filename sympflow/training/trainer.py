@@ -269,7 +269,7 @@ def _fitted(
         if bought and isinstance(solver, GaussNewton):
             few = max(FEWEST, round(SOME * min(1.0, (SMALL / system.ndof) ** 2)))
             solver = replace(solver, restarts=few if not compiled else BOUGHT if limited else STARTS)
-        run = _run_of(system, domain, kind, flow, tried, fit, solver, session.deadline, runs)
+        run = _run_of(system, domain, flow, tried, fit, solver, session.deadline, runs)
         if session.resume is not None:
             run.load(session.resume)
         reason = run.go(session)
@@ -480,7 +480,6 @@ def _new_primed(
 def _run_of(
     system: HamiltonianSystem,
     domain: Domain,
-    kind: str,
     flow: Any,
     tried: PrimedFlow | None,
     fit: Any,
@@ -496,28 +495,27 @@ def _run_of(
         flow = copy.deepcopy(flow).bound(system)
         flow.certified = None  # of the numbers as they were
     dt = flow.dt if flow is not None else 1.0 if fit.dt is None else float(fit.dt)
-    labels, scaling, solver = None, None, solver.but(**fit.OPEN)
+    labels, scaling = None, None
     try:
         if isinstance(fit, SplitFit):
-            return SplitRun.start(flow, system, domain, fit, solver, deadline)
+            return SplitRun(flow, system, domain, scaling, fit, solver, deadline)
         if fit.data is not None:
             labels = handed_in(fit.data, system, dt)
             warn_of_another_system(labels, system)
             fit = replace(fit, data=labels)
         scaling = scaling_of(domain, dt, fit.seed)
         if isinstance(fit, PrimedFit):
-            fit = fit.resolved
-            run: Run = TableRun.start(flow, system, domain, scaling, fit, solver, tried, deadline, runs)
-            if labels is not None and fit.losses == "labels":
+            run: Run = TableRun(flow, system, domain, scaling, fit, solver, deadline, tried=tried, made_runs=runs)
+            if labels is not None and run.fit.losses == "labels":
                 run.unfitted = unlabelled(labels[0], dt)
             return run
         if isinstance(fit, NetworkFit):
             flow = fit.network(system, dt, scaling)
-        fit = fit.resolved(solver, flow.kind)
-        run = LossRun.start(flow.requires_grad_(True), system, domain, scaling, fit, solver, deadline)
-        if not (fit.residual_weight or fit.matching_weight):
+        run = LossRun(flow.requires_grad_(True), system, domain, scaling, fit, solver, deadline)
+        if not (run.fit.residual_weight or run.fit.matching_weight):
             made = dt * np.arange(1, fit.label_times + 1) / fit.label_times
             run.unfitted = unlabelled(made if labels is None else labels[0], dt)
         return run
     except OutOfTime as cut:
-        return Unstarted(flow if tried is None else tried, system, domain, scaling, fit, solver, str(cut))
+        flow = flow if tried is None else tried
+        return Unstarted(flow, system, domain, scaling, fit, solver, reached=str(cut))

@@ -159,7 +159,7 @@ def test_a_second_one_raises_and_the_checkpoint_stays(monkeypatch, tmp_path):
 
 
 def test_before_there_is_anything_it_raises(monkeypatch):
-    then(monkeypatch, TableRun, "start", interrupt)
+    then(monkeypatch, TableRun, "prepare", interrupt)
     with pytest.raises(KeyboardInterrupt):
         train(PENDULUM, flow=FLOW, **QUICK)
 

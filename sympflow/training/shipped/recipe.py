@@ -39,16 +39,7 @@ from sympflow.training.fits import (
     SplitFit,
 )
 from sympflow.training.session import Session
-from sympflow.training.shipped.judges import (
-    AsPublished,
-    ByBalance,
-    ByCertificate,
-    ByClock,
-    ByRuns,
-    Judge,
-    OfStiff,
-    network_cost,
-)
+from sympflow.training.shipped.judges import AsPublished, ByRuns, Judge, balance_errors, by_certificate, of_stiff
 from sympflow.training.trainer import fit_flow
 from sympflow.workers import WorkerPool
 
@@ -181,19 +172,19 @@ class Recipe:
         flow, certificate = self.flow, self.flow.certified
         scene = self.name.partition("-")[0]
         if isinstance(flow, ClockedFlow):
-            return ByClock()
+            return ByRuns()
         if isinstance(flow, SplitFlow):
-            return OfStiff()
+            return of_stiff
         if not isinstance(flow, PrimedFlow):
-            return AsPublished(*INITIAL[scene]) if scene in INITIAL else ByCertificate(cost=network_cost)
+            return AsPublished(*INITIAL[scene]) if scene in INITIAL else by_certificate
         if scene == "outer_solar_system":
-            return ByRuns(along_the_orbit, 1e5 * YEAR, 100 * YEAR)
+            return ByRuns(states=along_the_orbit, t_end=1e5 * YEAR, t_certified=100 * YEAR)
         if flow.shape.timed:
-            return ByBalance()
+            return ByRuns(balance_errors)
         if certificate is None:
-            return ByCertificate()
-        sizes = {name: getattr(certificate, name) for name in ("states", "times", "held_out")}
-        return ByCertificate(certificate.t_end, **sizes)
+            return by_certificate
+        sizes = {name: getattr(certificate, name) for name in ("t_end", "states", "times", "held_out")}
+        return partial(by_certificate, **sizes)
 
     def fitted(self, progress: bool | None = None) -> FlowMap:
         """The flow made again, not judged yet."""
