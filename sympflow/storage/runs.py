@@ -186,7 +186,7 @@ class RunStore:
 
     def _read(self, names: tuple[str, ...], batch: tuple[int, ...], first: int) -> np.ndarray:
         fields = self.store.fields
-        n, size = fields[TIME].shape[0], fields[TIME].chunks[0]  # type: ignore[index]
+        n, size = fields[TIME].shape[0], fields[TIME].chunks[0]
         width = () if names == (TIME,) else (sum(fields[name].shape[-2] for name in names),)
         whole = np.empty((*batch, *width, n - first), fields[names[0]].dtype)
         row = 0

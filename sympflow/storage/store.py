@@ -60,7 +60,7 @@ class Field:
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     dtype: Any = float
-    chunks: tuple[int, ...] | None = None
+    chunks: Any = None  # of int, one for each dimension; None for the whole array
     attributes: Mapping[str, Any] = field(default_factory=dict)
     missing: int | None = None
 
@@ -78,12 +78,10 @@ class Field:
     @property
     def grid(self) -> tuple[int, ...]:
         """The number of chunks along each dimension."""
-        assert self.chunks is not None
         return tuple(-(-n // size) for n, size in zip(self.shape, self.chunks, strict=True))
 
     def region(self, index: tuple[int, ...]) -> tuple[slice, ...]:
         """Return where in the array a chunk lies."""
-        assert self.chunks is not None
         ends = zip(index, self.chunks, self.shape, strict=True)
         return tuple(slice(i * size, min((i + 1) * size, n)) for i, size, n in ends)
 
@@ -244,7 +242,6 @@ class Store:
     def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
         """Write one chunk, into which `values` must fit; at the edge of the array they may be smaller."""
         known = self.fields[name]
-        assert known.chunks is not None
         values = np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
             raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
@@ -269,7 +266,6 @@ class Store:
             for i in product(*map(range, known.grid)):
                 whole[known.region(i)] = self.read(name, i)
             return whole
-        assert known.chunks is not None
         shape = tuple(part.stop - part.start for part in known.region(index))
         size = prod(known.chunks) * known.dtype.itemsize
         try:
@@ -372,7 +368,6 @@ class Appender:
         self.axes = {name: known.dims.index(dim) for name, known in store.fields.items() if dim in known.dims}
         name, axis = next(iter(self.axes.items()))
         known = store.fields[name]
-        assert known.chunks is not None
         self.size, self.length = known.chunks[axis], known.shape[axis]
         self.tails: dict[str, list[np.ndarray]] = {name: [] for name in self.axes}
         self.held = self.length % self.size
