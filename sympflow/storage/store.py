@@ -55,16 +55,12 @@ class StoreError(OSError):
 
 @dataclass(frozen=True)
 class Field:
-    """An array of a store, of numbers or truth values; fields that share a dimension have the same length along it.
-
-    `chunks` is by default the whole array. `missing` is the number where nothing has been written, which a reader of
-    zarr may show as NaN; the default is NaN, or 0 of other numbers than floats.
-    """
+    """An array of a store; `chunks` is by default all of it, `missing` the number where nothing was written."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     dtype: Any = float
-    chunks: tuple[int, ...] | None = None
+    chunks: Any = None  # of int, one for each dimension; None for the whole array
     attributes: Mapping[str, Any] = field(default_factory=dict)
     missing: int | None = None
 
@@ -82,12 +78,10 @@ class Field:
     @property
     def grid(self) -> tuple[int, ...]:
         """The number of chunks along each dimension."""
-        assert self.chunks is not None
         return tuple(-(-n // size) for n, size in zip(self.shape, self.chunks, strict=True))
 
     def region(self, index: tuple[int, ...]) -> tuple[slice, ...]:
         """Return where in the array a chunk lies."""
-        assert self.chunks is not None
         ends = zip(index, self.chunks, self.shape, strict=True)
         return tuple(slice(i * size, min((i + 1) * size, n)) for i, size, n in ends)
 
@@ -146,10 +140,7 @@ class Store:
         attributes: Mapping[str, Any],
         values: Mapping[str, np.ndarray] | None = None,
     ) -> Store:
-        """Make a store, with the values of some arrays of one chunk; the others have none.
-
-        It is made beside its place, and moved there: it is whole, or it is not there.
-        """
+        """Make a store beside its place, and move it there, with the values of some arrays of one chunk."""
         place = Path(path)
         for name in fields:
             if not is_name(name):
@@ -249,17 +240,8 @@ class Store:
         return self._file(name, index).exists()
 
     def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
-        """Write one chunk; at the edge of the array, or of one that is to grow, `values` may be smaller than a chunk.
-
-        Raises
-        ------
-        ValueError
-            If the values do not fit into the chunk.
-        StoreError
-            If they cannot be written, as on a full disk.
-        """
+        """Write one chunk, into which `values` must fit; at the edge of the array they may be smaller."""
         known = self.fields[name]
-        assert known.chunks is not None
         values = np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
             raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
@@ -284,7 +266,6 @@ class Store:
             for i in product(*map(range, known.grid)):
                 whole[known.region(i)] = self.read(name, i)
             return whole
-        assert known.chunks is not None
         shape = tuple(part.stop - part.start for part in known.region(index))
         size = prod(known.chunks) * known.dtype.itemsize
         try:
@@ -387,7 +368,6 @@ class Appender:
         self.axes = {name: known.dims.index(dim) for name, known in store.fields.items() if dim in known.dims}
         name, axis = next(iter(self.axes.items()))
         known = store.fields[name]
-        assert known.chunks is not None
         self.size, self.length = known.chunks[axis], known.shape[axis]
         self.tails: dict[str, list[np.ndarray]] = {name: [] for name in self.axes}
         self.held = self.length % self.size

@@ -382,17 +382,16 @@ class Comparison(Report):
 
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "status", "reason", "dt", "tolerance", "backend", "run_time", "run_time_spread"),
+        *("compile_time", "force_evaluations", "hessian_evaluations", "error", "energy_error", "balance_error"),
         *(
-            "compile_time",
-            "force_evaluations",
-            "hessian_evaluations",
-            "error",
-            "energy_error",
-            "balance_error",
             "energy_drift",
             "energy_drift_error",
+            "volume_error",
+            "symplecticity_defect",
+            "conformal_defect",
+            "time_reversal_error",
         ),
-        *("volume_error", "symplecticity_defect", "conformal_defect", "time_reversal_error", "training_time"),
+        "training_time",
     )
 
     system: HamiltonianSystem

@@ -189,16 +189,8 @@ def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarra
     if given.ndim == 2:
         return given
     system = started(system, given)
-    times = system.dt * np.array(PHASES)
-    sol = solve(
-        system,
-        "dop853",
-        (0.0, float(times[-1])),
-        given,
-        t_eval=times,
-        rtol=1e-11,
-        atol=1e-13 * smallest_size(system, given),
-    )
+    times, atol = system.dt * np.array(PHASES), 1e-13 * smallest_size(system, given)
+    sol = solve(system, "dop853", (0.0, float(times[-1])), given, t_eval=times, rtol=1e-11, atol=atol)
     return sol.states if sol.success and np.isfinite(sol.y).all() else given[None]
 
 
@@ -316,19 +308,16 @@ class Study:
                 for y in ([y0] if together else list(y0))
             ]
 
+    @property
+    def named(self) -> dict[str, Any]:
+        """The system, its first parameter, the method and the precision, as fields of rows and limits."""
+        parameter, value = next(iter(self.system.params.items()), (None, None))
+        own = {"method": self.candidate.method, "label": self.candidate.label, "dtype": self.dtype}
+        return {"system": self.system.title, "parameter": parameter, "value": value, **own}
+
     def attempt(self, h: float | None, span: tuple[float, float]) -> Attempt:
         """Run all initial states with one step; the row has the largest energy error, and the status."""
-        params = self.system.params
-        row = Row(
-            self.system.title,
-            self.candidate.method,
-            self.candidate.label,
-            parameter=next(iter(params), None),
-            value=next(iter(params.values()), None),
-            dtype=self.dtype,
-            t_end=self.span(h)[1],
-        )
-        one = Attempt(self.candidate, row)
+        one = Attempt(self.candidate, Row(**self.named, t_end=self.span(h)[1]))
         one.run(lambda _: self.runs(self.with_step(h), h, span))
         one.fill(dt=h)
         if one.sol is not None:
@@ -524,22 +513,13 @@ def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
     error = None
     if low is not None:
         error = study.stable(low / PRECISION if study.known else low)[1]
-    c, params, linear = study.candidate, study.system.params, study.linear
-    return StepLimit(
-        study.system.title,
-        next(iter(params), None),
-        next(iter(params.values()), None),
-        c.method,
-        c.label,
-        study.dtype,
-        low,
-        high,
-        error,
-        reached,
-        None if study.small is None else study.small.fastest,
-        None if linear is None or not linear.windows else linear.limit,
-        () if linear is None or study.small is None or study.small.equilibrium is None else linear.intervals,
-    )
+    linear, small = study.linear, study.small
+    found: dict[str, Any] = {"stable": low, "unstable": high, "energy_error": error, "reached": reached}
+    found["frequency"] = None if small is None else small.fastest
+    found["linear"] = None if linear is None or not linear.windows else linear.limit
+    if linear is not None and small is not None and small.equilibrium is not None:
+        found["intervals"] = linear.intervals
+    return StepLimit(**study.named, **found)
 
 
 @dataclass
