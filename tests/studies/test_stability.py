@@ -113,9 +113,7 @@ def test_two_is_unstable_though_one_state_does_not_show_it():
 
 
 def test_an_overflow_is_never_a_small_error():
-    (row,) = stability(
-        systems.harmonic_oscillator(), ["verlet"], steps=[2.5], metrics=("energy",), limits=False
-    ).rows
+    (row,) = stability(systems.harmonic_oscillator(), ["verlet"], steps=[2.5], metrics=("energy",), limits=False).rows
     assert row.status == "unstable"
     assert row.energy_error == np.inf
     assert not row.singular
@@ -220,7 +218,9 @@ def test_what_is_no_singularity_is_not_called_one():
 
 
 def test_rows_of_a_singular_solution():
-    report = stability(systems.henon_heiles_escape(), ["kahan_li8", "rk45"], steps=[0.1], t_span=(0, 20), metrics=("energy", "domain"))
+    report = stability(
+        systems.henon_heiles_escape(), ["kahan_li8", "rk45"], steps=[0.1], t_span=(0, 20), metrics=("energy", "domain")
+    )
     fixed, adaptive = report.rows
     assert fixed.status == adaptive.status == "unstable"
     assert fixed.singular
