@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-Array = Any
-"""A NumPy array or a torch tensor."""
+Array = Any  # a NumPy array or a torch tensor
 
 
 def is_tensor(x: object) -> bool:

@@ -16,8 +16,7 @@ from sympflow.arguments import warn
 from sympflow.arrays import Array, copied, detached, differentiable, stack, to_numpy
 
 EventFunction = Callable[[float, Array], Any]
-Dense = Callable[[float], Array]
-"""The state at a time within one step."""
+Dense = Callable[[float], Array]  # the state at a time within one step
 
 _EPS = float(np.finfo(float).eps)
 

@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from sympflow.storage.runs import RunStore
 
 
-LARGE = 2_000_000
-"""Numbers of a solution beyond which its card has no energy error."""
+LARGE = 2_000_000  # numbers of a solution beyond which its card has no energy error
 LOOKED_AT = 64  # outputs at which the terms of H are looked at
 
 

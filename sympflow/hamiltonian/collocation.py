@@ -28,8 +28,7 @@ Tableau = tuple[tuple[tuple[float, ...], ...], tuple[float, ...], tuple[float, .
 
 In Butcher's letters a_ij = A_ij scale_j and b_i = B_i scale_i."""
 MOST_ITERATIONS = 50
-DIFFERENTIATED = 3
-"""Iterations in the graph, and so the orders of derivatives that are right."""
+DIFFERENTIATED = 3  # iterations in the graph, and so the orders of derivatives that are right
 TRACED_ITERATIONS = 8
 """Newton's iterations in a graph that `torch.compile` traces; from K = 0 some five converge where dt is sensible."""
 

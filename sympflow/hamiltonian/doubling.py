@@ -32,8 +32,7 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 
 Force = Callable[[Array, Array], Array]
 
-THIN = 0.1
-"""Width of the default domain in q₋ and p₋, over that in q and p."""
+THIN = 0.1  # width of the default domain in q₋ and p₋, over that in q and p
 _DRAWN = 1000  # states that find the extent of a domain
 
 

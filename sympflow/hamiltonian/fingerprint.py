@@ -16,19 +16,14 @@ from sympflow.hamiltonian.domain import Domain, domain_of
 if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
-DRAWN = 512
-"""States of a domain from which those of an identity are chosen."""
+DRAWN = 512  # states of a domain from which those of an identity are chosen
 MOST_STATES, FEWEST_STATES, MOST_NUMBERS = 64, 8, 4096
-LONGEST_EXPRESSION = 20_000
-"""Characters of an H that is kept as a text; a longer one is known by its values alone."""
-LONGEST_COMPARED = 2_000
-"""Characters of two formulas that are compared as such, where their texts differ."""
-TOLERANCE = 1e-9
-"""Share of the largest difference of energies among the states, and of the largest entry of Γ."""
+LONGEST_EXPRESSION = 20_000  # characters of an H that is kept as a text; a longer one is known by its values alone
+LONGEST_COMPARED = 2_000  # characters of two formulas that are compared as such, where their texts differ
+TOLERANCE = 1e-9  # share of the largest difference of energies among the states, and of the largest entry of Γ
 LATEST, GOLDEN = 20.0, (5**0.5 - 1) / 2
 """Times at which a driven H is probed are multiples of the golden ratio, modulo 1, of the first."""
-PROBES = 8
-"""Fixed states whose energies begin a fingerprint."""
+PROBES = 8  # fixed states whose energies begin a fingerprint
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:

@@ -25,12 +25,9 @@ Expressions = Callable[[], Sequence[sp.Expr]]
 """Expressions that are made when a function of them is generated, not in each call of it."""
 BOUNDARIES = "periodic", "fixed", "free"
 MOST_AXES = 3
-FEW = 6, 4, 3
-"""Sites along each axis of a subsystem, of lattices of one, two and three axes."""
-MANY = 64, 10, 5
-"""The same, of a ring of which long runs are made; as many as a subsystem has, if that is more."""
-MOST_JUDGED = 1024
-"""Degrees of freedom of the lattice on which a flow is judged, where it has more."""
+FEW = 6, 4, 3  # sites along each axis of a subsystem, of lattices of one, two and three axes
+MANY = 64, 10, 5  # the same, of a ring of which long runs are made; as many as a subsystem has, if that is more
+MOST_JUDGED = 1024  # degrees of freedom of the lattice on which a flow is judged, where it has more
 WELLS, FAR = 8, 100.0
 """Starts from which minima of U are looked for, for each field, and how far they may be, in units of U."""
 SIZES, LINES = np.geomspace(1e-30, 1e30, 3001), 64

@@ -26,8 +26,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printab
 __all__ = ["LocalHamiltonian", "check_memory", "checked_params", "named_values", "numbered", "parsed"]
 
 MOST_SPELLED = 128  # degrees of freedom
-MOST_DENSE = 50_000_000
-"""Entries of matrices ∇²V that are made at a time."""
+MOST_DENSE = 50_000_000  # entries of matrices ∇²V that are made at a time
 VECTORS_OF_A_RUN = 12
 """Vectors of d numbers that a run holds: its state, the next one, copies to look for what is not finite, forces."""
 
@@ -48,10 +47,8 @@ class LocalHamiltonian(Definition, ABC):
     """1 of the momenta that count in H, 0 of those of bodies without mass (d,); None where all do."""
     frame: Any = None
     """The coordinates of planets about a star, of a system that knows its star: see `sympflow.hamiltonian.planets`."""
-    arrays_only: str = ""
-    """The part of the system without compiled kicks; "" if all has them."""
-    in_terms: bool = False
-    """True where compiled kicks are made of all terms of H."""
+    arrays_only: str = ""  # the part of the system without compiled kicks; "" if all has them
+    in_terms: bool = False  # True where compiled kicks are made of all terms of H
     written: SymbolicHamiltonian | None = None
     """H in symbols, of a system so small that it is written out when symbols are asked for."""
     loops: str

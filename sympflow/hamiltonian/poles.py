@@ -63,10 +63,8 @@ class Cancelling(NamedTuple):
 class Poles(Protocol):
     """The places at which H of a system may be infinite, in columns."""
 
-    cancelling: Sequence[Cancelling]
-    """Terms of H that cancel where each is infinite."""
-    watched: bool
-    """False if H has cancelling terms alone."""
+    cancelling: Sequence[Cancelling]  # terms of H that cancel where each is infinite
+    watched: bool  # False if H has cancelling terms alone
 
     @property
     def exact(self) -> Poles | None:

@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import Kick
 
 MOST_DEGREES = 1_000_000
-TYPESET = 400
-"""Characters of an H that notebooks typeset."""
+TYPESET = 400  # characters of an H that notebooks typeset
 GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
 PROPER = {"henon_heiles": "Hénon–Heiles"}
 SHOWN_NAMES = (
@@ -154,8 +153,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     _period: float | None = None
     _former_period: float | None = None
-    _continuous = True
-    """False of systems that are made of others, whose H may jump where solutions do not feel it."""
+    _continuous = True  # False of systems that are made of others, whose H may jump where solutions do not feel it
     exact: Callable[[Any], Array] | None = None
 
     def __init__(

@@ -80,22 +80,19 @@ class Composition(ABC, ArraySteps):
     splitting, or the scheme with it, does not apply to the system.
     """
 
-    compensates: ClassVar[bool] = False
-    """True if there are compensated sums."""
+    compensates: ClassVar[bool] = False  # True if there are compensated sums
     keeps: ClassVar[str] = ""
     """Name of what a run keeps from step to step beside the state, where steps are made on an extended phase space."""
     counts_as_scheme: ClassVar[bool] = True
     """True if a step evaluates as many forces as the scheme says, whatever the system."""
     takes_values: ClassVar[bool] = False
     """True if compiled loops may take the values of parameters as numbers, other ones for each trajectory."""
-    takes_friction: ClassVar[bool] = False
-    """True if one of the parts holds the friction of a damped system."""
+    takes_friction: ClassVar[bool] = False  # True if one of the parts holds the friction of a damped system
     takes_driving: ClassVar[bool] = False
     """True if the time moves with one of the parts, of a system that depends on it."""
     breakdown: ClassVar[Failure | None] = None
     """The reason for which runs end that cannot go on; None for that of all methods."""
-    doubts: ClassVar[bool] = False
-    """True if there may be a warning of a step that is long for the system."""
+    doubts: ClassVar[bool] = False  # True if there may be a warning of a step that is long for the system
     takes_extended: ClassVar[bool] = False
     """True if the parts stay as they are with E, the momentum of the time, as one more momentum."""
 

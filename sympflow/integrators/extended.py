@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from sympflow.integrators.compositions import Composition
     from sympflow.storage.runs import RunStore
 
-APART = 0.1
-"""Distance of two copies, over the size of the states of the run, beyond which these mean little."""
+APART = 0.1  # distance of two copies, over the size of the states of the run, beyond which these mean little
 
 
 class ProjectedSolution(DenseOutput):

@@ -16,8 +16,7 @@ from sympflow.integrators.contract import Integrator, Interrupted, Outcome, Prob
 from sympflow.integrators.grid import EPS, jumps_met
 
 Run = Callable[[Integrator, Problem], tuple[Outcome, Problem]]
-MOST_LANDINGS = 20_000
-"""Jumps at which a run is cut; one with more is not, and warns."""
+MOST_LANDINGS = 20_000  # jumps at which a run is cut; one with more is not, and warns
 ASIDE = 64 * EPS
 """Share of the times between which a run goes on from a jump, or ends before it, so that H is that of one side."""
 

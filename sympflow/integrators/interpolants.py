@@ -11,8 +11,7 @@ import numpy as np
 from sympflow.arguments import check_not_followed
 from sympflow.arrays import Array, beside, detached, last, like, moveaxis, stack
 
-Time = Any
-"""A number, or a tensor that carries a gradient."""
+Time = Any  # a number, or a tensor that carries a gradient
 
 
 class Interpolant:

@@ -14,8 +14,7 @@ from sympflow.integrators.registry import name_of
 from sympflow.storage.identity import Known
 from sympflow.storage.layout import UNITS
 
-LONGEST_EXPRESSION = 10_000
-"""Characters of H beyond which its text is left out."""
+LONGEST_EXPRESSION = 10_000  # characters of H beyond which its text is left out
 
 
 def option_text(integrator: Integrator) -> str:

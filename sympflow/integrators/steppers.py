@@ -35,13 +35,11 @@ class ArraySteps:
     """The steps of one run by array operations, and the count of their evaluations; a subclass defines `step`."""
 
     takes_carry: bool = True
-    counts: Mapping[str, int] | None = None
-    """The evaluations that were made so far, where they are counted."""
+    counts: Mapping[str, int] | None = None  # the evaluations that were made so far, where they are counted
     stages: int = 0
     """Evaluations of the force and the Hessian in each iteration of an implicit step; 0 of an explicit one."""
     iterations: int = 0
-    backend: str = ""
-    """The name of what runs, if it is not the library of the states."""
+    backend: str = ""  # the name of what runs, if it is not the library of the states
 
     def step(self, y: Array, h: Any, t: Any = 0.0) -> Array:
         """One step of length h, a number or one for each state, from y (..., 2d) at the time t, of either kind."""

@@ -45,8 +45,7 @@ from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless,
 from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
-Visit = Callable[[Interpolant], bool]
-"""Takes a step as soon as it is accepted; whether the run ends in it."""
+Visit = Callable[[Interpolant], bool]  # takes a step as soon as it is accepted; whether the run ends in it
 
 
 class Trace:
