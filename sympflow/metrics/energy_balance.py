@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -11,9 +11,6 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.lazy import kept
 from sympflow.solution import Solution, check_solution, gathered
 from sympflow.solver import solve
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["energy_balance_error"]
 
@@ -111,7 +108,7 @@ def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
     symbols = system.symbols
     if symbols is None or symbols.samples or system.kinetic_timed:
         return None
-    d, time = system.ndof, symbols.time
+    d, time = system.ndof, cast(Any, symbols.time)
     s = type(time)(f"q{d + 1}", real=True)  # SymPy's symbol
     H, values = symbols.written
     params = {symbol.name: system.params[symbol.name] for symbol in values}
