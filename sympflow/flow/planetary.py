@@ -28,7 +28,7 @@ from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, check_compilable, doubles
 from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
@@ -123,13 +123,11 @@ class KeplerFlow(SystemFlow):
         dt: float = 1.0,
         periods: Sequence[float] | None = None,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
-        kind: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        self.register_buffer("kicks", torch.zeros(2 * reach, **kind))
-        self.register_buffer("gradients", torch.zeros(n_gradients, **kind))
+        super().__init__(ndof, dt, **like)
+        self.register_buffer("kicks", torch.zeros(2 * reach, **self._like))
+        self.register_buffer("gradients", torch.zeros(n_gradients, **self._like))
         self.periods = None if periods is None else tuple(map(float, periods))
         self._kept: Kept[_Kept] = Kept([self._buffers])
         # A tuple, not a ModuleList: the layers own no numbers.

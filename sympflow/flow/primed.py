@@ -43,7 +43,7 @@ from sympflow.flow.primed_potentials import (
 from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Tables, columns_of
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, check_compilable, doubles
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.monomials import Monomials, in_monomials, monomials
@@ -78,15 +78,13 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         shape: PrimedShape,
         dt: float = 1.0,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
+        super().__init__(ndof, dt, **like)
         self.shape = shape
-        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
 
         def columns(inside: bool) -> Columns:
-            made = shape.columns(inside, lambda name, *given: Coefficients(*given, dt=self.dt, **like))
+            made = shape.columns(inside, lambda name, *given: Coefficients(*given, dt=self.dt, **self._like))
             return made if made.polynomials is None else made._replace(polynomials=nn.ModuleList(made.polynomials))
 
         inside, outside = columns(True), columns(False)
@@ -152,11 +150,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
             processor=processor,
             curvature=curvature,
             monomials=exponents,
-            timed=_is_timed(system),
+            timed=not system.keeps_energy,
             gradient_kicks=some,
             curvature_kicks=curved,
         )
-        flow = cls(system.ndof, shape, dt, system, dtype, device)
+        flow = cls(system.ndof, shape, dt, system, dtype=dtype, device=device)
         kicks, drifts = _kicks(scheme), [s for s in substeps if s.kind == "drift"]
         flow.kicks.set_constant([s.one for s in kicks])
         flow.drifts.set_constant([s.one for s in drifts])
@@ -294,7 +292,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
                 f"`system` {system.name!r} has no kicks and drifts such as the flow's: it must be H = ½ pᵀM⁻¹p + V(q), "
                 "with `hessian_vector` where V is a function."
             )
-        return self._of(system, replace(self.shape, timed=_is_timed(system)))
+        return self._of(system, replace(self.shape, timed=not system.keeps_energy))
 
     def of_any_size(self, system: HamiltonianSystem) -> Self:
         """Return the flow of a system with the numbers of this one, of a piece of it by its coordinates."""
@@ -306,7 +304,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     def _of(self, system: HamiltonianSystem, shape: PrimedShape) -> Self:
         """A flow of a system with the numbers of this one."""
-        other = type(self)(system.ndof, shape, self.dt, system, self.dtype, self.device)
+        other = type(self)(system.ndof, shape, self.dt, system, dtype=self.dtype, device=self.device)
         mine = dict(self.columns())
         for name, column in other.columns():
             column.set(to_numpy(mine[name].table))
@@ -348,11 +346,6 @@ class PrimedFlow(PrimedKnown, SystemFlow):
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
         return super().initial_velocity(x, t0) if self.system is None else self.system.vector_field(x, t0)
-
-
-def _is_timed(system: HamiltonianSystem) -> bool:
-    """Return True if the drifts of a kernel must add up to t."""
-    return not system.keeps_energy
 
 
 def _check_counts(stages: Any, processor: Any) -> None:

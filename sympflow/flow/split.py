@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.arguments import check_flag, plain
+from sympflow.arguments import check_counts, check_flag, plain
 from sympflow.flow.coefficients import Column
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.layers import OwnLayer
@@ -26,7 +26,7 @@ from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Memory, Total
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, check_compilable, doubles
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts, map_evaluations
@@ -128,38 +128,35 @@ class SplitFlow(SystemFlow):
         dt: float = 1.0,
         expressions: Sequence[str] | None = None,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
+        super().__init__(ndof, dt, **like)
         self.expressions = None if expressions is None else tuple(expressions)
         self.sequence, self.kinds, self.classes = tuple(sequence), tuple(kinds), tuple(classes)
         if not self.sequence or self.sequence != self.sequence[::-1]:
             raise ValueError("`sequence` must read the same backwards: make it a palindrome.")
         if set(self.sequence) - set(range(len(self.kinds) + 1)):
             raise ValueError(f"`sequence` names parts beyond the {len(self.kinds)} there are: check `kinds`.")
-        if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
-            raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
+        check_counts(terms=terms)
         self.terms, self.filtered, self.gradient_kicks = terms, bool(filters), tuple(sorted(set(gradients)))
         n_kicks = self.sequence.count(1)
         if self.gradient_kicks != tuple(sorted(n_kicks - 1 - i for i in self.gradient_kicks)):
             raise ValueError(f"`force_gradient` {gradients!r} is not the same from either end of {n_kicks} kicks.")
         if not set(self.gradient_kicks) <= set(range(n_kicks)) or (gradients and "shear" in self.kinds):
             raise ValueError(f"`force_gradient` {gradients!r} names no kicks: count them from 0 to {n_kicks - 1}.")
-        like: dict[str, Any] = {"dt": self.dt, "dtype": checked_dtype(dtype), "device": checked_device(device)}
 
-        def column(part: int, power: int, total: Total) -> Column:
-            return Column(self.sequence.count(part), range(terms), power, total=total, **like)
+        def column(n: int, power: int, total: Total = None) -> Column:
+            return Column(n, range(terms), power, total=total, dt=self.dt, **self._like)
 
         modules = torch.nn.ModuleList
         rest = [k for k in range(1, len(self.kinds) + 1) if k in self.sequence]
         turning = [f for f, kind in enumerate(self.classes) if kind in FILTERED]
         linear = range(len(self.classes)) if LINEAR in self.sequence else ()
-        self.linear = modules(column(LINEAR, 1, "always") for _ in linear)
-        self.weights = modules(column(k, 1, "start") for k in rest)
-        self.filters = modules(column(k, 0, None) for k in rest for _ in turning if filters)
-        n_gradients = len(self.gradient_kicks)
-        self.gradients = modules(Column(n_gradients, range(terms), 3, **like) for _ in range(n_gradients > 0))
+        count = self.sequence.count
+        self.linear = modules(column(count(LINEAR), 1, "always") for _ in linear)
+        self.weights = modules(column(count(k), 1, "start") for k in rest)
+        self.filters = modules(column(count(k), 0) for k in rest for _ in turning if filters)
+        self.gradients = modules(column(len(self.gradient_kicks), 3) for _ in range(bool(self.gradient_kicks)))
         self._slot = {k: i for i, k in enumerate(rest)}
         self._turning = turning
         for c in self.columns():  # equal steps, φ = 1

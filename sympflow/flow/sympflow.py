@@ -28,7 +28,7 @@ from sympflow.flow.potentials import (
 )
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_widths, count_parameters
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.weights import Kept, check_compilable, check_memory
+from sympflow.flow.weights import Kept, check_compilable, check_memory, checked_device, checked_dtype
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
@@ -612,8 +612,9 @@ class SystemFlow(SympFlow):
     """The name of its plan in a file, which `plan` tells, and `checked_plan` makes arguments of."""
     MADE: ClassVar[str] = "primed with the V and T of a system"
 
-    def __init__(self, ndof: int, dt: float) -> None:
+    def __init__(self, ndof: int, dt: float, dtype: Any = torch.float64, device: Any = None) -> None:
         super().__init__(ndof, dt=dt, layers=())
+        self._like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         self._binding = Binding(None, self.MADE)
         self._loops: tuple[HamiltonianSystem, Any] | None = None  # compiled, of the system that was asked for last
 
