@@ -694,8 +694,8 @@ class StabilityReport(Report):
         parts = [text_table(self._limit_columns()), *self.without_limit(), ""] if self.limits else []
         below = ["", "Notes", *dict.fromkeys(notes)] if notes else []
         titles = ("step", "steps", "energy error", "drift per unit t", "blow-up at t", "leaves domain at t")
-        titles += ("volume error", "sympl. defect", "status")
-        columns = [*self._names(self.rows), *attempts.columns(self.rows, titles, {"blow-up at t": _end})]
+        more = ("volume error", "sympl. defect", "status")
+        columns = [*self._names(self.rows), *attempts.columns(self.rows, titles + more, {"blow-up at t": _end})]
         return "\n".join([*parts, text_table(columns), *below])
 
     def without_limit(self) -> list[str]:
