@@ -149,7 +149,7 @@ class KeplerFlow(SystemFlow):
 
     def _frame_of(self, system: HamiltonianSystem) -> Frame:
         """The frame of a system, whose planets are on the orbits for which the numbers hold."""
-        frame = frame_of(system.local, system.y0)
+        frame = frame_of(system)
         if frame is None or not frame.jacobi:
             raise ValueError(
                 f"`system` {system.name!r} has no planets in Jacobi's coordinates, which the flow needs: make it by "
