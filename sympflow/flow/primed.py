@@ -30,16 +30,7 @@ from sympflow.flow.flow_map import check_system
 from sympflow.flow.frozen import PrimedKnown
 from sympflow.flow.layers import Drift, Kick
 from sympflow.flow.potentials import Time
-from sympflow.flow.primed_potentials import (
-    CURVATURE,
-    FORCE_GRADIENT,
-    POTENTIAL,
-    PolynomialTerm,
-    PrimedDrift,
-    PrimedPotential,
-    Sum,
-    Term,
-)
+from sympflow.flow.primed_potentials import CURVATURE, FORCE_GRADIENT, POTENTIAL, PrimedDrift, PrimedPotential, Term
 from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Tables, columns_of
@@ -196,12 +187,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         substep = self.substeps[i]
         if substep.kind == "drift":
             return PrimedDrift(self.ndof, self._binding, substep.weight)
-        passed = Sum(tuple(s.weight for s in self.substeps[:i] if s.kind == "drift"))
+        passed = [s.weight for s in self.substeps[:i] if s.kind == "drift"]
         terms: list[tuple[Term, Entry]] = [(POTENTIAL, substep.weight)]
-        polynomial = PolynomialTerm(self.monomials, substep.more) if self.monomials else None
-        if polynomial is None:
+        if not self.monomials:
             terms += zip((FORCE_GRADIENT, CURVATURE), substep.more, strict=False)
-        return Kick(PrimedPotential(self.ndof, self._binding, terms, polynomial, passed))
+        return Kick(PrimedPotential(self.ndof, self._binding, terms, self.monomials, substep.more, passed))
 
     # the frozen tables --------------------------------------------------------------------------------------
 
