@@ -47,18 +47,9 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     A palindromic one has even polynomials b, γ, c, a, and its kernel reads the same backwards, which makes K
     time-reversible: continued to negative t by its formulas, K_{−t} = K_t⁻¹. With a processor ψ̄ is conjugate to it.
-    Without a system the flow has a `scheme`, but no values.
-
-    Attributes
-    ----------
-    kicks, drifts, gradients, curvatures : Coefficients, or None
-        b, a, γ and c of the kernel.
-    polynomials : ModuleList of Coefficients, or None
-        e_m, one column for each monomial.
-    processor_kicks, processor_drifts, processor_gradients, processor_curvatures, processor_polynomials
-        Those of χ, or None.
-    substeps : tuple of Substep
-        The maps in the order in which they are executed: χ⁻¹, K, χ.
+    Without a system the flow has a `scheme`, but no values. `kicks`, `drifts`, `gradients` and `curvatures` are the
+    `Coefficients` b, a, γ and c of the kernel, or None, `polynomials` the e_m, and `processor_kicks`, … those of χ;
+    `substeps` are the maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
     PLAN = "primed"
