@@ -107,8 +107,7 @@ def _integrated(
     """`odeint` by one of our methods, along a path."""
     if (rtol, atol) != (_RTOL, _ATOL):
         warn(
-            f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.",
-            UserWarning,
+            f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.", UserWarning
         )
     direction = _direction(t)
     integrator, system = _build(func, method, options)

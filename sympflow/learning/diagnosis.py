@@ -21,7 +21,7 @@ from typing import Self
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from sympflow.learning.lagrangian import lagrangian_start
+from sympflow.learning.lagrangian import lagrangian_start, least
 from sympflow.learning.library import Library, library_for, polynomials
 from sympflow.learning.models import Force, FreeField, Model, drags, frictions, turns
 from sympflow.learning.orbits import Field
@@ -131,7 +131,6 @@ class Reading:
     def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
         """LᵀJ + JL over twice JL, 0 for any H, at states (2d, n) in the order of the reading; the rate of volumes."""
         slopes = self.field.field(theta, states, True, False).slope
-        assert slopes is not None
         back = np.argsort(self.rows)
         slopes = slopes[np.ix_(back, back)]
         d = len(scales) // 2
@@ -165,11 +164,7 @@ def free_reading(scales: np.ndarray, degree: int) -> Reading:
 
 
 def best_by_increments(
-    data: Trajectories,
-    held: Trajectories,
-    models: Sequence[Model],
-    drives: Sequence[Drive] = (),
-    stop: Stop = never,
+    data: Trajectories, held: Trajectories, models: Sequence[Model], drives: Sequence[Drive] = (), stop: Stop = never
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
     """The place of the model that explains held-out increments best, a doubt, and the squares by places; or None."""
     scales, d = data.scales, data.ndof
@@ -224,11 +219,7 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
 
 
 def hint(
-    library: Library,
-    smooth: Smooth,
-    data: Trajectories,
-    force: Force | None = None,
-    drives: Sequence[Drive] = (),
+    library: Library, smooth: Smooth, data: Trajectories, force: Force | None = None, drives: Sequence[Drive] = ()
 ) -> str | None:
     """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
     d, scales = data.ndof, data.scales
@@ -257,13 +248,8 @@ def hint(
             left = Rest.of(other, v[:, pairs], scales[pairs]).squares
             found.append((left, 'The columns look like q1, p1, q2, p2, …: pass order="pairs".'))
         left, masses = _masses(library, x, v, scales, d)
-        said = " : ".join(f"{m:.3g}" for m in masses)
-        found.append(
-            (
-                left,
-                f"The second half looks like velocities, of masses {said}: pass velocity_mass=[…], by which p = M v.",
-            )
-        )
+        said = f"velocities, of masses {' : '.join(f'{m:.3g}' for m in masses)}"
+        found.append((left, f"The second half looks like {said}: pass velocity_mass=[…], by which p = M v."))
     share, frequencies = driven(X, smooth, scales, Drive(Polynomial.up_to(2, "q", scales[:d]), 1.0), drives)
     found.append((share * rest.squares, driven_by([*(drive.frequency for drive in drives), *frequencies])))
     least = min(found)[0]
@@ -295,7 +281,6 @@ def fields_of_drive(drive: Drive, smooth: Smooth) -> np.ndarray:
     """The fields (n, 2d, k) of the terms of a drive at the points of curves."""
     d = smooth.points.shape[1] // 2
     by = drive.at(smooth.times).gradient(np.zeros(drive.n), smooth.points.T[:d], False, True).by_parameters
-    assert by is not None
     forces = np.moveaxis(-by[:, :-1], -1, 0)
     return np.concatenate([np.zeros_like(forces), forces], axis=1)
 
@@ -345,9 +330,10 @@ def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Dr
     most = min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
     frequencies = np.pi / smooth.longest * np.arange(0.5, max(most, 2) / 2, 0.25)
     beside = Rest.of(X, smooth.slopes, scales)
-    pushes = drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
-    assert pushes is not None
-    pushes = pushes / scales[d:, None, None]
+    pushes = (
+        drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
+        / scales[d:, None, None]
+    )
     terms = np.einsum("ikn,ni->nk", pushes, beside.left.reshape(len(X), -1)[:, d:])
     power = np.abs(np.exp(-1j * frequencies[:, None] * smooth.times) @ terms) ** 2 / (pushes**2).sum(axis=(0, 2))
 
@@ -376,8 +362,7 @@ def driven(
     first, v, near = smooth.owner % 2 == 0, smooth.slopes, 0.5 * np.pi / smooth.longest
 
     def theirs(A: np.ndarray) -> float:
-        columns, lengths = _columns(A[first], scales)
-        c = np.linalg.lstsq(columns, (v[first] / scales).ravel(), rcond=1e-10)[0] / lengths
+        c = least((A[first] / scales[:, None]).reshape(-1, A.shape[2]), (v[first] / scales).ravel())
         return float(((((v - A @ c) / scales)[~first]) ** 2).sum())
 
     def beside(frequencies: Sequence[float]) -> np.ndarray:
@@ -412,9 +397,7 @@ def _masses(library: Library, x: np.ndarray, v: np.ndarray, scales: np.ndarray, 
     A = (np.concatenate([-V, -extra], 2) / scales[d:, None]).reshape(len(x) * d, -1)
     target = np.zeros((len(x), d))
     target[:, 0] = v[:, d]
-    lengths = np.linalg.norm(A, axis=0)
-    lengths[lengths == 0] = 1.0
-    theta = np.linalg.lstsq(A / lengths, (target / scales[d:]).ravel(), rcond=1e-10)[0] / lengths
+    theta = least(A, (target / scales[d:]).ravel())
     masses = np.concatenate([[1.0], theta[len(of_q) :]])
     force = -(V @ theta[: len(of_q)])
     with np.errstate(all="ignore"):

@@ -206,10 +206,8 @@ def _central(constraints: Constraints) -> Iterator[Candidate]:
         return
     bodies = np.arange(d)[None]
     for powers in POWERS:
-        yield Candidate(
-            f"{T}, V of the distance from the origin, {_of_powers(powers)}",
-            constraints.separated(Distances.between(bodies, powers, size, central=True)),
-        )
+        name = f"{T}, V of the distance from the origin, {_of_powers(powers)}"
+        yield Candidate(name, constraints.separated(Distances.between(bodies, powers, size, central=True)))
 
 
 def _of_powers(powers: Sequence[int]) -> str:
@@ -237,14 +235,8 @@ def _pairs(constraints: Constraints) -> Iterator[Candidate]:
 
 def _flows(constraints: Constraints) -> Iterator[Candidate]:
     scaling = constraints.flow_scaling
-    told = (
-        constraints.force
-        or constraints.frequencies
-        or constraints.known
-        or constraints.inverse_mass is not None
-        or constraints.angles
-    )
-    if scaling is None or told:
+    told = constraints.force or constraints.frequencies or constraints.known or constraints.angles
+    if scaling is None or told or constraints.inverse_mass is not None:
         return
     for pairs, width, palindromic in FLOW_SIZES:
         kind, all_pairs = ("palindromic SympFlow", 2 * pairs) if palindromic else ("SympFlow", pairs)

@@ -72,7 +72,6 @@ class Splitting(Stepper):
     def step(
         self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
     ) -> Any:
-        assert isinstance(model, Model)
         d = model.ndof
         q, p = slice(0, d), slice(d, 2 * d)
         wanted = X is not None, X is not None and X.shape[1] > 2 * d
@@ -140,11 +139,8 @@ class Gauss(Stepper):
             moved = np.abs(h * (new - K))
             change = float(moved.max(initial=0.0))
             K = new
-            if (
-                not math.isfinite(change)
-                or (moved <= near).all()
-                or (change >= before and change < 1e-9 * np.abs(x).max())
-            ):
+            rounding = change >= before and change < 1e-9 * np.abs(x).max()
+            if rounding or not math.isfinite(change) or (moved <= near).all():
                 break
             before = change
         end = x + h * np.einsum("j,mjn->mn", b, K)
@@ -153,7 +149,6 @@ class Gauss(Stepper):
         inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
         c = X.shape[1]
         f = model.field(theta, inner.reshape(m, s * N), True, c > m)
-        assert f.slope is not None
         S = np.broadcast_to(f.slope, (m, m, s * N)).reshape(m, m, s, N)
         rhs = np.einsum("klin,lcn->nikc", S, X, optimize=True)
         if f.by_parameters is not None:

@@ -16,11 +16,11 @@ STEEP = 5.0
 
 
 class Linear(NamedTuple):
-    """A function f(θ, x) of columns x (m, N) with its derivatives; None for those that were not asked for."""
+    """A function f(θ, x) of columns x (m, N) with its derivatives, None for those that were not asked for."""
 
     value: np.ndarray  # (m, N)
-    slope: np.ndarray | None = None  # (m, m, N): ∂f/∂x
-    by_parameters: np.ndarray | None = None  # (m, n, N): ∂f/∂θ
+    slope: Any = None  # (m, m, N): ∂f/∂x
+    by_parameters: Any = None  # (m, n, N): ∂f/∂θ
 
 
 Curvature = Iterable[tuple[tuple[int, int], Any, np.ndarray]]
@@ -86,7 +86,6 @@ class Part(ABC):
         """p = ∂L/∂v and p' = ∂L/∂q at q and v (d, N) for θ = 0, and their derivatives by θ (2d, n, N)."""
         x = {"q": q, "p": v, "y": np.concatenate([q, v])}[self.of]
         f = self.gradient(np.zeros(self.n), x, False, True)
-        assert f.by_parameters is not None
         return self._mechanics(f.value), self._mechanics(f.by_parameters)
 
     def _mechanics(self, slopes: np.ndarray) -> np.ndarray:
@@ -251,9 +250,7 @@ class Fixed(Part):
     @property
     def inverse_mass(self) -> np.ndarray:
         """M⁻¹ of a kinetic energy ½ pᵀM⁻¹p."""
-        slopes = self.part.gradient(self.theta, np.ones((self.part.width, 1)), True, False).slope
-        assert slopes is not None
-        return slopes[..., 0]
+        return self.part.gradient(self.theta, np.ones((self.part.width, 1)), True, False).slope[..., 0]
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         return self.part.value(self.theta, x)
@@ -559,9 +556,8 @@ class Drive(Part):
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         cos, sin = self._waves(theta)
         a, b = (self.base.gradient(part, x, slope, by_parameters) for part in np.split(theta[:-1], 2))
-        slopes = by = None
-        if a.slope is not None and b.slope is not None:
-            slopes = a.slope * cos + b.slope * sin
+        slopes = a.slope * cos + b.slope * sin if slope else None
+        by = None
         if a.by_parameters is not None:
             turned = self.times * (b.value * cos - a.value * sin)
             by = np.concatenate([a.by_parameters * cos, a.by_parameters * sin, turned[:, None]], axis=1)

@@ -418,15 +418,11 @@ def _gaps(data: Trajectories) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if np.isfinite(run.y[:, k]).all()
     ]
     if not found:  # never a whole state
-        found = [
-            (x, float(np.diff(run.t).max()), run.t[0]) for x, run in zip(first_states(data), data.runs, strict=True)
-        ]
+        firsts = zip(first_states(data), data.runs, strict=True)
+        found = [(x, float(np.diff(run.t).max()), run.t[0]) for x, run in firsts]
     gaps, times = np.array([one[1:] for one in found]).T
-    chosen = np.unique(
-        np.concatenate(
-            [np.argsort(gaps)[-STATES // 4 :], np.linspace(0, len(gaps) - 1, min(STATES, len(gaps))).astype(int)]
-        )
-    )
+    spread = np.linspace(0, len(gaps) - 1, min(STATES, len(gaps))).astype(int)
+    chosen = np.unique(np.concatenate([np.argsort(gaps)[-STATES // 4 :], spread]))
     return np.stack([found[i][0] for i in chosen], axis=1), gaps[chosen], times[chosen]
 
 
@@ -493,7 +489,6 @@ def _increments(
     """The increments less the integrals of the field, and minus their derivative by θ."""
     here = model.at(np.concatenate([run.t for run in pieces]))
     f = here.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)
-    assert f.by_parameters is not None
     at, rests, columns = 0, [], []
     for run in pieces:
         here = slice(at, at + run.n_points)

@@ -16,17 +16,7 @@ from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
-from sympflow.show.style import (
-    TEXT,
-    dress,
-    filled,
-    frame,
-    labelled,
-    legend_above,
-    method_styles,
-    new_figure,
-    save,
-)
+from sympflow.show.style import TEXT, dress, filled, frame, labelled, legend_above, method_styles, new_figure, save
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies.attempts import Attempt, Row, any_step
@@ -260,13 +250,7 @@ def _annotate(ax: Axes, points: Sequence[tuple[float, float, str]], styles: dict
         _, dx, dy, align, low = min(choices, key=lambda choice: choice[0])
         placed.append((low, low + size))
         ax.annotate(
-            label,
-            (x, y),
-            xytext=(dx, dy),
-            textcoords="offset points",
-            ha=align,
-            fontsize=8,
-            color=styles[label][0],
+            label, (x, y), xytext=(dx, dy), textcoords="offset points", ha=align, fontsize=8, color=styles[label][0]
         )
 
 
@@ -289,11 +273,7 @@ def _overlap(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.nda
 
 
 def portrait(comparison: Compared) -> Figure:
-    """Phase space, a panel for each method with the reference behind in grey.
-
-    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0 with q₁ increasing along the
-    run, on each method's own map. More: q₁ against q₂. Of a driven system the states after each period, q₁ against p₁.
-    """
+    """Phase space, a panel for each method with the reference in grey: (q, p), the section q₁ = 0, or q₁ against q₂."""
     system = comparison.system
     runs = [run for run in comparison.runs if run.sol is not None]
     rows = -(-len(runs) // 5)
@@ -311,16 +291,9 @@ def portrait(comparison: Compared) -> Figure:
     for k, (ax, run) in enumerate(zip(axes.flat, runs, strict=False)):
         points = _phase_points(comparison, run.sols[0].integrator)
         ax.plot(*truth.T, ".", color="#C8C8C8", ms=8 if system.ndof == 2 else 2.5, mew=0, zorder=1, rasterized=True)
-        ax.plot(
-            *points.T,
-            ".",
-            color=styles[run.row.label][0],
-            ms=2.2 if len(points) > 100 else 4,
-            mew=0,
-            zorder=2,
-            rasterized=True,
-        )
-        ax.set_title(filled(run.row.label, 2.2, 9), fontsize=9, color=styles[run.row.label][0])
+        colour, size = styles[run.row.label][0], 2.2 if len(points) > 100 else 4
+        ax.plot(*points.T, ".", color=colour, ms=size, mew=0, zorder=2, rasterized=True)
+        ax.set_title(filled(run.row.label, 2.2, 9), fontsize=9, color=colour)
         lowest = k + columns >= len(runs)  # nothing below it, or an empty place
         dress(ax, x_label if lowest else "", y_label if k % columns == 0 else "")
         ax.tick_params(labelbottom=lowest)
@@ -511,16 +484,8 @@ def section_figure(
     """Points (n, 2) of a section, each trajectory in a shade of its own."""
     figure = new_figure(4.6, 4.4)
     ax = figure.add_subplot()
-    ax.scatter(
-        points[:, 0],
-        points[:, 1],
-        c=trajectory,
-        cmap="viridis",
-        s=3.0,
-        linewidths=0,
-        vmax=max(1.15 * (n_trajectories - 1), 1),
-        rasterized=True,
-    )
+    shades: dict[str, Any] = {"c": trajectory, "cmap": "viridis", "vmax": max(1.15 * (n_trajectories - 1), 1)}
+    ax.scatter(points[:, 0], points[:, 1], s=3.0, linewidths=0, rasterized=True, **shades)
     frame(ax, points, 0.05)
     ax.set_title(filled(heading, 4.0, 9), fontsize=9, color=TEXT)
     dress(ax, *axes)

@@ -196,10 +196,7 @@ class Conditions:
         return measure_of(self.system)
 
     def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
-        """The solution from all initial states, or of a method that takes them one by one from a few.
-
-        Over another interval if that is given.
-        """
+        """The solution from all initial states, or of a method that takes them one by one from a few."""
         few = integrator.one_by_one and self.trajectories > SAMPLE
         y0 = self.y0[:SAMPLE] if few else self.y0
         times = self.t if t is None else t

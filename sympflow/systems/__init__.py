@@ -37,15 +37,7 @@ from sympflow.systems.textbook import (
     spring_pendulum,
 )
 from sympflow.systems.user_files import from_toml
-from sympflow.systems.waves import (
-    fput_beta,
-    grid,
-    nonlinear_schroedinger,
-    phi4,
-    sine_gordon,
-    toda_chain,
-    wave_equation,
-)
+from sympflow.systems.waves import fput_beta, grid, nonlinear_schroedinger, phi4, sine_gordon, toda_chain, wave_equation
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
