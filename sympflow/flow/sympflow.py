@@ -542,10 +542,10 @@ class SympFlow(FlowMap):
     def _kept_kernels(self) -> Kept[Any]:
         """The compiled loops of the numbers that the flow has now."""
         if self._network is None:
-            self._network = Kept(self._numbers())
+            self._network = Kept(self._kept_tensors())
         return self._network
 
-    def _numbers(self) -> Iterable[Mapping[str, Tensor | None]]:
+    def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
         """The tensors that compiled loops are made of, which they are compared with in every run."""
         return (d for m in self.modules() for d in (m._parameters, m._buffers))
 
@@ -670,7 +670,7 @@ class SystemFlow(SympFlow):
     def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)
 
-    def _numbers(self) -> Iterable[Mapping[str, Tensor | None]]:
+    def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
         return (self._buffers, *(m._parameters for m in self.modules()))  # the bases of columns are no numbers
 
     def _loops_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
