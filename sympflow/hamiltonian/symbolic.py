@@ -105,10 +105,7 @@ class SymbolicHamiltonian(Definition):
     _rest: SymbolicHamiltonian | None = None  # H without its impulses, where it has some
 
     def __init__(
-        self,
-        expression: str | sp.Expr,
-        params: Mapping[str, Any] | None = None,
-        time: str | sp.Symbol | None = None,
+        self, expression: str | sp.Expr, params: Mapping[str, Any] | None = None, time: str | sp.Symbol | None = None
     ) -> None:
         params = checked_params(params)
         self.time = self.named_time = named_time(time, params)
@@ -417,10 +414,7 @@ class SymbolicHamiltonian(Definition):
         return self._function(name + "'" * order, expressions, (_single, assemble, _square)[order])
 
     def _function(
-        self,
-        key: str,
-        expressions: Callable[[], list[sp.Expr]],
-        collect: Callable[[Sequence[Array], Array], Array],
+        self, key: str, expressions: Callable[[], list[sp.Expr]], collect: Callable[[Sequence[Array], Array], Array]
     ) -> Callable[..., Array]:
         """A function of an array (..., n), and of the time, generated for NumPy or torch when first called with one."""
         if key in self._functions:

@@ -250,7 +250,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
             warn(
                 f"`expression` has {symbols.ndof} coordinates: written out, H takes seconds to define, and a step ten "
                 "times as long as by HamiltonianSystem.lattice, from one site and one bond, or by "
-                "HamiltonianSystem.pairs, from one pair. Use one of these.",
+                "HamiltonianSystem.pairs, from one pair. Use one of these."
             )
         self = cls.__new__(cls)
         M = symbols.inverse_mass

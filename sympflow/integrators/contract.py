@@ -103,10 +103,7 @@ class Failure(Enum):
         "the star",
         "Follow the encounter with the splitting 'kinetic', such as method 'dop853' or 'srkn11b' with short steps",
     )
-    STALLED = (
-        "After {n_steps} steps time hardly advances any more, as before a collision",
-        "Raise `dt`",
-    )
+    STALLED = ("After {n_steps} steps time hardly advances any more, as before a collision", "Raise `dt`")
 
 
 class Interrupted(KeyboardInterrupt):
@@ -387,10 +384,7 @@ def forward_tangent(
 
 
 def differentiated(
-    jacobian: Callable[[Any, np.ndarray, np.ndarray], np.ndarray],
-    times: np.ndarray,
-    states: Array,
-    lengths: np.ndarray,
+    jacobian: Callable[[Any, np.ndarray, np.ndarray], np.ndarray], times: np.ndarray, states: Array, lengths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A chunk of `steps` as times and lengths (n, ...) and Jacobians (n, ..., k, k).
 

@@ -16,16 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import (
-    Array,
-    differentiable,
-    full_of_nan,
-    is_tensor,
-    readable,
-    stack,
-    to_numpy,
-    transformed,
-)
+from sympflow.arrays import Array, differentiable, full_of_nan, is_tensor, readable, stack, to_numpy, transformed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
 from sympflow.integrators.contract import (
