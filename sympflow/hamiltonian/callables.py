@@ -57,14 +57,7 @@ class CallableHamiltonian(Definition):
     _hamiltonian: Any
 
     def __init__(
-        self,
-        ndof: int,
-        potential: Callable[..., Array] | None,
-        hamiltonian: Callable[..., Array] | None,
-        gradient: Callable[..., Any] | None,
-        hessian_vector: Callable[..., Any] | None,
-        check: bool = True,
-        timed: bool = False,
+        self, ndof: int, potential: Any, hamiltonian: Any, gradient: Any, hessian_vector: Any, check: Any, timed: bool
     ) -> None:
         check_flag("check", check)
         if (potential is None) == (hamiltonian is None):

@@ -23,16 +23,6 @@ from sympflow.compiler.program import CONDITIONS, Program, Recording, Traced, gr
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = [
-    "Formula",
-    "TracedDriving",
-    "TracedHamiltonian",
-    "TracedLetters",
-    "TracedPoles",
-    "Variable",
-    "evaluator",
-    "recorded",
-]
 
 MOST_IN_SYMBOLS = 300  # operations
 _JUMPING = {"sign", "floor", "mod", "where", "lt", "le", "eq", "atan2"}

@@ -14,7 +14,6 @@ from sympflow.arrays import Array, like, stack
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
-__all__ = ["MOST_MONOMIALS", "Monomials", "in_monomials", "monomials"]
 
 MOST_MONOMIALS = 60
 MOST_MIRRORED = 6  # coordinates of which all combinations of signs are tried

@@ -13,8 +13,7 @@ from sympflow.arrays import Array, concatenate, library
 from sympflow.arrays import like as as_like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.scene import Scene
-from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
+from sympflow.hamiltonian.system import HamiltonianSystem, Parameters, Scene
 from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
