@@ -7,6 +7,7 @@ import math
 import os
 import reprlib
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -355,3 +356,19 @@ def naming_path(path: Path) -> Iterator[None]:
     except OSError as error:
         why = error.strerror or type(error).__name__
         raise ValueError(f"`path` {str(path)!r} cannot be written ({why}): name a file that can be.") from error
+
+
+def put_file(path: Path, content: bytes, durable: bool = True) -> None:
+    """Write a file beside its place and move it there in one step; `durable` once the disk has it."""
+    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".new-")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        os.chmod(unfinished, 0o644)
+        os.replace(unfinished, path)
+    except BaseException:
+        Path(unfinished).unlink(missing_ok=True)
+        raise

@@ -101,14 +101,14 @@ class Equations:
             rows, rest = self._stacked(rows / self.scales[..., None]), (rest / self.scales).ravel()
             wide = np.concatenate([likely, np.zeros((len(likely), self.model.forces))], axis=1)
             J, right = np.concatenate([wide, rows]), np.concatenate([right, -rest])
-            theta = _least(J, right)
+            theta = least(J, right)
             return theta, right - J @ theta, J
-        theta[: self.n] = _least(likely, right)  # p = v
+        theta[: self.n] = least(likely, right)  # p = v
         left, J = self._left(theta)
         forces = np.arange(self.model.n) >= self.n  # first those alone
         forces[: self.n] = ~self.by_mass[1].any(axis=(0, 1, 3))
         for attempt in range(STEPS):
-            step = _least(J if attempt else J * forces, -left)
+            step = least(J if attempt else J * forces, -left)
             for _ in range(HALVINGS):
                 after, K = self._left(theta + step)
                 if after @ after < left @ left:
@@ -176,7 +176,7 @@ class Equations:
         return whole[:, 0], np.concatenate([whole[:, 1:], self._along(np.zeros_like(pushes), pushes)], axis=1)
 
 
-def _least(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
+def least(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The solution of least squares, its columns in their lengths; the shortest where there are many."""
     lengths = np.linalg.norm(rows, axis=0)
     lengths[lengths == 0] = 1.0

@@ -118,15 +118,10 @@ def extended_system(system: HamiltonianSystem) -> HamiltonianSystem | None:
     d, time = system.ndof, symbols.time
     s = _symbol(f"q{d + 1}", time)
     H, values = symbols.written
-    return HamiltonianSystem.from_sympy(
-        H.xreplace({time: time + s}),
-        params={symbol.name: system.params[symbol.name] for symbol in values},
-        time=time,
-        name=f"{system.name} with the work of the drive",
-        y0=np.zeros(2 * d + 2),
-        t_span=system.t_span,
-        dt=system.dt,
-    )
+    params = {symbol.name: system.params[symbol.name] for symbol in values}
+    scene: dict[str, Any] = {"y0": np.zeros(2 * d + 2), "t_span": system.t_span, "dt": system.dt}
+    scene["name"] = f"{system.name} with the work of the drive"
+    return HamiltonianSystem.from_sympy(H.xreplace({time: time + s}), params=params, time=time, **scene)
 
 
 def _symbol(name: str, like: sympy.Symbol) -> sympy.Symbol:

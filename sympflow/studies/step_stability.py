@@ -189,16 +189,8 @@ def initial_states(system: HamiltonianSystem, y0: ArrayLike | None) -> np.ndarra
     if given.ndim == 2:
         return given
     system = started(system, given)
-    times = system.dt * np.array(PHASES)
-    sol = solve(
-        system,
-        "dop853",
-        (0.0, float(times[-1])),
-        given,
-        t_eval=times,
-        rtol=1e-11,
-        atol=1e-13 * smallest_size(system, given),
-    )
+    times, atol = system.dt * np.array(PHASES), 1e-13 * smallest_size(system, given)
+    sol = solve(system, "dop853", (0.0, float(times[-1])), given, t_eval=times, rtol=1e-11, atol=atol)
     return sol.states if sol.success and np.isfinite(sol.y).all() else given[None]
 
 
@@ -316,19 +308,16 @@ class Study:
                 for y in ([y0] if together else list(y0))
             ]
 
+    @property
+    def named(self) -> dict[str, Any]:
+        """The system, its first parameter, the method and the precision, as fields of rows and limits."""
+        parameter, value = next(iter(self.system.params.items()), (None, None))
+        own = {"method": self.candidate.method, "label": self.candidate.label, "dtype": self.dtype}
+        return {"system": self.system.title, "parameter": parameter, "value": value, **own}
+
     def attempt(self, h: float | None, span: tuple[float, float]) -> Attempt:
         """Run all initial states with one step; the row has the largest energy error, and the status."""
-        params = self.system.params
-        row = Row(
-            self.system.title,
-            self.candidate.method,
-            self.candidate.label,
-            parameter=next(iter(params), None),
-            value=next(iter(params.values()), None),
-            dtype=self.dtype,
-            t_end=self.span(h)[1],
-        )
-        one = Attempt(self.candidate, row)
+        one = Attempt(self.candidate, Row(**self.named, t_end=self.span(h)[1]))
         one.run(lambda _: self.runs(self.with_step(h), h, span))
         one.fill(dt=h)
         if one.sol is not None:
@@ -352,10 +341,7 @@ class Study:
         )
 
     def stable(self, h: float) -> tuple[bool, float]:
-        """Tell whether all runs with this step stay below the bound and in a flow's domain, and their largest error.
-
-        Most unstable steps show in the first `min_steps` of them.
-        """
+        """Tell whether all runs with this step stay below the bound and in a flow's domain, and their largest error."""
         self.say(f"longest stable step: dt = {h:.6g}")
         t0, t1 = span = self.span(h)
         if abs(t1 - t0) > 4 * h * self.min_steps:
@@ -446,18 +432,7 @@ MEASURES: dict[str, Metric] = {
 
 @dataclass(frozen=True)
 class BlowUp:
-    """The end of a run that could not go on.
-
-    Attributes
-    ----------
-    time : float
-        Of the singularity, as `solve` estimates it; or of the last finite state, where there is none.
-    singular : bool
-        True if the solution itself becomes infinite.
-    growth : float or None
-        Else the factor by which ‖y‖ grew with each step, the median over the last steps before the overflow; None for
-        an adaptive method, whose steps differ.
-    """
+    """The end of a run that could not go on, and the factor by which ‖y‖ grew with each of its last steps."""
 
     time: float
     singular: bool
@@ -538,36 +513,18 @@ def step_limit(study: Study, rows: Sequence[Row]) -> StepLimit:
     error = None
     if low is not None:
         error = study.stable(low / PRECISION if study.known else low)[1]
-    c, params, linear = study.candidate, study.system.params, study.linear
-    return StepLimit(
-        study.system.title,
-        next(iter(params), None),
-        next(iter(params.values()), None),
-        c.method,
-        c.label,
-        study.dtype,
-        low,
-        high,
-        error,
-        reached,
-        None if study.small is None else study.small.fastest,
-        None if linear is None or not linear.windows else linear.limit,
-        () if linear is None or study.small is None or study.small.equilibrium is None else linear.intervals,
-    )
+    linear, small = study.linear, study.small
+    found: dict[str, Any] = {"stable": low, "unstable": high, "energy_error": error, "reached": reached}
+    found["frequency"] = None if small is None else small.fastest
+    found["linear"] = None if linear is None or not linear.windows else linear.limit
+    if linear is not None and small is not None and small.equilibrium is not None:
+        found["intervals"] = linear.intervals
+    return StepLimit(**study.named, **found)
 
 
 @dataclass
 class Search:
-    """The search for the first step that is unstable.
-
-    Attributes
-    ----------
-    study : Study
-    bad : list of float
-        Steps that are known to be unstable.
-    found : dict
-        What was found, stable or not, for each step that was tried.
-    """
+    """The search for the first step that is unstable."""
 
     study: Study
     bad: list[float]
@@ -815,24 +772,9 @@ class StabilityReport(Report):
         ]
 
     def _columns(self) -> list[Column]:
-        rows = self.rows
-        drifts = [
-            "" if r.energy_drift is None else f"{number(r.energy_drift)} ± {number(r.energy_drift_error, 1)}"
-            for r in rows
-        ]
-        ends = ["" if r.blow_up is None else f"{r.blow_up:.6g}{' (singular)' if r.singular else ''}" for r in rows]
-        return [
-            *self._names(rows),
-            Column("step", [plain(r.dt) for r in rows]),
-            Column("steps", [f"{r.n_steps:,}" if r.n_steps else "" for r in rows]),
-            Column("energy error", [number(r.energy_error) for r in rows]),
-            Column("drift per unit t", drifts),
-            Column("blow-up at t", ends),
-            Column("leaves domain at t", [plain(r.domain_exit) for r in rows]),
-            Column("volume error", [number(r.volume_error) for r in rows]),
-            Column("sympl. defect", [number(r.symplecticity_defect) for r in rows]),
-            Column("status", [r.status for r in rows], left=True),
-        ]
+        titles = ("step", "steps", "energy error", "drift per unit t", "blow-up at t", "leaves domain at t")
+        more = ("volume error", "sympl. defect", "status")
+        return [*self._names(self.rows), *attempts.columns(self.rows, titles + more, {"blow-up at t": _end})]
 
     def _names(self, rows: Sequence[Row | StepLimit]) -> list[Column]:
         several = len(self.systems) > 1
@@ -842,6 +784,10 @@ class StabilityReport(Report):
             Column("method", [r.label for r in rows], left=True),
             Column("dtype", [r.dtype if len(precisions) > 1 else "" for r in rows], left=True),
         ]
+
+
+def _end(row: Row) -> str:
+    return "" if row.blow_up is None else f"{row.blow_up:.6g}{' (singular)' if row.singular else ''}"
 
 
 def _intervals(intervals: Sequence[tuple[float, float]]) -> str:
