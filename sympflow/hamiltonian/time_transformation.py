@@ -110,7 +110,7 @@ def default_shift(system: HamiltonianSystem) -> float:
 @lately_kept
 def _energy(system: HamiltonianSystem, y0: bytes) -> float:
     """H at the system's y0, kept: every run asks for it several times."""
-    return float(system.hamiltonian(np.frombuffer(y0)))
+    return float(system.hamiltonian(np.frombuffer(y0).copy()))
 
 
 def checked_shift(shift: Any) -> float:
