@@ -123,9 +123,6 @@ class TableRun(SearchRun):
                 slope = energy_slope(system, labels, options.energy_weight)
                 self._fit_frozen(labels, slope)
         if options.residual_weight or options.matching_weight or data is not None:
-            system.check_autonomous(
-                "and losses at points compare a table at no time of it", "fit it to labels, loss='labels'"
-            )
             rest = options.label_weight if data is not None else 0.0
             loss = Loss(system, scaling, options.residual_weight, options.matching_weight, rest)
             shape = (flow.dt, options.loss_points, options.matching_times, options.seed, flow.dtype, flow.device)
