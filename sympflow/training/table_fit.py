@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from scipy.linalg import null_space
 
+from sympflow.arguments import warn
 from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
@@ -192,7 +192,7 @@ class TableRun(SearchRun):
         late = self.whole_end.over()
         if late or not tables:
             reason = "the time was up" if late else "those of the flow do not stay finite: take a shorter `dt`"
-            warnings.warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning, stacklevel=8)
+            warn(f"The flow was not fitted to `runs`, because {reason}.", RuntimeWarning)
             self.runs = None
             return False
         common = both, min(self.most_steps, RUN_STEPS), self.whole_end, False
@@ -283,12 +283,11 @@ class TableRun(SearchRun):
         self.kept_start = True
         if session.interruption.asked or after < CLOSE * before:  # as when a fit is fitted again
             return self.at_start
-        warnings.warn(
+        warn(
             f"The fit has a larger held-out error ({after:.1e}, in units of the spread of `domain`) than the flow that "
             f"it started from ({before:.1e}), which is returned: its data are too few, too far from Δt, or not of this "
             "system; or H is singular in `domain`, nearly so, or has a kink: shrink that.",
             RuntimeWarning,
-            stacklevel=7,
         )
         return self.at_start
 
