@@ -97,10 +97,7 @@ class Entries:
 
 
 class TracedHamiltonian:
-    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols.
-
-    The program is V of q, if it is `separable`, or H of q and p; of a driven system the time comes first.
-    """
+    """The form of a system of Python functions, as `SymbolicHamiltonian` is that of a system of symbols."""
 
     parameters: tuple[Variable, ...] = ()
     values: tuple[float, ...] = ()

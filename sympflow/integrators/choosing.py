@@ -113,10 +113,7 @@ def _flow_holds(system: HamiltonianSystem, y0: Array, tol: float | None) -> bool
 
 @lately_kept
 def _attractive_pole(system: HamiltonianSystem, states: bytes) -> tuple[str, bool]:
-    """A place towards which V falls without bound from all positions, in words; True if like a power where V < 0.
-
-    Such places are q = 0 and those where an expression of H vanishes that is next to them.
-    """
+    """A place towards which V falls without bound from all positions, in words; True if like a power where V < 0."""
     if not system.definition.poles or (system.local is not None and system.written is None):
         return "", False
     q = np.frombuffer(states).reshape(-1, 2 * system.ndof)[:, : system.ndof]

@@ -78,11 +78,7 @@ def diagnose(
     action: str,
     interrupted: bool,
 ) -> None:
-    """Look at the outcome of a run: what it shows ends it, is added to its message, or is warned of.
-
-    These are poles that it passed, terms of H that cancel, when the solution becomes infinite, singularities over which
-    it leapt, functions that do not fit, a flow of another system, its domain, and steps that are too long.
-    """
+    """Look at the outcome of a run: what it shows ends it, is added to its message, or is warned of."""
     system, y0 = problem.system, problem.y0
     if not interrupted:
         diagnose_piece(outcome, integrator, problem, rows)
@@ -313,14 +309,7 @@ def _end(
 
 
 def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Problem) -> None:
-    """Warn of what a method doubts, and of fixed steps with which the energy is off by `TOO_LONG` of its size.
-
-    Where energy is not kept, the motion at the start and the end must not be too fast for the step.
-
-    H is evaluated at the start and a few outputs, of large systems at one for every 200 steps, and not in runs of few
-    steps that are not long, which would take twice the time. Its size is the largest of ½ Σ|y_i ∂H/∂y_i| there, that
-    of an oscillator.
-    """
+    """Warn of what a method doubts, and of fixed steps with which the energy is off by `TOO_LONG` of its size."""
     if not isinstance(integrator, FixedStep):
         return
     system, n, n_steps = problem.system, len(outcome.t), outcome.stats.get("n_steps", 0)
