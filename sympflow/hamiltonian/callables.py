@@ -130,7 +130,7 @@ class CallableHamiltonian(Definition):
         return found
 
     @cached_property
-    def poles(self) -> TracedPoles | None:  # type: ignore[override]
+    def poles(self) -> TracedPoles | None:
         return None if self.form is None else TracedPoles(self.form) or None
 
     @cached_property

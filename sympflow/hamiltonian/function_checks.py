@@ -77,8 +77,8 @@ class Tested:
 
     names: tuple[str, str, str]  # of the functions, and of the state, in messages
     value: Callable[[Array], Array]
-    gradient: Callable[[Array], Array] | None  # None of an exact one, of a function that was traced
-    hessian_vector: Callable[[Array, Array], Array] | None = None
+    gradient: Any  # None of an exact one, of a function that was traced
+    hessian_vector: Any = None
     automatic: bool = False  # the gradient is an automatic one
     parts: int = 1  # 2 if x is [q, p], two halves of sizes of their own
     result_types: Callable[[Array], list[tuple[str, Any]]] | None = None  # in which the user's own functions answer
@@ -293,8 +293,6 @@ def _refuse(functions: Tested, state: Array, k: int, given: float, found: float,
 
 
 def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
-    assert functions.hessian_vector is not None
-    assert functions.gradient is not None
     name = "hessian_vector"
     v, claimed = _products(functions, x, own=False)
     if claimed.shape != g.shape:
@@ -319,7 +317,6 @@ def _check_hessian_vector(functions: Tested, x: Array, g: np.ndarray) -> None:
 
 def _products(functions: Tested, x: Array, own: bool) -> tuple[np.ndarray, np.ndarray]:
     """One random direction at each state, and the given products of the Hessian with them, (N, n) each."""
-    assert functions.hessian_vector is not None
     v = _directions(_numbers(x), None, 1, own)[:, 0]
     vectors = like(v, x)
     return v, np.stack([_numbers(functions.hessian_vector(x[i], vectors[i])) for i in range(len(x))])

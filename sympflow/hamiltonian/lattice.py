@@ -178,7 +178,7 @@ class LatticeHamiltonian(LocalHamiltonian):
         return [size * x for x in kept]
 
     @cached_property
-    def poles(self) -> Poles | None:  # type: ignore[override]
+    def poles(self) -> Poles | None:
         return LatticePoles(self) or None
 
     def remark(self, q: np.ndarray) -> str:

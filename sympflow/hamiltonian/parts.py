@@ -83,9 +83,7 @@ class ExactParts:
     `rest` are the parts 1, 2, …; `sequence` is the order of a splitting, the last innermost: kicks outside by default.
     """
 
-    def __init__(
-        self, linear: LinearPart | None, rest: Sequence[Any], ndof: int, sequence: Sequence[int] | None = None
-    ) -> None:
+    def __init__(self, linear: Any, rest: Sequence[Any], ndof: int, sequence: Sequence[int] | None = None) -> None:
         self.linear, self.rest, self.ndof = linear, tuple(rest), ndof
         self.sequence = tuple(range(1, len(self.rest) + 1)) + (LINEAR,) * (linear is not None)
         if sequence is not None:
@@ -199,12 +197,10 @@ class ExactParts:
         return [replace(m, length=self._shears(m.length, X)) if m.part == LINEAR else m for m in maps]
 
     def _shears(self, s: Any, X: Array) -> tuple[Array, Array, Array, Array]:
-        assert self.linear is not None
         return shears(self.linear.kinds, like(self.linear.rates, X), self.by_class(like(s, X)))
 
     def linear_energies(self, X: Array, Y: Array) -> Array:
         """Energy of the linear part in each frequency: (..., F)."""
-        assert self.linear is not None
         sign = {"oscillator": 1.0, "hyperbolic": -1.0, "free": 0.0, "idle": 0.0}
         squares = like(np.array([sign[k] for k in self.linear.kinds]), X) * X * X + Y * Y
         energies = like(self.linear.rates, X) * squares / 2
@@ -228,7 +224,6 @@ class ExactParts:
     def force_gradient(self, part: int, X: Array, filters: Array | None, *t: Any) -> Array:
         """½ ∇|∇U|²_{M⁻¹} of U(X) = H_k(c + C φ X): (..., d)."""
         functions, d, linear = self.rest[part - 1], self.ndof, self.linear
-        assert linear is not None
         y = self._state(part, X, 0 * X, filters)
         phi = 1.0 if filters is None else self.by_class(like(filters, X))
         v = self.inverse_masses(X) * phi * linear.slopes(functions.gradient(y, *t)[..., :d])
@@ -237,7 +232,6 @@ class ExactParts:
 
     def inverse_masses(self, X: Array) -> Array:
         """The diagonal M⁻¹ of the modes: Ω of each."""
-        assert self.linear is not None
         return like(self.linear.rates, X)
 
     def _state(self, part: int, X: Array, Y: Array, filters: Array | None) -> Array:
@@ -366,11 +360,9 @@ def _detected(system: HamiltonianSystem) -> ExactParts:
     import sympy as sp
 
     symbols = system.written
-    assert symbols is not None
     try:
         linear = linear_part(system)
         rest = linear.potential
-        assert rest is not None
     except ValueError:
         linear, rest = None, symbols.H
     if _groups(rest, symbols) is None:
@@ -413,7 +405,6 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
     import sympy as sp
 
     symbols = system.written
-    assert symbols is not None
     parts = [_parsed(expression, system) for expression in expressions]
     difference = sp.expand(sp.Add(*parts) - symbols.H)
     probes = np.random.default_rng(0).uniform(0.3, 0.9, (8, 2 * system.ndof))
@@ -446,7 +437,6 @@ def _given(system: HamiltonianSystem, expressions: tuple[str, ...]) -> ExactPart
 def _parsed(expression: str, system: HamiltonianSystem) -> sp.Expr:
     """A part in the symbols q1 … pd of the system."""
     symbols = system.written
-    assert symbols is not None
     if not isinstance(expression, str):
         raise ValueError(f"`parts` must be expressions as text; got {expression!r}.")
     words, time = set(re.findall(r"[A-Za-z_]\w*", expression)), symbols.time

@@ -443,7 +443,6 @@ class MollifiedLinearRest(LinearRest):
     label = "mollified"
 
     def filters(self, h: Any) -> Any:
-        assert self.parts.linear is not None
         for part in self.parts.rest:
             if part.turns:
                 raise ValueError(
@@ -462,7 +461,6 @@ class MidpointLinearRest(LinearRest):
 
     def times(self, s: Any) -> Any:
         parts = self.parts
-        assert parts.linear is not None
         times = _each_class(s, parts)
         kinds = [parts.linear.kinds[j] for j in parts.linear.representatives]
         rates = like(parts.linear.rates[parts.linear.representatives], times)

@@ -117,7 +117,6 @@ def note_poles(outcome: Outcome, integrator: Integrator, problem: Problem, value
     poles, width, n = problem.system.definition.poles, 2 * problem.system.ndof, len(outcome.t)
     numbers: Sequence[Any] = ()
     if problem.parameter_values is not None:
-        assert problem.system.symbols is not None
         poles, numbers = problem.system.symbols.parametric.poles, [*problem.parameter_values]
     if poles is None or not poles.watched or not n:
         return False
