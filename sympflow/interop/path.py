@@ -50,7 +50,8 @@ class Path:
         self.driven = system is not None and not system.autonomous
         self.start = t0.to(torch.float64)
         self.t0: Any = 0.0 if not self.driven else self.start if differentiable(t0) else float(t0)
-        self.eager = self._learns() or differentiable(self.t0)
+        learns = system is not None and system.definition.learns(y0)  # True if torch follows numbers of H
+        self.eager = learns or differentiable(*self.weights(), self.t0)
 
     def __call__(self, s: Tensor) -> Tensor:
         """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction."""
@@ -134,12 +135,6 @@ class Path:
     def _plain(self, y: Tensor) -> bool:
         """True if NumPy may step y: on the CPU, and with nothing that torch follows, of the state or of weights."""
         return not (self.eager or differentiable(y)) and y.device.type == "cpu"
-
-    def _learns(self) -> bool:
-        """True if torch follows numbers of the map: the weights of the flow, or those of H."""
-        if differentiable(*self.weights()):
-            return True
-        return self.system is not None and self.system.definition.learns(self.y0)
 
     def weights(self) -> list[Tensor]:
         """The weights of the flow, if there is one."""

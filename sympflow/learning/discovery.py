@@ -216,7 +216,7 @@ class Discovery:
         parts: list[str] = []
         for f, c, error in zip(self.terms, self.coefficients, self.errors, strict=True):
             sign = "- " if c < 0 else "+ " if parts else ""
-            parts.append(f"{sign}{rounded(abs(c), error)}*{_in_product(f)}")
+            parts.append(f"{sign}{rounded(abs(c), error)}*{f'({f})' if f.is_Add else f}")
         return " ".join(parts)
 
     def table(self) -> str:
@@ -801,10 +801,6 @@ def _in_order(terms: tuple[sp.Expr, ...], theta: Any, errors: Any, *more: Any) -
 def _residual(cost: float, freedom: int) -> float:
     """The root mean square of the residuals over the noise."""
     return math.sqrt(cost / max(freedom, 1))
-
-
-def _in_product(f: sp.Expr) -> str:
-    return f"({f})" if f.is_Add else str(f)
 
 
 def rounded(value: float, error: float) -> str:

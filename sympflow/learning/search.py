@@ -317,7 +317,7 @@ class Search:
         worse, best = 0, None
         for candidate in candidates:
             over = self.best is not None and (self.best[2].exact or setting.stop())
-            if over or worse == 2 or not self._affords(candidate):
+            if over or worse == 2 or self.numbers <= candidate.model.n:
                 return
             made = self._try(candidate, setting, session)
             better = best is None or fitting.gains(best[2], made[2])
@@ -332,10 +332,6 @@ class Search:
                 break
             found = fewer
         return [candidate] if found is candidate else [found, candidate]
-
-    def _affords(self, candidate: Candidate) -> bool:
-        """True if there are more numbers than the model and the initial states have."""
-        return self.numbers > candidate.model.n
 
     def _fit(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
         numbers = self.done.get(candidate.name)

@@ -177,18 +177,14 @@ def _windows(p: Polynomial, points: list[Decimal], values: list[Decimal]) -> tup
             if start is None and (u - level) * level <= 0 < (v - level) * level:  # leaves through this level
                 start, peak = _crossing(p, level, a, b), abs(v)
             elif start is not None and (v - level) * level <= 0 < (u - level) * level:  # comes back
-                windows.append(_window(start, _crossing(p, level, a, b) if v != level else b, peak))
+                stop, growth = _crossing(p, level, a, b) if v != level else b, peak + (peak * peak - 1).sqrt()
+                windows.append(Window(math.sqrt(start), math.sqrt(stop), float(growth)))
                 start = None
         if start is not None:
             peak = max(peak, abs(v))
     if start is not None:
         windows.append(Window(math.sqrt(start), math.inf, math.inf))
     return tuple(windows)
-
-
-def _window(start: Decimal, stop: Decimal, peak: Decimal) -> Window:
-    growth = peak + (peak * peak - 1).sqrt()
-    return Window(math.sqrt(start), math.sqrt(stop), float(growth))
 
 
 # polynomials ----------------------------------------------------------------------------------------------------------
