@@ -67,7 +67,7 @@ class Hamiltonian:
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self.name = name
         self.definition = definition
-        self.symbols: SymbolicHamiltonian | None = definition.symbols
+        self.symbols: Any = definition.symbols
         self.ndof: int = definition.ndof
         self.separable: bool = definition.separable
         self.inverse_mass = inverse_mass
@@ -479,7 +479,7 @@ class Hamiltonian:
         return recorded([form.H], (*times, *form.q, *form.p))
 
     @property
-    def written(self) -> SymbolicHamiltonian | None:
+    def written(self) -> Any:
         """The symbolic definition, or that of a few bodies or a traced function, written when asked for; else None."""
         if self.local is not None:
             return self.local.written

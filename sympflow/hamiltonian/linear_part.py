@@ -68,7 +68,7 @@ class LinearPart(NormalModes):
     inverse_mass: np.ndarray  # B (d, d), symmetric positive semidefinite
     stiffness_matrix: np.ndarray  # K (d, d), symmetric
     center: np.ndarray  # c (d,): where the forces along stiff directions vanish, of a system given by functions
-    potential: sp.Expr | None = None  # U(q), what V has beside the quadratic part, if the system is symbolic
+    potential: Any = None  # U(q), what V has beside the quadratic part, if the system is symbolic
     interval: float = 0.0  # length of the system's default interval
 
     dense: ClassVar[bool] = True

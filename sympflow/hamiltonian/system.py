@@ -599,8 +599,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
         if isinstance(domain, LatticeStates):
             return domain
-        states = self.y0 if domain is None else domain.sample(DRAWN)
-        assert states is not None
+        states: Any = self.y0 if domain is None else domain.sample(DRAWN)
         return LatticeStates.of_states(self, states)
 
     @cached_property
@@ -822,7 +821,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if self.local is not None:
             return HamiltonianSystem._of_local(self.local.with_params(values), self.damping, self.scene)
         self.check_parameters(values)
-        assert self.symbols is not None
         H, time = self.symbols.written[0], self.symbols.named_time
         params = {**self.params, **values}
         made = HamiltonianSystem.from_sympy(H, params=params, time=time, damping=self.damping, **vars(self.scene))
@@ -962,7 +960,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
         if 0 < len(H) <= TYPESET:
             import sympy
 
-            formula = "H = " + sympy.latex(self.symbols.H)  # type: ignore[union-attr]
+            formula = "H = " + sympy.latex(self.symbols.H)
         facts = {
             "H": "" if formula else H,
             "parameters": parameters_text(self.params, GREEK, " = "),

@@ -138,8 +138,8 @@ class SplitProblem(Problem):
         unit = np.where(spread > 0, spread, 1.0)
         linear, d = self.parts.linear, self.parts.ndof
         for j in range(d if linear is not None else 0):
-            if linear.kinds[j] == "oscillator" and energy > 0:  # type: ignore[union-attr]
-                unit[[j, d + j]] = math.sqrt(energy / linear.rates[j])  # type: ignore[union-attr]
+            if linear.kinds[j] == "oscillator" and energy > 0:
+                unit[[j, d + j]] = math.sqrt(energy / linear.rates[j])
         return unit
 
     def _joined(self, half: Callable[[Column, int], Any]) -> np.ndarray:
