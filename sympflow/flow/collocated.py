@@ -20,14 +20,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from sympflow.arguments import floats, plain
+from sympflow.arguments import checked_count, floats, plain
 from sympflow.arrays import per_state
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time
-from sympflow.flow.records import Refused, checked_integer
+from sympflow.flow.records import checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import checked_device, checked_dtype
 from sympflow.hamiltonian import collocation
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -46,13 +45,9 @@ TOLERANCE = 1e-10
 class CollocationLayer(OwnLayer):
     """One step χ_{t/m} of a Gauss method."""
 
-    kind = "collocation"
-
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._step(t / self.flow.steps, q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._step(-t / self.flow.steps, q, p)
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        h = (-t if back else t) / self.flow.steps
+        return self.flow.ended(y, self.flow.stages_of(y, h)[0], h)
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         flow, y, h = self.flow, torch.cat([q, p]).T, -t / self.flow.steps
@@ -60,20 +55,8 @@ class CollocationLayer(OwnLayer):
         K, _ = flow.stages_of(y, h)  # of the way back, whose stages are those of the step
         A = torch.as_tensor(flow.tableau[0], dtype=y.dtype, device=y.device)
         mean = (flow.weights * flow.bound_system.hamiltonian(y[:, None, :] + A @ K)).sum(-1)
-        return (*_halves(flow.ended(y, K, h).T), mean / flow.steps)
-
-    def _step(self, h: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        y = torch.cat([q, p]).T
-        return _halves(self.flow.ended(y, self.flow.stages_of(y, h)[0], h).T)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind}
-
-
-def _halves(y: Tensor) -> tuple[Tensor, Tensor]:
-    """The q and p of columns (2d, N)."""
-    q, p = y.chunk(2)
-    return q, p
+        q, p = flow.ended(y, K, h).T.chunk(2)
+        return q, p, mean / flow.steps
 
 
 class CollocatedFlow(SystemFlow):
@@ -109,6 +92,7 @@ class CollocatedFlow(SystemFlow):
     """
 
     takes_friction = True
+    PLAN = "collocated"
     MADE = "made of steps with the H of a system"
 
     def __init__(
@@ -121,17 +105,16 @@ class CollocatedFlow(SystemFlow):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(ndof, dt, system)
-        self.stages, self.steps = _count("stages", stages, MOST_STAGES), _count("steps", steps, MOST_STEPS)
+        super().__init__(ndof, dt, dtype, device)
+        self.stages = checked_count("stages", plain(stages), 1, MOST_STAGES, f"an integer from 1 to {MOST_STAGES}")
+        self.steps = checked_count("steps", plain(steps), 1, MOST_STEPS, f"an integer from 1 to {MOST_STEPS}")
         self.tableau = collocation.gauss_legendre(self.stages)
         _, B, scale = self.tableau
         weights = [b * unit for b, unit in zip(B, scale, strict=True)] if self.stages > 2 else list(B)
-        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        self.register_buffer("weights", torch.tensor(weights, **like), persistent=False)
+        self.register_buffer("weights", torch.tensor(weights, **self._like), persistent=False)
         # A tuple, not a ModuleList: the layers own nothing.
         self.layers = tuple(CollocationLayer(self) for _ in range(self.steps))
-        if system is not None:
-            self.identify(system)
+        self._made_of(system)
 
     @classmethod
     def of(
@@ -158,16 +141,12 @@ class CollocatedFlow(SystemFlow):
         return made
 
     @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        described = plan["collocated"]
-        if not isinstance(described, dict):
-            raise Refused("its plan of a collocated flow is missing")
-        stages = checked_integer(described.get("stages"), "number of stages", MOST_STAGES)
-        steps = checked_integer(described.get("steps"), "number of steps", MOST_STEPS)
-        return cls(ndof, stages, steps, dt, dtype=dtype)
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        most = {"stages": MOST_STAGES, "steps": MOST_STEPS}
+        return {name: checked_integer(plan.get(name), f"number of {name}", m) for name, m in most.items()}
 
-    def architecture(self) -> dict[str, Any]:
-        return {"ndof": self.ndof, "collocated": {"stages": self.stages, "steps": self.steps}}
+    def plan(self) -> dict[str, Any]:
+        return {"stages": self.stages, "steps": self.steps}
 
     # the maps -----------------------------------------------------------------------------------------------
 
@@ -179,7 +158,7 @@ class CollocatedFlow(SystemFlow):
         """The states (N, 2d) at the end of that step."""
         return collocation.advanced(self.bound_system, self.tableau, y, K, per_state(h, y))
 
-    def _compiled_for(self, system: HamiltonianSystem) -> CollocatedFlowKernel:
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> CollocatedFlowKernel:
         from sympflow.flow.loops import CollocatedFlowKernel
 
         return CollocatedFlowKernel(system, self.tableau, self.steps)
@@ -199,13 +178,6 @@ class CollocatedFlow(SystemFlow):
     def bound_system(self) -> HamiltonianSystem:
         """The system whose H the flow uses."""
         return self._binding.system
-
-
-def _count(name: str, value: Any, most: int) -> int:
-    value = plain(value)
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-        raise ValueError(f"`{name}` must be an integer from 1 to {most}; got {value!r}.")
-    return value
 
 
 def _checked_states(states: ArrayLike, ndof: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, doubles
 from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
@@ -43,11 +43,10 @@ BEFORE, STEPS, AFTER = slice(0, 1), slice(1, 2), slice(2, 3)
 
 
 class _Kept(NamedTuple):
-    """χ, its inverse, and compiled loops with a frame by True where sums are compensated, of the numbers now."""
+    """χ and its inverse, of the numbers now."""
 
     processor: Substeps
     inverse: Substeps
-    kernels: dict[bool, tuple[Frame, Kernel]]
 
 
 def at_dt(dt: float, t: Any) -> Any:
@@ -79,17 +78,9 @@ class PlanetLayer(OwnLayer):
         super().__init__(flow)
         self.substep = kick, drift, 0.0
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved([self.substep], t, q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(reversed_substeps([self.substep]), t, q, p)
-
-    def _moved(self, substeps: Substeps, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        y = torch.cat([q, p]).T
-        time = t + 0 * y[:, 0]
-        y = self.flow.frame.moved(y, sum(a for _, a, _ in substeps) * time, (substeps, time))
-        return y.T.chunk(2)
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        substeps, time = reversed_substeps([self.substep]) if back else [self.substep], t + 0 * y[:, 0]
+        return self.flow.frame.moved(y, sum(a for _, a, _ in substeps) * time, (substeps, time))
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         q, p = self.inverse(t, q, p)
@@ -97,39 +88,19 @@ class PlanetLayer(OwnLayer):
         kepler = self.flow.frame.kepler_energy(y)
         return q, p, kick * (self.flow.system.hamiltonian(y) - kepler) if kick else drift * kepler
 
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "kepler"}
-
 
 class KeplerFlow(SystemFlow):
     """A flow of planets about a star with trained coordinates; made by `sympflow.train` of a system of planets.
 
-    Parameters
-    ----------
-    ndof : int
-    reach : int
-        M, in steps.
-    n_gradients : int
-        The number of force gradients, 0 to 2M.
-    dt : float
-        Δt.
-    periods : sequence of float, optional
-        Periods of the planets; the numbers hold for these orbits alone.
-    system : HamiltonianSystem, optional
-        One of `HamiltonianSystem.planets`, in Jacobi's coordinates. Without it the flow has no values.
-    dtype, device
-        Of the parameters.
-
-    Attributes
-    ----------
-    kicks, gradients : Tensor
-        β (2M,) and γ.
-    periods : tuple of float
+    `reach` is M, in steps, `n_gradients` is 0 to 2M, and `periods` those of the planets, for whose orbits alone the
+    numbers `kicks`, β (2M,), and `gradients`, γ, hold. The system is one of `HamiltonianSystem.planets`, in Jacobi's
+    coordinates; without it the flow has no values.
     """
 
     kicks: Tensor
     gradients: Tensor
 
+    PLAN = "kepler"
     MADE = "made of Kepler's motion and the interaction of planets"
 
     def __init__(
@@ -140,20 +111,16 @@ class KeplerFlow(SystemFlow):
         dt: float = 1.0,
         periods: Sequence[float] | None = None,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
-        kind: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        self.register_buffer("kicks", torch.zeros(2 * reach, **kind))
-        self.register_buffer("gradients", torch.zeros(n_gradients, **kind))
+        super().__init__(ndof, dt, **like)
+        self.register_buffer("kicks", torch.zeros(2 * reach, **self._like))
+        self.register_buffer("gradients", torch.zeros(n_gradients, **self._like))
         self.periods = None if periods is None else tuple(map(float, periods))
         self._kept: Kept[_Kept] = Kept([self._buffers])
         # A tuple, not a ModuleList: the layers own no numbers.
         self.layers = tuple(PlanetLayer(self, *m) for b, a, _ in BETWEEN for m in ((b, 0.0), (0.0, a)) if any(m))
-        if system is not None:
-            self._take(system)
-            self.identify(system)
+        self._made_of(system)
 
     @property
     def frame(self) -> Frame:
@@ -170,7 +137,7 @@ class KeplerFlow(SystemFlow):
 
     def _frame_of(self, system: HamiltonianSystem) -> Frame:
         """The frame of a system, whose planets are on the orbits for which the numbers hold."""
-        frame = frame_of(system.local, system.y0)
+        frame = frame_of(system)
         if frame is None or not frame.jacobi:
             raise ValueError(
                 f"`system` {system.name!r} has no planets in Jacobi's coordinates, which the flow needs: make it by "
@@ -236,40 +203,32 @@ class KeplerFlow(SystemFlow):
 
     def _frozen(self) -> _Kept:
         processor = processor_of(*(doubles(x).tolist() for x in (self.kicks, self.gradients)))
-        return _Kept(processor, reversed_substeps(processor), {})
+        return _Kept(processor, reversed_substeps(processor))
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
-        check_compilable(self.dtype, self.device)
-        flow, kept = self.bound(system), self._kept.current(self._frozen)
-        known = kept.kernels.get(compensated)
-        if known is None or known[0] is not flow.frame:
-            from sympflow.kernels.kepler import KeplerFlowKernel, KeplerKernel, kepler_loops
+        return self._loops_for(system, compensated)
 
-            loops = kepler_loops(flow.frame)
-            trained = KeplerKernel(loops, STEP, kept.inverse, kept.processor, compensated)
-            between = KeplerKernel(loops, BETWEEN, compensated=compensated)
-            known = flow.frame, KeplerFlowKernel(partial(at_dt, self.dt), trained, between)
-            kept.kernels[compensated] = known
-        return known[1]
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
+        from sympflow.kernels.kepler import KeplerFlowKernel, KeplerKernel, kepler_loops
+
+        kept, loops = self._kept.current(self._frozen), kepler_loops(self.frame)
+        trained = KeplerKernel(loops, STEP, kept.inverse, kept.processor, compensated)
+        return KeplerFlowKernel(partial(at_dt, self.dt), trained, KeplerKernel(loops, BETWEEN, compensated=compensated))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         kicks = sum(kick != 0 for kick, *_ in self._kept.current(self._frozen).processor)
         forces = n_steps + kicks * (1 + n_saved) + sum(kick != 0 for kick, *_ in BETWEEN) * n_extra
         return {"force_evaluations": forces, "hessian_evaluations": 2 * len(self.gradients) * (1 + n_saved)}
 
-    def architecture(self) -> dict[str, Any]:
-        shape = {"reach": len(self.kicks) // 2, "gradients": len(self.gradients), "periods": list(self.periods or ())}
-        return {"ndof": self.ndof, "kepler": shape}
+    def plan(self) -> dict[str, Any]:
+        return {"reach": len(self.kicks) // 2, "gradients": len(self.gradients), "periods": list(self.periods or ())}
 
     @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        shape = plan["kepler"]
-        if not isinstance(shape, dict):
-            raise Refused("its plan of a flow of planets is missing")
-        reach = checked_integer(shape.get("reach"), "reach", MOST_REACH)
-        gradients, periods = shape.get("gradients"), shape.get("periods")
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        reach = checked_integer(plan.get("reach"), "reach", MOST_REACH)
+        gradients, periods = plan.get("gradients"), plan.get("periods")
         if gradients != 0:
             gradients = checked_integer(gradients, "number of force gradients", 2 * reach)
         if not (isinstance(periods, list) and len(periods) == ndof // 3 - 1 and all(map(_is_period, periods))):
             raise Refused("its periods are not those of its planets")
-        return cls(ndof, reach, gradients, dt, periods, dtype=dtype)
+        return {"reach": reach, "n_gradients": gradients, "periods": periods}

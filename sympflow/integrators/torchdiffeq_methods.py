@@ -16,16 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import (
-    Array,
-    differentiable,
-    full_of_nan,
-    is_tensor,
-    readable,
-    stack,
-    to_numpy,
-    transformed,
-)
+from sympflow.arrays import Array, differentiable, full_of_nan, is_tensor, readable, stack, to_numpy, transformed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
 from sympflow.integrators.contract import (
@@ -42,11 +33,10 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import THIRDS, Batch, Interpolant, Piecewise
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
-from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
+from sympflow.integrators.steppers import Stepper, stepper_of
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
-Visit = Callable[[Interpolant], bool]
-"""Takes a step as soon as it is accepted; whether the run ends in it."""
+Visit = Callable[[Interpolant], bool]  # takes a step as soon as it is accepted; whether the run ends in it
 
 
 class Trace:
@@ -254,13 +244,20 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
     stats: dict[str, Any] = {**counts, "backend": "torchdiffeq"}
     if not done.all():
         stats["failed_at"] = np.where(done, np.nan, reached).reshape(batch)
-    outcome = Outcome(
-        times,
-        stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape),
-        np.where(done, 0, -1).reshape(batch),
-        _message(method, batch, source, done, unfinished, reached) or finished(problem),
-        stats,
-    )
+    said = []
+    if len(failed := np.flatnonzero(~done & ~unfinished)):
+        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
+    if unfinished.any():
+        first = np.argmax(unfinished)
+        said.append(
+            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
+            f"because some of its trajectories fail, ended before {unfinished.sum()} of {n} trajectories: they are "
+            f"kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
+            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
+        )
+    y = stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape)
+    status = np.where(done, 0, -1).reshape(batch)
+    outcome = Outcome(times, y, status, " ".join(said) or finished(problem), stats)
     if problem.dense_output:
         outcome.sol = Batch([(run.sol, j) for run, j in source], batch, (problem.t0, problem.t1))
     return outcome
@@ -281,29 +278,6 @@ def _divided(problem: Problem, part: np.ndarray, trace: Trace) -> list[np.ndarra
         gaps = np.nan_to_num(rates[order[1:]] / rates[order[:-1]], nan=1.0)
     cut = int(np.argmax(gaps)) + 1 if gaps.max() > 10 else len(part) // 2
     return [np.sort(part[order[:cut]]), np.sort(part[order[cut:]])]
-
-
-def _message(
-    method: Watched,
-    batch: tuple[int, ...],
-    source: list[tuple[Outcome, int]],
-    done: np.ndarray,
-    unfinished: np.ndarray,
-    reached: np.ndarray,
-) -> str:
-    said = []
-    failed = np.flatnonzero(~done & ~unfinished)
-    if len(failed):
-        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
-    if unfinished.any():
-        first = np.argmax(unfinished)
-        said.append(
-            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
-            f"because some of its trajectories fail, ended before {unfinished.sum()} of {len(done)} trajectories: they "
-            f"are kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
-            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
-        )
-    return " ".join(said)
 
 
 def _index(i: Any, batch: tuple[int, ...]) -> str:
@@ -428,7 +402,6 @@ class _Stages(Trace):
         if not differentiable(s, dt):
             s, dt = float(s), float(dt)
         t0, t1 = (self.t_span[0] + self.direction * x for x in (s, s + dt))
-        h = self.direction * dt
         self.first = self.slopes[-1]
         self.announce(Interpolant(t0, t1, y, lambda: self._inside(t0, t1, y, K)))
 
@@ -576,18 +549,8 @@ class FixedGrid(ExplicitStep, FixedStep):
     tableau: ClassVar[Tableau]
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        told, arrays = list[str](), OwnSteps(self, problem)
         make = partial(self.compiled, problem.system, "explicit_kernel", self.tableau)
-        if problem.followed:
-            return Stepper(self, problem, arrays, followed_loops(make, problem))
-        kernel = compiled_loops(
-            make,
-            problem.y0,
-            problem.backend,
-            told=told,
-            system=problem.system,
-        )
-        return Stepper(self, problem, arrays, kernel, told)
+        return stepper_of(self, problem, OwnSteps(self, problem), make)
 
     def multiplier(self, z: np.ndarray) -> np.ndarray:
         K: list[np.ndarray] = []

@@ -1,14 +1,8 @@
-"""The training of a flow's clock: the times that the exact solution takes to where a scheme comes, by least squares.
-
-A splitting scheme on a logarithmic Hamiltonian comes in a step s from x to a state near the orbit through x, and holds
-a time for it. The label is the time at which the exact solution in the physical time is nearest to that state; the
-clock is linear in its numbers.
-"""
+"""The training of a flow's clock: the times that the exact solution takes to where a scheme comes, by least squares."""
 
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,9 +13,6 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.flows import LogSympFlow
-from sympflow.metrics.energy import max_energy_error
-from sympflow.solver import solve
 from sympflow.training.fits import ClockedFit
 from sympflow.training.points import Stream, states, step_errors
 
@@ -40,7 +31,7 @@ def train_clock(system: HamiltonianSystem, fit: ClockedFit, domain: Domain) -> C
     flow = ClockedFlow(transformed.ndof, scheme, terms, dt * time_scale(system, shift), transformed)
     x = lifted(system, states(domain, points, seed, Stream.RESIDUAL), shift)
     s = np.repeat(flow.dt * np.arange(1, label_times + 1) / label_times, len(x))
-    late = _lateness(flow, system, np.tile(x, (label_times, 1)), s)[1]
+    late = _lateness(flow, system, np.tile(x, (label_times, 1)), s)
     B = np.tile(x[:, -1], label_times)
     columns = np.stack([s ** (3 + 2 * k) * B**k for k in range(terms)], axis=-1)
     unit = np.abs(columns).max(0)
@@ -65,17 +56,8 @@ def train_clock(system: HamiltonianSystem, fit: ClockedFit, domain: Domain) -> C
     return flow
 
 
-def energy_errors(flow: ClockedFlow, system: HamiltonianSystem, y0: np.ndarray, t_end: float, outputs: int) -> Any:
-    """The largest relative energy error of each run in the physical time, over equidistant outputs: (N,)."""
-    times = np.linspace(0.0, t_end, outputs + 1)
-    integrator = LogSympFlow(flow=flow, shift=flow.recipe["transforms"]["shift"])
-    return max_energy_error(solve(system, integrator, (0.0, t_end), y0, t_eval=times, on_domain_exit="ignore"))
-
-
-def _lateness(
-    flow: ClockedFlow, system: HamiltonianSystem, x: np.ndarray, s: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """ψ̄_s(x) of rows, and how much later than it holds the exact solution is where it comes: (N, 2d + 2), (N,)."""
+def _lateness(flow: ClockedFlow, system: HamiltonianSystem, x: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """How much later than ψ̄_s(x) of rows holds the exact solution is where it comes: (N,)."""
     transformed = flow.system
     assert transformed is not None
     end = flow.kernel_for(transformed).step(s, x).states
@@ -85,7 +67,7 @@ def _lateness(
         exact = _at(system, start, t)
         v = system.vector_field(exact)
         t = t + ((y - exact) * v).sum(-1) / (v * v).sum(-1)
-    return end, t - held
+    return t - held
 
 
 def clock_errors(

@@ -29,9 +29,9 @@ def test_fixed_methods_are_torchdiffeqs(method):
 
 
 @pytest.mark.parametrize("t_end", [3.0, -3.0])
-def test_the_interpolation_is_torchdiffeqs(t_end, method="dopri5"):
+def test_the_interpolation_of_dopri5_is_torchdiffeqs(t_end):
     """Between the steps, which are long here, to rounding: at output times, and by the dense output."""
-    times = np.linspace(0, t_end, 20)
+    method, times = "dopri5", np.linspace(0, t_end, 20)
     loose = {"rtol": 1e-3, "atol": 1e-5}
     theirs = odeint(HH, torch.tensor(HH.y0), torch.as_tensor(times), method=method, **loose).numpy().T
     sol = solve(HH, method, (0, t_end), t_eval=times, dense_output=True, **loose)
