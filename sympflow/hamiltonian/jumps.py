@@ -523,9 +523,9 @@ def _leaves(f: sp.Basic, time: sp.Symbol, samples: Mapping[str, Samples]) -> Ite
         yield from _leaves(each, time, samples)
 
 
-def common_period(f: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples] | None = None) -> float | None:
+def common_period(f: sp.Expr, time: sp.Symbol) -> float | None:
     """A period of f in t, that of all periodic functions in it, if t is in such alone and they have one."""
-    periods = sorted(set(_leaves(f, time, samples or {})))
+    periods = sorted(set(_leaves(f, time, {})))
     if not periods or math.inf in periods or -math.inf in periods:
         return None
     multiple = 1

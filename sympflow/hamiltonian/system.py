@@ -767,14 +767,9 @@ class HamiltonianSystem(Hamiltonian, Answering):
         return self._params
 
     def check_parameters(self, names: Iterable[str]) -> None:
-        """Refuse names other than those of the parameters of H.
+        """Refuse names other than those of the parameters of H, by a ValueError with these.
 
-        Raises
-        ------
-        TypeError
-            If the system is given by functions, or a parameter is an array of a lattice's sites.
-        ValueError
-            With the names that it has.
+        A TypeError if the system is given by functions, or a parameter is an array of a lattice's sites.
         """
         if self.local is not None:
             self.local.check_numbers(names)
@@ -917,10 +912,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def linear_part(self) -> LinearPart:
         """The quadratic part of H: K, its frequencies, the remaining potential U, and the `stiffness`.
 
-        Raises
-        ------
-        ValueError
-            If there is no such part, or its stiff direction turns.
+        A ValueError if there is no such part, or its stiff direction turns.
         """
         from sympflow.hamiltonian.linear_part import linear_part
 
