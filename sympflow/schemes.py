@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import pairwise
 from math import comb, factorial, fsum, isfinite, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -77,6 +77,14 @@ class Substep(NamedTuple):
         """Both in turn, of one kind."""
         e = tuple(map(float.__add__, self.polynomial, other.polynomial))
         return Substep(self.kind, self.one + other.one, self.three + other.three, self.five + other.five, e)
+
+
+_COUNTED: dict[str, Callable[[Substep], bool]] = {
+    "force_evaluations": lambda kick: True,
+    "hessian_evaluations": lambda kick: kick.three != 0 or kick.five != 0,
+    "curvature_evaluations": lambda kick: kick.five != 0,
+}
+"""Evaluations, and the kicks that make them."""
 
 
 @dataclass(frozen=True)
@@ -208,23 +216,33 @@ class Scheme:
     @cached_property
     def force_evaluations(self) -> int:
         """Forces per step in a long run, the last kick merged with the next step's first one."""
-        kinds = [kind for kind, *_ in self.substeps]
-        return kinds.count("kick") - (self.first_same_as_last and kinds[0] == "kick")
+        return self.counts["force_evaluations"][0]
 
     @cached_property
     def hessian_evaluations(self) -> int:
         """Force gradients (Hessian–vector products) per step, counted like `force_evaluations`."""
-        return self._kicks_with(lambda g, c: g != 0.0 or c != 0.0)
+        return self.counts["hessian_evaluations"][0]
 
     @cached_property
     def curvature_evaluations(self) -> int:
         """Curvature terms (third derivatives of V) per step, likewise."""
-        return self._kicks_with(lambda g, c: c != 0.0)
+        return self.counts.get("curvature_evaluations", (0,))[0]
 
-    def _kicks_with(self, has: Callable[[float, float], bool]) -> int:
-        with_it = [has(s.three, s.five) for s in self.substeps if s.kind == "kick"]
-        shared = self.first_same_as_last and self.substeps[0][0] == "kick"
-        return sum(with_it[1:-1] if shared else with_it) + (shared and (with_it[0] or with_it[-1]))
+    @cached_property
+    def counts(self) -> dict[str, tuple[int, int, int]]:
+        """Evaluations of a step in a long run, of a step alone, and of the last kick where the next step shares it."""
+        kicks = [s for s in self.substeps if s.kind == "kick"]
+        shared = self.first_same_as_last and self.substeps[0].kind == "kick"
+        found: dict[str, tuple[int, int, int]] = {}
+        for name, has in _COUNTED.items():
+            of = [has(kick) for kick in kicks]
+            if name != "curvature_evaluations" or any(of):
+                found[name] = (
+                    sum(of[shared : len(of) - shared]) + (shared and (of[0] or of[-1])),
+                    sum(of),
+                    shared and of[-1],
+                )
+        return found
 
     @cached_property
     def strang_weights(self) -> tuple[float, ...] | None:
@@ -493,30 +511,11 @@ def checked_scheme(scheme: Any) -> Scheme:
 
 def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Evaluations of the force, of force gradients and of curvature terms in a run, as `FixedStep.evaluations`."""
+    counts = scheme.counts.items()
     if backend != "compiled":
-        return {name: (n_steps + n_extra) * whole for name, _, whole, _ in _costs(scheme)}
+        return {name: (n_steps + n_extra) * whole for name, (_, whole, _) in counts}
     # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
-    return {
-        name: n_steps * of_a_step + n_saved * closing + n_extra * whole
-        for name, of_a_step, whole, closing in _costs(scheme)
-    }
-
-
-@lru_cache(maxsize=256)
-def _costs(scheme: Scheme) -> tuple[tuple[str, int, int, int], ...]:
-    """Names of evaluations, with those of a step in a long run, of a step alone, and of the last kick if it is shared.
-
-    Where it is shared, it is executed once more for each state that is saved.
-    """
-    kicks = [(True, s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick"]
-    shared = len(kicks) > scheme.force_evaluations
-    counts = [("force_evaluations", scheme.force_evaluations), ("hessian_evaluations", scheme.hessian_evaluations)]
-    if any(scheme.curvatures):
-        counts.append(("curvature_evaluations", scheme.curvature_evaluations))
-    return tuple(
-        (name, of_a_step, sum(kick[i] for kick in kicks), int(shared and kicks[-1][i]))
-        for i, (name, of_a_step) in enumerate(counts)
-    )
+    return {name: n_steps * run + n_saved * closing + n_extra * whole for name, (run, whole, closing) in counts}
 
 
 # pairs of a kick and a drift -----------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, check_compilable, doubles
+from sympflow.flow.weights import Kept, doubles
 from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
@@ -43,11 +43,10 @@ BEFORE, STEPS, AFTER = slice(0, 1), slice(1, 2), slice(2, 3)
 
 
 class _Kept(NamedTuple):
-    """χ, its inverse, and compiled loops with a frame by True where sums are compensated, of the numbers now."""
+    """χ and its inverse, of the numbers now."""
 
     processor: Substeps
     inverse: Substeps
-    kernels: dict[bool, tuple[Frame, Kernel]]
 
 
 def at_dt(dt: float, t: Any) -> Any:
@@ -79,26 +78,15 @@ class PlanetLayer(OwnLayer):
         super().__init__(flow)
         self.substep = kick, drift, 0.0
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved([self.substep], t, q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(reversed_substeps([self.substep]), t, q, p)
-
-    def _moved(self, substeps: Substeps, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        y = torch.cat([q, p]).T
-        time = t + 0 * y[:, 0]
-        y = self.flow.frame.moved(y, sum(a for _, a, _ in substeps) * time, (substeps, time))
-        return y.T.chunk(2)
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        substeps, time = reversed_substeps([self.substep]) if back else [self.substep], t + 0 * y[:, 0]
+        return self.flow.frame.moved(y, sum(a for _, a, _ in substeps) * time, (substeps, time))
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         q, p = self.inverse(t, q, p)
         y, (kick, drift, _) = torch.cat([q, p]).T, self.substep
         kepler = self.flow.frame.kepler_energy(y)
         return q, p, kick * (self.flow.system.hamiltonian(y) - kepler) if kick else drift * kepler
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": "kepler"}
 
 
 class KeplerFlow(SystemFlow):
@@ -149,7 +137,7 @@ class KeplerFlow(SystemFlow):
 
     def _frame_of(self, system: HamiltonianSystem) -> Frame:
         """The frame of a system, whose planets are on the orbits for which the numbers hold."""
-        frame = frame_of(system.local, system.y0)
+        frame = frame_of(system)
         if frame is None or not frame.jacobi:
             raise ValueError(
                 f"`system` {system.name!r} has no planets in Jacobi's coordinates, which the flow needs: make it by "
@@ -215,21 +203,17 @@ class KeplerFlow(SystemFlow):
 
     def _frozen(self) -> _Kept:
         processor = processor_of(*(doubles(x).tolist() for x in (self.kicks, self.gradients)))
-        return _Kept(processor, reversed_substeps(processor), {})
+        return _Kept(processor, reversed_substeps(processor))
 
     def kernel_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
-        check_compilable(self.dtype, self.device)
-        flow, kept = self.bound(system), self._kept.current(self._frozen)
-        known = kept.kernels.get(compensated)
-        if known is None or known[0] is not flow.frame:
-            from sympflow.kernels.kepler import KeplerFlowKernel, KeplerKernel, kepler_loops
+        return self._loops_for(system, compensated)
 
-            loops = kepler_loops(flow.frame)
-            trained = KeplerKernel(loops, STEP, kept.inverse, kept.processor, compensated)
-            between = KeplerKernel(loops, BETWEEN, compensated=compensated)
-            known = flow.frame, KeplerFlowKernel(partial(at_dt, self.dt), trained, between)
-            kept.kernels[compensated] = known
-        return known[1]
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
+        from sympflow.kernels.kepler import KeplerFlowKernel, KeplerKernel, kepler_loops
+
+        kept, loops = self._kept.current(self._frozen), kepler_loops(self.frame)
+        trained = KeplerKernel(loops, STEP, kept.inverse, kept.processor, compensated)
+        return KeplerFlowKernel(partial(at_dt, self.dt), trained, KeplerKernel(loops, BETWEEN, compensated=compensated))
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         kicks = sum(kick != 0 for kick, *_ in self._kept.current(self._frozen).processor)

@@ -73,12 +73,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
     PLAN = "primed"
 
     def __init__(
-        self,
-        ndof: int,
-        shape: PrimedShape,
-        dt: float = 1.0,
-        system: HamiltonianSystem | None = None,
-        **like: Any,
+        self, ndof: int, shape: PrimedShape, dt: float = 1.0, system: HamiltonianSystem | None = None, **like: Any
     ) -> None:
         super().__init__(ndof, dt, **like)
         self.shape = shape

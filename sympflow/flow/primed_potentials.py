@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
@@ -76,10 +76,7 @@ _FUNCTIONS: dict[str, tuple[Callable[..., Tensor], Callable[..., Tensor]]] = {
             lambda x, s: system.hessian_vector(x, system.velocity(system.force(x, s)), s), system, q, t
         ),
     ),
-    "curvature": (
-        lambda system, q, t: system.curvature(q, t),
-        lambda system, q, t: system.curvature_gradient(q, t),
-    ),
+    "curvature": (lambda system, q, t: system.curvature(q, t), lambda system, q, t: system.curvature_gradient(q, t)),
 }
 
 
@@ -176,16 +173,10 @@ class PrimedDrift(Drift):
         d = system.ndof
         return torch.cat([q[:d] + system.velocity(mean).T, q[d:] + passed]), end
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
         if self._plain:
-            return super().forward(t, q, p)
-        s = self._time.value(t)
-        return self._drifted(s, q, p, s)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        if self._plain:
-            return super().inverse(t, q, p)
-        s = -self._time.value(t)
+            return super().forward(t, q, p, back)
+        s = -self._time.value(t) if back else self._time.value(t)
         return self._drifted(s, q, p, s)
 
     def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -261,6 +252,3 @@ class PrimedPotential(Potential):
             impulse = impulse + slope
             tangent = tangent + self._polynomial.gradient(self._polynomial.rate(t, x), q) + change
         return impulse, tangent
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"type": "primed"}

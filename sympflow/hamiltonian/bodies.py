@@ -211,11 +211,11 @@ class PairsHamiltonian(LocalHamiltonian):
     # a few of many ----------------------------------------------------------------------------------------------------
 
     @property
-    def uniform(self) -> bool:
+    def uniform(self) -> bool:  # type: ignore[override]
         return all((x == x[0]).all() for x in (self.masses, *self.columns))
 
     @property
-    def apart(self) -> float:
+    def apart(self) -> float:  # type: ignore[override]
         """A power of two near six bonds: bodies nearer than one repel each other, beside which all else is rounding."""
         return (
             1.0 if self.box is not None or self.bond_length is None else 2.0 ** round(math.log2(6 * self.bond_length))
@@ -313,7 +313,8 @@ class PairsHamiltonian(LocalHamiltonian):
         for pairs in self._pairs(q, p / np.repeat(self.inertia, self.dim)):
             x, w = pairs.x
             r, side = np.sqrt(pairs.s), np.sign(x @ ASLANT[: self.dim])
-            straight = _is_straight(x, w)
+            speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
+            straight = (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
             along = straight.all(0, keepdims=True) if together else straight
             yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values
 
@@ -495,12 +496,6 @@ def _incidence(n: int) -> np.ndarray:
     """1 at the first and −1 at the second end of each pair of n bodies: (P, n)."""
     i, j = np.triu_indices(n, 1)
     return np.eye(n)[i] - np.eye(n)[j]
-
-
-def _is_straight(x: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """True where velocities w (..., dim) are along differences x of places."""
-    speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
-    return (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
 
 
 def _dot(x: Array, y: Array) -> Array:

@@ -24,6 +24,7 @@ from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
 from sympflow.hamiltonian.local import MOST_SPELLED, checked_params, numbered, parsed
 from sympflow.hamiltonian.recorded import NotRecorded
+from sympflow.lazy import kept
 from sympflow.schemes import Substeps
 
 COORDINATES = ("jacobi", "democratic")
@@ -305,12 +306,14 @@ class Frame:
         return None
 
 
-def frame_of(local: Any, y0: Any) -> Frame | None:
+@kept
+def frame_of(system: Any) -> Frame | None:
     """The frame of planets, or of a star and bodies in pairs that attract each other so; None for other systems."""
+    local = system.local
     if isinstance(local, PlanetsHamiltonian):
         return local.frame
     G = newtonian(local) if isinstance(local, PairsHamiltonian) else None
-    return None if G is None or y0 is None else Frame(local, G, np.asarray(to_numpy(y0)))
+    return None if G is None or system.y0 is None else Frame(local, G, system.y0)
 
 
 def newtonian(local: PairsHamiltonian) -> float | None:

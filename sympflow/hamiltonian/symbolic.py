@@ -547,14 +547,11 @@ def _read(
     for name in params:
         if names[name] not in H.free_symbols:
             raise ValueError(f"`params` has {name!r}, which the expression does not use: remove it.")
-    return H, {names[name]: _symbolic(name, value, time) for name, value in params.items()}
-
-
-def _symbolic(name: str, value: Any, time: sp.Symbol | None) -> sp.Expr:
-    if isinstance(value, Samples):
-        assert time is not None
-        return sampled_parameter(name, value, time)
-    return exact(value)
+    is_sampled = {name: isinstance(value, Samples) and time is not None for name, value in params.items()}
+    return H, {
+        names[name]: sampled_parameter(name, value, time) if is_sampled[name] else exact(value)
+        for name, value in params.items()
+    }
 
 
 def exact(value: float) -> sp.Expr:

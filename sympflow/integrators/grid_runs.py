@@ -107,14 +107,10 @@ class Run(ABC):
 
     def stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
         """Return the statistics of n_steps steps, n_saved states and n_extra shorter steps."""
-        stepper = self.stepper
-        return {
-            "dt": self.dt,
-            "n_steps": n_told,
-            **stepper.evaluations(n_steps, n_saved, n_extra),
-            "backend": stepper.backend + stepper.why,
-            **stepper.more_stats(),
-        }
+        stepper, arrays = self.stepper, self.stepper.arrays
+        stats: dict[str, Any] = {"dt": self.dt, "n_steps": n_told, **stepper.evaluations(n_steps, n_saved, n_extra)}
+        stats["backend"] = stepper.backend + stepper.why
+        return stats | {"newton_iterations": arrays.iterations} if arrays.stages else stats
 
 
 class GridRun(Run):

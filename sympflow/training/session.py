@@ -210,9 +210,6 @@ class Silent:
     def advance(self, step: int, loss: float) -> None:
         pass
 
-    def validated(self, step: int, figures: dict[str, float]) -> None:
-        self.tries(step, _text(figures))
-
     def tries(self, done: int, what: str) -> None:
         pass
 
@@ -256,6 +253,7 @@ class Bar(Silent):
         self.bar.update(self.task, completed=done, figures=what)
 
 
-def _text(figures: dict[str, float]) -> str:
+def shown(figures: dict[str, float]) -> str:
+    """Figures in short."""
     names = {"loss": "held-out", "residual_loss": "L1", "matching_loss": "L2", "one_step_error": "one-step"}
     return "  ".join(f"{short} {figures[name]:.1e}" for name, short in names.items() if name in figures)

@@ -16,10 +16,7 @@ from sympflow.schemes import SCHEMES
 EPS = np.finfo(float).eps
 HH, PENDULUM = systems.henon_heiles(), systems.pendulum()
 MASSES = HamiltonianSystem.from_sympy(
-    FULL_MASS_MATRIX,
-    name="masses",
-    domain=sympflow.Ball([0.0] * 4, 1.0),
-    y0=[0.3, 0.1, -0.2, 0.4],
+    FULL_MASS_MATRIX, name="masses", domain=sympflow.Ball([0.0] * 4, 1.0), y0=[0.3, 0.1, -0.2, 0.4]
 )
 RELATIVISTIC = HamiltonianSystem.from_sympy(RELATIVISTIC_H, domain=sympflow.Ball([0.0, 0.0], 1.0))
 
