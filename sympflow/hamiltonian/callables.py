@@ -43,10 +43,7 @@ CLOSE = 1e-9  # of the largest value
 
 
 class CallableHamiltonian(Definition):
-    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`.
-
-    Those of a driven system take the time first: a float beside arrays, a tensor of one double beside tensors.
-    """
+    """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`."""
 
     library: str = ""  # "numpy" or "torch", whose arrays the functions take; "" if they fail on both
     untraced: str = ""
@@ -57,14 +54,7 @@ class CallableHamiltonian(Definition):
     _hamiltonian: Any
 
     def __init__(
-        self,
-        ndof: int,
-        potential: Callable[..., Array] | None,
-        hamiltonian: Callable[..., Array] | None,
-        gradient: Callable[..., Any] | None,
-        hessian_vector: Callable[..., Any] | None,
-        check: bool = True,
-        timed: bool = False,
+        self, ndof: int, potential: Any, hamiltonian: Any, gradient: Any, hessian_vector: Any, check: Any, timed: bool
     ) -> None:
         check_flag("check", check)
         if (potential is None) == (hamiltonian is None):
@@ -140,7 +130,7 @@ class CallableHamiltonian(Definition):
         return found
 
     @cached_property
-    def poles(self) -> TracedPoles | None:  # type: ignore[override]
+    def poles(self) -> TracedPoles | None:
         return None if self.form is None else TracedPoles(self.form) or None
 
     @cached_property
@@ -399,7 +389,8 @@ class CallableHamiltonian(Definition):
         if self._exact(x) is not None:
             return self._derived("hessian", _hessian_of, x, (), t)
         if self._hessian_vector is not None:
-            columns = [self._protected(self._hessian_vector, "hessian_vector", t, x, e) for e in _basis(x)]
+            basis = [e + 0 * x for e in like(np.eye(n), x)]
+            columns = [self._protected(self._hessian_vector, "hessian_vector", t, x, e) for e in basis]
             return stack([_checked(column, x, "hessian_vector", (n,)) for column in columns])
         if self._gradient is not None and not is_tensor(x):
             raise ValueError(
@@ -507,16 +498,6 @@ def _check_numba(potential: Any, gradient: Any, hessian_vector: Any, first: str 
         count = len(inspect.signature(function.py_func).parameters)
         if count != len(arguments.split(",")):
             raise TypeError(f"`{name}` must take ({arguments}) as a Numba function; it takes {count} arguments.")
-
-
-def _basis(x: Array) -> list[Array]:
-    """The unit vectors along the last axis, each of the shape of x."""
-    vectors = []
-    for i in range(x.shape[-1]):
-        e = 0 * x
-        e[..., i] = 1
-        vectors.append(e)
-    return vectors
 
 
 def _gradient_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Array]:

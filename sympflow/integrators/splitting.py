@@ -45,10 +45,7 @@ END = 1e-9
 
 @dataclass(frozen=True)
 class Clock:
-    """A time in which steps are equal, with the traits of the contract that depend on it.
-
-    `on` makes of a method and a system the method on the clock; None for the physical time, which needs none.
-    """
+    """A time in which steps are equal, with the traits of the contract that depend on it."""
 
     on: Callable[[Splitting, HamiltonianSystem], LogarithmicClock] | None = None
     finds_events: bool = True
@@ -398,7 +395,8 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
     search = problem.events
     lifted, before = None, []
     if search is not None:  # which may go on from an earlier piece of the run
-        lifted, before = EventSearch(_of_projections(search, extension), search.max_interval), search.found
+        projected = (replace(e, g=lambda t, x, g=e.g: g(t, extension.project(x))) for e in search.events)  # type: ignore
+        lifted, before = EventSearch(tuple(projected), search.max_interval), search.found
         lifted.found, lifted.values, lifted.n_dense = [[*zeros] for zeros in before], search.values, search.n_dense
     store = problem.store
     if store is not None:
@@ -430,13 +428,6 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
     if stopped is not None:
         raise stopped
     return outcome
-
-
-def _of_projections(search: EventSearch, extension: Composition) -> Any:
-    return tuple(
-        replace(event, g=lambda t, x, g=event.g: g(t, extension.project(x)))  # type: ignore[misc]
-        for event in search.events
-    )
 
 
 def _noted(store: RunStore, extension: Composition, x: np.ndarray) -> np.ndarray:

@@ -16,16 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import (
-    Array,
-    differentiable,
-    full_of_nan,
-    is_tensor,
-    readable,
-    stack,
-    to_numpy,
-    transformed,
-)
+from sympflow.arrays import Array, differentiable, full_of_nan, is_tensor, readable, stack, to_numpy, transformed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
 from sympflow.integrators.contract import (
@@ -185,12 +176,8 @@ class Watched(ByVectorField):
         if t0 == t_end:
             record.empty(t0, y0)
         states = record.outputs
-        stats: dict[str, Any] = {
-            "n_steps": trace.n_steps,
-            "force_evaluations": trace.evaluations,
-            "hessian_evaluations": 0,
-            "backend": "torchdiffeq",
-        }
+        stats: dict[str, Any] = dict(zip(COUNTS, (trace.n_steps, trace.evaluations, 0), strict=True))
+        stats["backend"] = "torchdiffeq"
         ended = record.end is not None
         trace.failed = bool(failure) and not ended
         if trace.failed:
@@ -204,13 +191,9 @@ class Watched(ByVectorField):
             if problem.t_eval is None and not (times.size and times[-1] == t_end):
                 times, states = np.append(times, t_end), [*states, record.end[1]]
         status: Any = 1 if ended else -int(bool(failure))
-        outcome = Outcome(
-            times,
-            stack(states, axis=0) if states else y0[None][:0],
-            np.full(y0.shape[:-1], status) if y0.ndim > 1 else status,
-            (ENDED if status == 1 else failure or finished(problem)) + trace.note,
-            stats,
-        )
+        message = (ENDED if status == 1 else failure or finished(problem)) + trace.note
+        y = stack(states, axis=0) if states else y0[None][:0]
+        outcome = Outcome(times, y, np.full(y0.shape[:-1], status) if y0.ndim > 1 else status, message, stats)
         if problem.dense_output:
             outcome.sol = Piecewise(kept, y0, t0, t_end)
         return outcome, trace
@@ -253,13 +236,20 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
     stats: dict[str, Any] = {**counts, "backend": "torchdiffeq"}
     if not done.all():
         stats["failed_at"] = np.where(done, np.nan, reached).reshape(batch)
-    outcome = Outcome(
-        times,
-        stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape),
-        np.where(done, 0, -1).reshape(batch),
-        _message(method, batch, source, done, unfinished, reached) or finished(problem),
-        stats,
-    )
+    said = []
+    if len(failed := np.flatnonzero(~done & ~unfinished)):
+        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
+    if unfinished.any():
+        first = np.argmax(unfinished)
+        said.append(
+            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
+            f"because some of its trajectories fail, ended before {unfinished.sum()} of {n} trajectories: they are "
+            f"kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
+            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
+        )
+    y = stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape)
+    status = np.where(done, 0, -1).reshape(batch)
+    outcome = Outcome(times, y, status, " ".join(said) or finished(problem), stats)
     if problem.dense_output:
         outcome.sol = Batch([(run.sol, j) for run, j in source], batch, (problem.t0, problem.t1))
     return outcome
@@ -280,29 +270,6 @@ def _divided(problem: Problem, part: np.ndarray, trace: Trace) -> list[np.ndarra
         gaps = np.nan_to_num(rates[order[1:]] / rates[order[:-1]], nan=1.0)
     cut = int(np.argmax(gaps)) + 1 if gaps.max() > 10 else len(part) // 2
     return [np.sort(part[order[:cut]]), np.sort(part[order[cut:]])]
-
-
-def _message(
-    method: Watched,
-    batch: tuple[int, ...],
-    source: list[tuple[Outcome, int]],
-    done: np.ndarray,
-    unfinished: np.ndarray,
-    reached: np.ndarray,
-) -> str:
-    said = []
-    failed = np.flatnonzero(~done & ~unfinished)
-    if len(failed):
-        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
-    if unfinished.any():
-        first = np.argmax(unfinished)
-        said.append(
-            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
-            f"because some of its trajectories fail, ended before {unfinished.sum()} of {len(done)} trajectories: they "
-            f"are kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
-            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
-        )
-    return " ".join(said)
 
 
 def _index(i: Any, batch: tuple[int, ...]) -> str:
