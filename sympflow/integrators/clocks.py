@@ -35,7 +35,6 @@ FEW_EVALUATIONS = 20_000  # of forces on arrays, half a second, before a run who
 EVALUATIONS_EACH = 50  # and these for each step of the physical length dt within the interval,
 STEPS_EACH = 6  # or as many as so many steps take
 COMPILED_FOR_ONE = 10  # compiled evaluations that are allowed for one on arrays, which takes a thousand times longer
-
 _transformed = kept(time_transformed)
 scale_of = kept(time_scale)
 """ds/dt where the kinetic energy is c − E, at the energy E of the system's y0, of a system and c."""

@@ -34,7 +34,6 @@ LOST = 0.01  # of y·∇H: a state whose energy differs by more is no longer on 
 SHORT = 1e-11  # of the way: steps below it go on no more
 NEAR, NEARER, GROWTH = 1e-3, 1e-8, 10.0
 """The state is infinite at the end if it grows by so much from this to that part of the way before it."""
-
 LOOKED_AT, LOOKED_AT_TOGETHER = 32, 4096  # outputs of one trajectory, states of all, at which H and signs are compared
 OFF, FAR_OFF = 0.01, 0.5  # of the kinetic energy: a change of H after which steps are looked at; where H may change
 MOST_WALKED, MOST_TESTED, MOST_NAMED = 4 * 10**6, 32, 64  # numbers of a run executed again; crossings; trajectories
@@ -42,8 +41,6 @@ ACROSS, AROUND, PARTS = 0.25, 8, 9
 """A step leaps if, at one of so many points on it, what vanishes is so small a part of what it is at another; around it
 H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
-
-
 TOO_LONG = 0.05  # energy error, over the size of the energy, of a run whose step is too long
 PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
 """Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
@@ -55,7 +52,6 @@ FEWEST_NEAR, LOST_DIGITS = 100, 1e-9
 that share of errors there is told."""
 STATES_COMPARED, MOST_COMPARED = 16, 64
 """Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
-
 MANY_TIMES = 1000.0  # times the certified energy error of a flow beyond which an error outside its domain is warned of
 _TOLD: WeakSet[Any] = WeakSet()
 

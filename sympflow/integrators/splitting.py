@@ -162,7 +162,6 @@ class Splitting(FixedStep):
     shift: float | None = None
     omega: float | None = None
     corrector: int | None = None
-
     scheme: ClassVar[Scheme]
     symplectic: ClassVar[bool] = True
     compiles: ClassVar[bool] = True
