@@ -672,16 +672,6 @@ def check_start(flow: KnownFlow, system: HamiltonianSystem, y0: Array, compiled:
         )
 
 
-def _meaning(flow: KnownFlow | None) -> str:
-    """The worth of a trained flow outside its domain: a primed one still evaluates the system's own forces there."""
-    if flow is None or any(flow.evaluations(1, 1, 0, "array").values()):
-        return ""
-    return (
-        ", where its network was not trained: it stays finite, even past a singularity, and what it gives from that "
-        "time on means nothing. Start inside the domain, or use a classical method"
-    )
-
-
 def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSystem, action: str) -> None:
     """Note the first output outside the domain, or end the run there."""
     flow = integrator.known_flow(system)
@@ -708,8 +698,14 @@ def check_domain(outcome: Outcome, integrator: Integrator, system: HamiltonianSy
         which = f" (trajectory {', '.join(map(str, index))}, the first of {count})"
     note = f"The state left the domain at t = {t:.15g}{which}"
     if action == "warn":
+        worth = ""
+        if flow is not None and not any(flow.evaluations(1, 1, 0, "array").values()):  # else forces of the system
+            worth = (
+                ", where its network was not trained: it stays finite, even past a singularity, and what it gives from "
+                "that time on means nothing. Start inside the domain, or use a classical method"
+            )
         held = "the figures" if flow is None or flow.certified is None else "the figures and the certificate"
-        outcome.message += f" {note}: {held} of a trained flow do not hold there{_meaning(flow)}."
+        outcome.message += f" {note}: {held} of a trained flow do not hold there{worth}."
         return
     outcome.message = f"{note}. Start inside the domain, or pass on_domain_exit='warn'."
     if inside.ndim == 1:
