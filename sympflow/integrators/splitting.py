@@ -450,8 +450,8 @@ def _note_distance(extension: Composition, found: np.ndarray, outcome: Outcome) 
         which = "" if lost.ndim == 0 else f" of {np.count_nonzero(lost)} of {lost.size} trajectories"
         warn(
             f"The two copies{which} that method {extension.method!r} keeps differ by up to {largest:.3g} of the size "
-            "of the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which the "
-            "copies are bound.",
+            "of the states: these say little about the system. Reduce `dt`, or change `omega`, the strength by which "
+            "the copies are bound.",
             RuntimeWarning,
         )
 
