@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_flag, check_one_of, check_positive, warn
-from sympflow.arrays import Array, to_numpy
+from sympflow.arrays import Array, to_numpy, values
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import checked_shift
@@ -420,9 +420,9 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
     found = None
     if store is not None and "copy_distance" in store.noted:
         found = np.array([store.noted[name] for name in ("copy_distance", "size")])
-    elif len(x):
+    elif len(x) and (seen := values(x)) is not None:  # under vmap those of all lanes, which come first
         with np.errstate(all="ignore"):
-            found = np.asarray(extension.distance(to_numpy(x))).max(0)
+            found = np.asarray(extension.distance(seen)).max(seen.ndim - x.ndim)
     if found is not None:
         _note_distance(extension, found, outcome)
     if stopped is not None:
