@@ -19,6 +19,7 @@ import sympy as sp
 from sympy.core.relational import Relational
 
 from sympflow.hamiltonian.driving import JUMP, MOST_TURNS, Samples, sampled, with_symbols
+from sympflow.hamiltonian.removable import triangle
 
 MISMATCH = 1e-6
 """Share of the values on both sides of a border by which pieces that are joined may differ there: their constants are
@@ -53,7 +54,7 @@ class Border:
         return set().union(self.g.free_symbols, *(f.free_symbols for f in (*self.above, *self.below)))
 
 
-_STEPS = (sp.Heaviside, sp.sign, sp.Abs, sp.acot, sp.atan2, sp.floor)
+_STEPS = (sp.Heaviside, sp.sign, sp.Abs, sp.acot, sp.atan2, sp.floor, sp.Max, sp.Min, triangle)
 
 
 def borders(f: sp.Expr, symbols: Iterable[sp.Symbol]) -> list[Border]:
@@ -63,7 +64,9 @@ def borders(f: sp.Expr, symbols: Iterable[sp.Symbol]) -> list[Border]:
         f = f.replace(sp.frac, lambda x: x - sp.floor(x)).replace(sp.ceiling, lambda x: -sp.floor(-x))
         f = f.replace(sp.Mod, lambda x, m: x - m * sp.floor(x / m))
     sides: dict[sp.Expr, dict[sp.Basic, tuple[Any, Any]]] = {}
-    atoms = [(a, *_sides(a)) for a in f.atoms(*_STEPS, Relational)]
+    atoms = [
+        (a, *_sides(a)) for a in f.atoms(*_STEPS, Relational) if not isinstance(a, sp.Max | sp.Min) or len(a.args) == 2
+    ]
     atoms += [side for a in f.atoms(sp.Function) for side in _sides_of_quotient(a)]
     for a, g, above, below in atoms:
         if g.free_symbols & wanted:
@@ -111,7 +114,7 @@ def _decided(
 
 def _sides(a: sp.Basic) -> tuple[sp.Expr, Any, Any]:
     """The g at whose zeros an atom may jump, without a factor, and the values on either side of it."""
-    x = a.lhs - a.rhs if isinstance(a, Relational) else a.args[0]
+    x = a.args[0] - a.args[1] if isinstance(a, Relational | sp.Max | sp.Min) else a.args[0]
     factor, g = x.primitive() if x.is_Add else x.as_coeff_Mul()
     values: tuple[Any, Any]
     if isinstance(a, Relational):
@@ -122,6 +125,10 @@ def _sides(a: sp.Basic) -> tuple[sp.Expr, Any, Any]:
         values = sp.S.One, sp.S.NegativeOne
     elif isinstance(a, sp.Abs):
         values = x, -x
+    elif isinstance(a, sp.Max | sp.Min):
+        values = a.args if isinstance(a, sp.Max) else a.args[::-1]
+    elif isinstance(a, triangle):
+        return sp.cos(x), *(sp.sin(x) * (sp.pi / 2 - s * sp.cos(x)) for s in (1, -1))
     elif isinstance(a, sp.acot):
         values = sp.pi / 2, -sp.pi / 2
     elif isinstance(a, sp.atan2):
@@ -411,13 +418,13 @@ class Switch:
             jumps = (np.abs(jump) > JUMP * size + doubt).any(-1)
             return jumps | ~((np.abs(jump) > 0) | (change > 0)).any(-1)
 
-    def times(self, low: float, high: float, step: float) -> np.ndarray:
-        """Return the times (n,) between two others at which the expression jumps; `step` as of `Zeros.within`."""
+    def times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
+        """Return the times (n,) at which the expression jumps, or has kinks too; `step` as of `Zeros.within`."""
         if self.zeros.root is not None:
             found = np.array([self.zeros.root])
-            return found[(found > low) & (found < high) & self.at_root]
+            return found[(found > low) & (found < high) & (kinks or self.at_root)]
         found = self.zeros.within(low, high, step)
-        return found[self._jumps(found, step)] if len(found) else found
+        return found[self._jumps(found, step)] if len(found) and not kinks else found
 
 
 def _sampled_at(a: sampled, time: sp.Symbol, samples: Mapping[str, Samples], t: np.ndarray) -> np.ndarray:

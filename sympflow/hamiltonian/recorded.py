@@ -14,7 +14,19 @@ from sympy.core.relational import Relational
 from sympflow.compiler import NotCompiled
 from sympflow.compiler.functions import MOST_DERIVATIVES, apply, where
 from sympflow.compiler.program import Program, Traced
-from sympflow.hamiltonian.removable import Max, Min, sinc
+from sympflow.hamiltonian.removable import (
+    Max,
+    Min,
+    bose,
+    elliptic_e,
+    elliptic_k,
+    expit,
+    hyp2f1,
+    logcosh,
+    sinc,
+    softplus,
+    triangle,
+)
 
 __all__ = ["NotRecorded", "calculated", "can_be_recorded", "check_recorded", "in_symbols"]
 
@@ -47,6 +59,20 @@ def _sinc(x: Any) -> Any:
     return where(near, series, apply("sin", far) / far)
 
 
+FAR = 40.0
+
+
+def _beyond(near: Callable[[Any], Any], far: Callable[[Any, Any], Any]) -> Callable[[Any], Any]:
+    """A function of x where |x| < `FAR`, and beyond, without overflow, of x and exp(−|x|)."""
+
+    def function(x: Any) -> Any:
+        size = where(x > 0.0, x, -x)
+        close = size < FAR
+        return where(close, near(where(close, x, 1.0)), far(x, apply("exp", -size)))
+
+    return function
+
+
 # fmt: off
 _RULES: dict[type, Callable[..., Any]] = {
     sp.exp: lambda x: apply("exp", x), sp.log: lambda x: apply("log", x),
@@ -55,7 +81,13 @@ _RULES: dict[type, Callable[..., Any]] = {
     sp.asin: lambda x: apply("asin", x), sp.acos: lambda x: apply("acos", x), sp.atan: lambda x: apply("atan", x),
     sp.acot: lambda x: apply("atan", 1.0 / x), sp.atan2: lambda y, x: apply("atan2", y, x),
     sp.sinh: lambda x: apply("sinh", x), sp.cosh: lambda x: apply("cosh", x), sp.tanh: lambda x: apply("tanh", x),
-    sp.coth: _reciprocal("tanh"), sp.sech: _reciprocal("cosh"), sp.csch: _reciprocal("sinh"),
+    sp.coth: _reciprocal("tanh"),
+    sp.sech: _beyond(_reciprocal("cosh"), lambda x, e: 2.0 * e),
+    sp.csch: _beyond(_reciprocal("sinh"), lambda x, e: where(x > 0.0, 2.0 * e, -2.0 * e)),
+    expit: _beyond(lambda x: 1.0 / (1.0 + apply("exp", -x)), lambda x, e: where(x > 0.0, 1.0 - e, e)),
+    bose: _beyond(lambda x: 1.0 / apply("expm1", x), lambda x, e: where(x > 0.0, e, -1.0 - e)),
+    softplus: _beyond(lambda x: apply("log1p", apply("exp", x)), lambda x, e: where(x > 0.0, x, 0.0) + e),
+    logcosh: _beyond(lambda x: apply("log", apply("cosh", x)), lambda x, e: where(x > 0.0, x, -x) - math.log(2.0)),
     sp.asinh: lambda x: apply("asinh", x), sp.acosh: lambda x: apply("acosh", x),
     sp.atanh: lambda x: apply("atanh", x), sp.erf: lambda x: apply("erf", x),
     sp.erfc: lambda x: apply("erfc", x), sp.Abs: abs, sp.sign: lambda x: apply("sign", x),
@@ -64,7 +96,9 @@ _RULES: dict[type, Callable[..., Any]] = {
     sp.gamma: lambda x: apply("gamma", x), sp.loggamma: lambda x: where(x > 0.0, apply("lgamma", x), float("nan")),
     sp.lowergamma: lambda s, x: apply("gamma", s) * apply("gammainc", s, x),
     sp.uppergamma: lambda s, x: apply("gamma", s) * apply("gammaincc", s, x),
-    sp.elliptic_k: lambda m: apply("ellipk", m), sp.Ei: lambda x: apply("expi", x),
+    triangle: lambda x: math.pi / 2 - abs(apply("mod", x + math.pi / 2, 2 * math.pi) - math.pi),
+    elliptic_k: lambda m: apply("ellipk", m), elliptic_e: lambda m: apply("ellipe", m),
+    hyp2f1: lambda *x: apply("hyp2f1", *x), sp.Ei: lambda x: apply("expi", x),
     sp.polygamma: lambda n, x: apply(f"polygamma{int(n)}" if n else "digamma", x),
     sp.sinc: _sinc, sp.floor: lambda x: apply("floor", x), sp.Mod: lambda x, y: apply("mod", x, y),
     Max: _folded("max"), Min: _folded("min"), sp.And: _folded("and"), sp.Or: _folded("or"),
@@ -88,7 +122,8 @@ _SYMBOLS: dict[str, Callable[..., sp.Expr]] = {
     "log": sp.log, "log1p": lambda x: sp.log(1 + x), "sin": sp.sin, "cos": sp.cos, "tan": sp.tan, "asin": sp.asin,
     "acos": sp.acos, "atan": sp.atan, "atan2": sp.atan2, "sinh": sp.sinh, "cosh": sp.cosh, "tanh": sp.tanh,
     "asinh": sp.asinh, "acosh": sp.acosh, "atanh": sp.atanh, "erf": sp.erf, "erfc": sp.erfc, "jv": sp.besselj,
-    "yv": sp.bessely, "iv": sp.besseli, "kv": sp.besselk, "gamma": sp.gamma, "ellipk": sp.elliptic_k, "expi": sp.Ei,
+    "yv": sp.bessely, "iv": sp.besseli, "kv": sp.besselk, "gamma": sp.gamma, "ellipk": elliptic_k,
+    "ellipe": elliptic_e, "hyp2f1": hyp2f1, "expi": sp.Ei,
 }
 # fmt: on
 

@@ -46,7 +46,7 @@ from sympflow.hamiltonian.jumps import (
     split_impulses,
 )
 from sympflow.hamiltonian.poles import Poles, SymbolicPoles
-from sympflow.hamiltonian.removable import Max, sinc
+from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
 
 LARGEST, TINY = sys.float_info.max, 1e-150
 MOST_LEFT_OUT = 100
@@ -271,9 +271,9 @@ class SymbolicHamiltonian(Definition):
         own = [border for border in borders(self.H, [self.time]) if border.g.free_symbols == {self.time}]
         return [Switch(border, self.time, self.samples) for border in own]
 
-    def jump_times(self, low: float, high: float, step: float) -> np.ndarray:
+    def jump_times(self, low: float, high: float, step: float, kinks: bool = False) -> np.ndarray:
         found = [samples.jump_times(low, high) for samples in self.samples.values()]
-        found += [each.times(low, high, step) for each in self._switches]
+        found += [each.times(low, high, step, kinks) for each in self._switches]
         times = np.unique(np.concatenate(found)) if found else np.zeros(0)
         return times[np.diff(times, prepend=-np.inf) > 8 * sys.float_info.epsilon * np.abs(times)]
 
@@ -869,7 +869,7 @@ def _modules(library: str, code: list[sp.Expr]) -> list[Any]:
     if library == "torch":
         known |= {"erf", "tensor_erfc"}
     names = {type(f).__name__ for expression in code for f in expression.atoms(sp.Function)} - {"integer_power"}
-    special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise"})
+    special = sorted(names - known - {"Max", "Min", "Abs", "Heaviside", "sign", "Piecewise", *BOUNDED})
     if library == "numpy":
         own = {"integer_power": _integer_power, "Heaviside": np.heaviside}
         return [own | _special_functions(), "scipy", "numpy"] if special else [own, "numpy"]

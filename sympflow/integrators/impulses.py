@@ -23,9 +23,12 @@ ASIDE = 64 * EPS
 
 
 def landings(
-    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True
+    integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float, able: bool = True, kinks: bool = False
 ) -> tuple[str, list[float]]:
-    """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut."""
+    """The warning of a run that loses its order at jumps of H in t; or, if it is `able`, those at which it is cut.
+
+    By fixed steps of more than second order it is cut at `kinks` of H too.
+    """
     if not system.definition.may_jump or not math.isfinite(t1) or t0 == t1:
         return "", []
     dt, label = integrator.step_length(system), integrator.label if integrator.forces_at_ends(system) else None
@@ -40,10 +43,13 @@ def landings(
             )
     else:
         said, times = jumps_met(system, t0, t1, dt, label)
-    able = able and len(times) <= MOST_LANDINGS and not integrator.forces_beyond(system)
-    # all times are known, of which the first ones may be listed
-    if able and times and not len(system.jump_times(max(times), max(t0, t1), step)):
-        return "", times
+    if integrator.forces_beyond(system) or not able:
+        return said, []
+    for bent in {kinks and dt is not None and (integrator.order or 0) > 2, False}:
+        times = system.jump_times(min(t0, t1), max(t0, t1), step, True).tolist() if bent else times
+        # all times are known, of which the first ones may be listed
+        if 0 < len(times) <= MOST_LANDINGS and not len(system.jump_times(max(times), max(t0, t1), step, bent)):
+            return "", times
     return said, []
 
 
@@ -58,7 +64,7 @@ def spans(t0: float, t1: float, ends: Collection[float], jumps: Sequence[float])
 
 def pieces_of(integrator: Integrator, system: HamiltonianSystem, t0: float, t1: float) -> list[tuple[float, float]]:
     """The pieces of a run of a system without impulses."""
-    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1)[1])]
+    return [piece[:2] for piece in spans(t0, t1, [], landings(integrator, system, t0, t1, kinks=True)[1])]
 
 
 def run_in_pieces(
