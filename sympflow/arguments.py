@@ -7,6 +7,7 @@ import math
 import os
 import reprlib
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -20,10 +21,8 @@ from numpy.typing import ArrayLike
 from sympflow.arrays import differentiable, is_tensor, to_numpy, without_torch
 
 MAX_SAVED_VALUES = 10_000_000
-MAX_ASKED_VALUES = 1_000_000_000
-"""Values of a batch, or of outputs that were asked for one by one: 8 GB."""
-LONGEST_STEP = 1e100
-"""Beyond it the powers of dt in a step are no floating-point numbers."""
+MAX_ASKED_VALUES = 1_000_000_000  # values of a batch, or of outputs that were asked for one by one: 8 GB
+LONGEST_STEP = 1e100  # beyond it the powers of dt in a step are no floating-point numbers
 _FLOAT64 = np.dtype(np.float64)
 _PLAIN = {float, int}
 FEWEST_TIMES = 8  # floating-point numbers that an interval must span
@@ -357,3 +356,19 @@ def naming_path(path: Path) -> Iterator[None]:
     except OSError as error:
         why = error.strerror or type(error).__name__
         raise ValueError(f"`path` {str(path)!r} cannot be written ({why}): name a file that can be.") from error
+
+
+def put_file(path: Path, content: bytes, durable: bool = True) -> None:
+    """Write a file beside its place and move it there in one step; `durable` once the disk has it."""
+    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".new-")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        os.chmod(unfinished, 0o644)
+        os.replace(unfinished, path)
+    except BaseException:
+        Path(unfinished).unlink(missing_ok=True)
+        raise

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-Array = Any
-"""A NumPy array or a torch tensor."""
+Array = Any  # a NumPy array or a torch tensor
 
 
 def is_tensor(x: object) -> bool:
@@ -131,14 +130,7 @@ def per_state(h: Any, y: Array) -> Any:
 
 
 def to_numpy(x: Array) -> np.ndarray:
-    """A NumPy view or copy of `x`, detached from any graph.
-
-    Raises
-    ------
-    TypeError
-        If `x` has no such values: inside `torch.func.vmap` it stands for many arrays, and in a graph that
-        `torch.compile` traces for none.
-    """
+    """The values of `x`, in no graph; a TypeError where it stands for many arrays, as under vmap, or none."""
     found = values(x)
     if found is None or (found is not x and found.ndim != np.ndim(x)):
         where = "in a graph that torch.compile traces" if found is None else "inside torch.func.vmap"
@@ -150,19 +142,12 @@ def to_numpy(x: Array) -> np.ndarray:
 
 
 def differentiable(*arrays: Any) -> bool:
-    """Return True if torch follows one of these tensors, so that NumPy would silently drop what it follows.
-
-    That is a graph (reverse mode), a tangent (forward mode), a transform of `torch.func`, or a graph that
-    `torch.compile` traces.
-    """
+    """Return True if torch follows one of these tensors, by any means: NumPy would silently drop what it follows."""
     return any(map(_is_followed, filter(is_tensor, arrays)))
 
 
 def values(x: Any) -> np.ndarray | None:
-    """Return the values of x, of a tensor (*lanes, *x.shape), the axes first over which `torch.func.vmap` maps.
-
-    None where there are none to be read, in a graph that `torch.compile` traces.
-    """
+    """Return the values of x, of a tensor (*lanes, *x.shape), lanes of vmap first; None where torch.compile traces."""
     if not is_tensor(x):
         return np.asarray(x)
     plain, order = (x, None) if _is_plain(x) else _behind(x)
@@ -176,13 +161,7 @@ def values(x: Any) -> np.ndarray | None:
 
 
 def values_of_times(t: Any, remedy: str) -> np.ndarray:
-    """Return the values of times that say how many steps are made, as `values` does.
-
-    Raises
-    ------
-    TypeError
-        If there are none, with the remedy.
-    """
+    """Return the values of times that say how many steps are made; a TypeError with the remedy if there are none."""
     found = values(t)
     if found is None:
         raise TypeError(
@@ -197,13 +176,7 @@ def has_values(x: Array) -> bool:
 
 
 def one_lane(x: Array) -> np.ndarray:
-    """Return the values of `x`, under `torch.func.vmap` those of the first lane.
-
-    Raises
-    ------
-    TypeError
-        If there are none, in a graph that `torch.compile` traces.
-    """
+    """Return the values of `x`, under `torch.func.vmap` those of the first lane."""
     found = values(x)
     return to_numpy(x) if found is None else found[(0,) * (found.ndim - x.ndim)]
 
@@ -311,16 +284,11 @@ def finite_states(y: Array, *, in_any_lane: bool = False) -> np.ndarray:
         return np.isfinite(y).all(-1)
     if y.device.type == "cpu" and (found := values(y)) is not None and found.ndim == y.ndim:
         return np.isfinite(found).all(-1)
-    finite = values(all_finite(y))
+    finite = values(library(y).isfinite(y).all(-1))
     if finite is None:
         return np.ones(y.shape[:-1], dtype=bool)
     hidden = tuple(range(finite.ndim - y.ndim + 1))
     return np.asarray(finite.any(hidden) if in_any_lane else finite.all(hidden))
-
-
-def all_finite(y: Array) -> Array:
-    """Return True for each of the states y (..., k) that is finite: (...) booleans of the library of y."""
-    return library(y).isfinite(y).all(-1)
 
 
 def full_of_nan(y: Array) -> Array:
@@ -368,6 +336,16 @@ def jvp(f: Callable[[Array], Array], x: Array, v: Array) -> tuple[Array, Array]:
     return y, dy
 
 
+def jacobian(f: Callable[[Array], Array], x: Array, directions: Array | None = None) -> tuple[Array, Array]:
+    """Return f of a tensor x (..., n), and its derivative (..., m, k) along directions (..., n, k), by default all."""
+    import torch
+
+    if directions is None:
+        directions = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
+    found = [jvp(f, x, v + 0 * x.detach()) for v in directions.unbind(-1)]
+    return found[0][0], torch.stack([column for _, column in found], dim=-1)
+
+
 @cache
 def _set_up() -> None:
     """The first forward-mode derivative of a process makes torch import modules that warn of its own deprecations."""
@@ -403,11 +381,8 @@ def detached(x: Any) -> Any:
 def opaque(function: Any, *x: Array) -> Array:
     """Return a function of NumPy arrays of arrays x, or of tensors, which torch differentiates by its own rules.
 
-    Parameters
-    ----------
-    function : object
-        `value(*arrays)`; `jvp(x, v)`, its derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
-        the derivatives of Σ w·value by those of x that are wanted.
+    It has `value(*arrays)`; `jvp(x, v)`, the derivative along v, of which entries may be None; `vjp(x, w, wanted)`,
+    the derivatives of Σ w·value by those of x that are wanted.
     """
     return _opaque_function().apply(function, *x) if is_tensor(x[0]) else function.value(*x)
 

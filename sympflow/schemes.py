@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import pairwise
 from math import comb, factorial, fsum, isfinite, sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -77,6 +77,14 @@ class Substep(NamedTuple):
         """Both in turn, of one kind."""
         e = tuple(map(float.__add__, self.polynomial, other.polynomial))
         return Substep(self.kind, self.one + other.one, self.three + other.three, self.five + other.five, e)
+
+
+_COUNTED: dict[str, Callable[[Substep], bool]] = {
+    "force_evaluations": lambda kick: True,
+    "hessian_evaluations": lambda kick: kick.three != 0 or kick.five != 0,
+    "curvature_evaluations": lambda kick: kick.five != 0,
+}
+"""Evaluations, and the kicks that make them."""
 
 
 @dataclass(frozen=True)
@@ -208,23 +216,33 @@ class Scheme:
     @cached_property
     def force_evaluations(self) -> int:
         """Forces per step in a long run, the last kick merged with the next step's first one."""
-        kinds = [kind for kind, *_ in self.substeps]
-        return kinds.count("kick") - (self.first_same_as_last and kinds[0] == "kick")
+        return self.counts["force_evaluations"][0]
 
     @cached_property
     def hessian_evaluations(self) -> int:
         """Force gradients (Hessian–vector products) per step, counted like `force_evaluations`."""
-        return self._kicks_with(lambda g, c: g != 0.0 or c != 0.0)
+        return self.counts["hessian_evaluations"][0]
 
     @cached_property
     def curvature_evaluations(self) -> int:
         """Curvature terms (third derivatives of V) per step, likewise."""
-        return self._kicks_with(lambda g, c: c != 0.0)
+        return self.counts.get("curvature_evaluations", (0,))[0]
 
-    def _kicks_with(self, has: Callable[[float, float], bool]) -> int:
-        with_it = [has(s.three, s.five) for s in self.substeps if s.kind == "kick"]
-        shared = self.first_same_as_last and self.substeps[0][0] == "kick"
-        return sum(with_it[1:-1] if shared else with_it) + (shared and (with_it[0] or with_it[-1]))
+    @cached_property
+    def counts(self) -> dict[str, tuple[int, int, int]]:
+        """Evaluations of a step in a long run, of a step alone, and of the last kick where the next step shares it."""
+        kicks = [s for s in self.substeps if s.kind == "kick"]
+        shared = self.first_same_as_last and self.substeps[0].kind == "kick"
+        found: dict[str, tuple[int, int, int]] = {}
+        for name, has in _COUNTED.items():
+            of = [has(kick) for kick in kicks]
+            if name != "curvature_evaluations" or any(of):
+                found[name] = (
+                    sum(of[shared : len(of) - shared]) + (shared and (of[0] or of[-1])),
+                    sum(of),
+                    shared and of[-1],
+                )
+        return found
 
     @cached_property
     def strang_weights(self) -> tuple[float, ...] | None:
@@ -345,260 +363,73 @@ _OMELYAN4_LAMBDA = 0.2470939580390842
 _OMELYAN4_THETA = 0.5 - 1.0 / sqrt(24.0 * _OMELYAN4_LAMBDA)
 _OMELYAN4_CHI = (1.0 - sqrt(6.0 * _OMELYAN4_LAMBDA) * (1.0 - _OMELYAN4_LAMBDA)) / 12.0
 
+# fmt: off
 _TABLE = (
-    _scheme(
-        "verlet",
-        2,
-        _kick_first((0.5, 0.5), (1.0,)),
-        "L. Verlet, Phys. Rev. 159 (1967) 98–103; kick–drift–kick form (velocity Verlet)",
-    ),
-    _scheme(
-        "leapfrog",
-        2,
-        _drift_first((0.5, 0.5), (1.0,)),
+    _scheme("verlet", 2, _kick_first((0.5, 0.5), (1.0,)),
+        "L. Verlet, Phys. Rev. 159 (1967) 98–103; kick–drift–kick form (velocity Verlet)"),
+    _scheme("leapfrog", 2, _drift_first((0.5, 0.5), (1.0,)),
         "Störmer–Verlet in drift–kick–drift form; E. Hairer, C. Lubich and G. Wanner, Geometric numerical "
-        "integration illustrated by the Störmer–Verlet method, Acta Numerica 12 (2003) 399–450",
-    ),
-    compose(
-        "yoshida4",
-        4,
-        _palindrome((_YOSHIDA4_WEIGHT,)),
-        f"{_YOSHIDA}, eq. (2.11); E. Forest and R. D. Ruth (1990)",
-    ),
-    compose(
-        "yoshida6",
-        6,
-        _palindrome((0.78451361047755726381949763, 0.23557321335935813368479318, -1.17767998417887100694641568)),
-        f"{_YOSHIDA}, solution A of table 1",
-    ),
-    compose(
-        "suzuki4",
-        4,
-        _palindrome((_SUZUKI4_WEIGHT, _SUZUKI4_WEIGHT)),
-        "M. Suzuki, Fractal decomposition of exponential operators, Phys. Lett. A 146 (1990) 319–323",
-    ),
-    _scheme(
-        "mclachlan4",
-        4,
-        _adjoint_composition(_MCLACHLAN4_ALPHAS),
+        "integration illustrated by the Störmer–Verlet method, Acta Numerica 12 (2003) 399–450"),
+    compose("yoshida4", 4, _palindrome((_YOSHIDA4_WEIGHT,)),
+        f"{_YOSHIDA}, eq. (2.11); E. Forest and R. D. Ruth (1990)"),
+    compose("yoshida6", 6, _palindrome((0.78451361047755726381949763, 0.23557321335935813368479318,
+        -1.17767998417887100694641568)), f"{_YOSHIDA}, solution A of table 1"),
+    compose("suzuki4", 4, _palindrome((_SUZUKI4_WEIGHT, _SUZUKI4_WEIGHT)),
+        "M. Suzuki, Fractal decomposition of exponential operators, Phys. Lett. A 146 (1990) 319–323"),
+    _scheme("mclachlan4", 4, _adjoint_composition(_MCLACHLAN4_ALPHAS),
         "R. I. McLachlan, On the numerical integration of ordinary differential equations by symmetric "
-        "composition methods, SIAM J. Sci. Comput. 16 (1995) 151–168, five stages and their adjoints",
-    ),
-    _scheme(
-        "blanes_moan4",
-        4,
-        _kick_first(
-            _palindrome((0.0792036964311957, 0.353172906049774, -0.0420650803577195)),
-            _even_palindrome((0.209515106613362, -0.143851773179818)),
-        ),
-        f"{_BLANES_MOAN}, table 2, S6 of order 4",
-    ),
-    compose(
-        "kahan_li6",
-        6,
-        _palindrome(
-            (
-                0.39216144400731413927925056,
-                0.33259913678935943859974864,
-                -0.70624617255763935980996482,
-                0.08221359629355080023149045,
-            )
-        ),
-        f"{_KAHAN_LI}, s9odr6a",
-    ),
-    compose(
-        "kahan_li8",
-        8,
-        _palindrome(
-            (
-                0.13020248308889008087881763,
-                0.56116298177510838456196441,
-                -0.38947496264484728640807860,
-                0.15884190655515560089621075,
-                -0.39590389413323757733623154,
-                0.18453964097831570709183254,
-                0.25837438768632204729397911,
-                0.29501172360931029887096624,
-            )
-        ),
-        f"{_KAHAN_LI}, s17odr8a",
-    ),
-    _scheme(
-        "srkn6b",
-        4,
-        _kick_first(
-            _palindrome((0.0829844064174052, 0.396309801498368, -0.0390563049223486)),
-            _even_palindrome((0.245298957184271, 0.604872665711080)),
-        ),
-        f"{_BLANES_MOAN}, table 3, SRKN 6b",  # tuned for a quadratic T; being symmetric, of order 4 for any
-    ),
-    _scheme(
-        "srkn11b",
-        6,
-        _kick_first(
-            _even_palindrome(
-                (
-                    0.0414649985182624,
-                    0.198128671918067,
-                    -0.0400061921041533,
-                    0.0752539843015807,
-                    -0.0115113874206879,
-                )
-            ),
-            _palindrome(
-                (
-                    0.123229775946271,
-                    0.290553797799558,
-                    -0.127049212625417,
-                    -0.246331761062075,
-                    0.357208872795928,
-                )
-            ),
-        ),
-        f"{_BLANES_MOAN}, table 3, SRKN 11b",
-        nystrom=True,
-    ),
-    _scheme(
-        "srkn14a",
-        6,
-        _drift_first(
-            _palindrome(
-                (
-                    0.0378593198406116,
-                    0.102635633102435,
-                    -0.0258678882665587,
-                    0.314241403071447,
-                    -0.130144459517415,
-                    0.106417700369543,
-                    -0.00879424312851058,
-                )
-            ),
-            _even_palindrome(
-                (
-                    0.09171915262446165,
-                    0.183983170005006,
-                    -0.05653436583288827,
-                    0.004914688774712854,
-                    0.143761127168358,
-                    0.328567693746804,
-                )
-            ),
-        ),
-        f"{_BLANES_MOAN}, table 3, SRKN 14a",
-        nystrom=True,
-    ),
-    _scheme(
-        "aba104",
-        4,
-        _drift_first(
-            _even_palindrome(
-                (
-                    0.04706710064597250612947887637243678556564,
-                    0.1847569354170881069247376193702560968574,
-                    0.2827060056798362053243616565541452479160,
-                )
-            ),
-            _palindrome(
-                (
-                    0.1188819173681970199453503950853885936957,
-                    0.2410504605515015657441667865901651105675,
-                    -0.2732866667053238060543113981664559460630,
-                )
-            ),
-        ),
-        f"{_NEARLY_INTEGRABLE}, ABA (10, 4): errors of order εh¹⁰ + ε²h⁴ where kicks are small, of order ε",
-    ),
-    _scheme(
-        "aba864",
-        4,
-        _drift_first(
-            _even_palindrome(
-                (
-                    0.0711334264982231177779387300061549964174,
-                    0.241153427956640098736487795326289649618,
-                    0.521411761772814789212136078067994229991,
-                )
-            ),
-            _palindrome(
-                (
-                    0.183083687472197221961703757166430291072,
-                    0.310782859898574869507522291054262796375,
-                    -0.0265646185119588006972121379164987592663,
-                )
-            ),
-        ),
-        f"{_NEARLY_INTEGRABLE}, ABA (8, 6, 4): errors of order εh⁸ + ε²h⁶ + ε³h⁴ where kicks are small, of order ε",
-    ),
-    _scheme(
-        "aba1064",
-        4,
-        _drift_first(
-            _palindrome(
-                (
-                    0.03809449742241219545697532230863756534060,
-                    0.1452987161169137492940200726606637497442,
-                    0.2076276957255412507162056113249882065158,
-                    0.4359097036515261592231548624010651844006,
-                )
-            ),
-            _even_palindrome(
-                (
-                    0.09585888083707521061077150377145884776921,
-                    0.2044461531429987806805077839164344779763,
-                    0.2170703479789911017143385924306336714532,
-                )
-            ),
-        ),
-        f"{_NEARLY_INTEGRABLE}, ABA (10, 6, 4): errors of order εh¹⁰ + ε²h⁶ + ε³h⁴ where kicks are small, of order ε",
-    ),
-    _scheme(
-        "takahashi_imada",
-        2,
-        _drift_first((0.5, 0.5), (1.0,)),
+        "composition methods, SIAM J. Sci. Comput. 16 (1995) 151–168, five stages and their adjoints"),
+    _scheme("blanes_moan4", 4, _kick_first(_palindrome((0.0792036964311957, 0.353172906049774, -0.0420650803577195)),
+        _even_palindrome((0.209515106613362, -0.143851773179818))), f"{_BLANES_MOAN}, table 2, S6 of order 4"),
+    compose("kahan_li6", 6, _palindrome((0.39216144400731413927925056, 0.33259913678935943859974864,
+        -0.70624617255763935980996482, 0.08221359629355080023149045)), f"{_KAHAN_LI}, s9odr6a"),
+    compose("kahan_li8", 8, _palindrome((0.13020248308889008087881763, 0.56116298177510838456196441,
+        -0.38947496264484728640807860, 0.15884190655515560089621075, -0.39590389413323757733623154,
+        0.18453964097831570709183254, 0.25837438768632204729397911, 0.29501172360931029887096624)),
+        f"{_KAHAN_LI}, s17odr8a"),
+    _scheme("srkn6b", 4, _kick_first(_palindrome((0.0829844064174052, 0.396309801498368, -0.0390563049223486)),
+        _even_palindrome((0.245298957184271, 0.604872665711080))), f"{_BLANES_MOAN}, table 3, SRKN 6b"),
+    _scheme("srkn11b", 6, _kick_first(
+        _even_palindrome((0.0414649985182624, 0.198128671918067, -0.0400061921041533, 0.0752539843015807,
+        -0.0115113874206879)),
+        _palindrome((0.123229775946271, 0.290553797799558, -0.127049212625417, -0.246331761062075,
+        0.357208872795928))), f"{_BLANES_MOAN}, table 3, SRKN 11b",
+        nystrom=True),
+    _scheme("srkn14a", 6, _drift_first(_palindrome((0.0378593198406116, 0.102635633102435, -0.0258678882665587,
+        0.314241403071447, -0.130144459517415, 0.106417700369543, -0.00879424312851058)),
+        _even_palindrome((0.09171915262446165, 0.183983170005006, -0.05653436583288827, 0.004914688774712854,
+        0.143761127168358, 0.328567693746804))), f"{_BLANES_MOAN}, table 3, SRKN 14a", nystrom=True),
+    _scheme("aba104", 4, _drift_first(_even_palindrome((0.04706710064597250612947887637243678556564,
+        0.1847569354170881069247376193702560968574, 0.2827060056798362053243616565541452479160)),
+        _palindrome((0.1188819173681970199453503950853885936957, 0.2410504605515015657441667865901651105675,
+        -0.2732866667053238060543113981664559460630))),
+        f"{_NEARLY_INTEGRABLE}, ABA (10, 4): errors of order εh¹⁰ + ε²h⁴ where kicks are small, of order ε"),
+    _scheme("aba864", 4, _drift_first(_even_palindrome((0.0711334264982231177779387300061549964174,
+        0.241153427956640098736487795326289649618, 0.521411761772814789212136078067994229991)),
+        _palindrome((0.183083687472197221961703757166430291072, 0.310782859898574869507522291054262796375,
+        -0.0265646185119588006972121379164987592663))),
+        f"{_NEARLY_INTEGRABLE}, ABA (8, 6, 4): errors of order εh⁸ + ε²h⁶ + ε³h⁴ where kicks are small, of order ε"),
+    _scheme("aba1064", 4, _drift_first(_palindrome((0.03809449742241219545697532230863756534060,
+        0.1452987161169137492940200726606637497442, 0.2076276957255412507162056113249882065158,
+        0.4359097036515261592231548624010651844006)), _even_palindrome((0.09585888083707521061077150377145884776921,
+        0.2044461531429987806805077839164344779763, 0.2170703479789911017143385924306336714532))),
+        f"{_NEARLY_INTEGRABLE}, ABA (10, 6, 4): errors of order εh¹⁰ + ε²h⁶ + ε³h⁴ where kicks are small, of order ε"),
+    _scheme("takahashi_imada", 2, _drift_first((0.5, 0.5), (1.0,)),
         "M. Takahashi and M. Imada, Monte Carlo calculation of quantum systems, II: higher order correction, J. Phys. "
         "Soc. Japan 53 (1984) 3765–3769; of order 4 in other coordinates: G. Rowlands, A numerical algorithm for "
-        "Hamiltonian systems, J. Comput. Phys. 97 (1991) 235–239",
-        gradients={1: 1.0 / 12.0},
-    ),
-    _scheme(
-        "chin4a",
-        4,
-        _kick_first((1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0), (0.5, 0.5)),
-        f"{_CHIN}, scheme A",
-        gradients={1: 1.0 / 36.0},
-    ),
-    _scheme(
-        "chin4c",
-        4,
-        _drift_first((1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0), (3.0 / 8.0, 1.0 / 4.0, 3.0 / 8.0)),
-        f"{_CHIN}, scheme C",
-        gradients={2: 1.0 / 96.0},
-    ),
-    _scheme(
-        "omelyan4",
-        4,
-        _drift_first(
-            _even_palindrome((_OMELYAN4_THETA,)),
-            _palindrome((_OMELYAN4_LAMBDA,)),
-        ),
-        f"{_OMELYAN}, eqs. (38)–(42), three forces and one force gradient",
-        gradients={2: 2.0 * _OMELYAN4_CHI},
-    ),
-    _scheme(
-        "omelyan6",
-        6,
-        _drift_first(
-            _even_palindrome((0.1097059723948682, 0.4140632267310831)),
-            _palindrome((0.2693315848935301, 1.1319803486515564)),
-        ),
+        "Hamiltonian systems, J. Comput. Phys. 97 (1991) 235–239", gradients={1: 1.0 / 12.0}),
+    _scheme("chin4a", 4, _kick_first((1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0), (0.5, 0.5)), f"{_CHIN}, scheme A",
+        gradients={1: 1.0 / 36.0}),
+    _scheme("chin4c", 4, _drift_first((1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0), (3.0 / 8.0, 1.0 / 4.0, 3.0 / 8.0)),
+        f"{_CHIN}, scheme C", gradients={2: 1.0 / 96.0}),
+    _scheme("omelyan4", 4, _drift_first(_even_palindrome((_OMELYAN4_THETA,)), _palindrome((_OMELYAN4_LAMBDA,))),
+        f"{_OMELYAN}, eqs. (38)–(42), three forces and one force gradient", gradients={2: 2.0 * _OMELYAN4_CHI}),
+    _scheme("omelyan6", 6, _drift_first(_even_palindrome((0.1097059723948682, 0.4140632267310831)),
+        _palindrome((0.2693315848935301, 1.1319803486515564))),
         f"{_OMELYAN}, eqs. (50)–(51), five forces and three force gradients",
-        gradients={
-            1: 2.0 * 0.0008642161339706166,
-            3: -2.0 * 0.01324638643416052,
-            5: 2.0 * 0.0008642161339706166,
-        },
-    ),
+        gradients={1: 2.0 * 0.0008642161339706166, 3: -2.0 * 0.01324638643416052, 5: 2.0 * 0.0008642161339706166}),
 )
+# fmt: on
 
 SCHEMES: dict[str, Scheme] = {scheme.name: scheme for scheme in _TABLE}
 
@@ -680,30 +511,11 @@ def checked_scheme(scheme: Any) -> Scheme:
 
 def scheme_evaluations(scheme: Scheme, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
     """Evaluations of the force, of force gradients and of curvature terms in a run, as `FixedStep.evaluations`."""
+    counts = scheme.counts.items()
     if backend != "compiled":
-        return {name: (n_steps + n_extra) * whole for name, _, whole, _ in _costs(scheme)}
+        return {name: (n_steps + n_extra) * whole for name, (_, whole, _) in counts}
     # compiled, the last kick of a step is merged with the next step's first, except where a state is saved
-    return {
-        name: n_steps * of_a_step + n_saved * closing + n_extra * whole
-        for name, of_a_step, whole, closing in _costs(scheme)
-    }
-
-
-@lru_cache(maxsize=256)
-def _costs(scheme: Scheme) -> tuple[tuple[str, int, int, int], ...]:
-    """Names of evaluations, with those of a step in a long run, of a step alone, and of the last kick if it is shared.
-
-    Where it is shared, it is executed once more for each state that is saved.
-    """
-    kicks = [(True, s.three != 0 or s.five != 0, s.five != 0) for s in scheme.substeps if s.kind == "kick"]
-    shared = len(kicks) > scheme.force_evaluations
-    counts = [("force_evaluations", scheme.force_evaluations), ("hessian_evaluations", scheme.hessian_evaluations)]
-    if any(scheme.curvatures):
-        counts.append(("curvature_evaluations", scheme.curvature_evaluations))
-    return tuple(
-        (name, of_a_step, sum(kick[i] for kick in kicks), int(shared and kicks[-1][i]))
-        for i, (name, of_a_step) in enumerate(counts)
-    )
+    return {name: n_steps * run + n_saved * closing + n_extra * whole for name, (run, whole, closing) in counts}
 
 
 # pairs of a kick and a drift -----------------------------------------------------------------------------------------

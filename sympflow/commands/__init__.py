@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperCommand
 
 from sympflow._version import __version__
@@ -41,7 +42,7 @@ app.command(cls=Command)(learning.learn)
 
 
 @app.callback(invoke_without_command=True)
-def _sympflow(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
+def _sympflow(version: Annotated[bool, Option("--version", help="Print the version and leave.")] = False) -> None:
     """Structure-preserving integration of Hamiltonian systems, classical and learned."""
     if version:
         out.print(__version__)

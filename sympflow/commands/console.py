@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.console import Console
+from typer import Option
 
 from sympflow.commands.words import Scene, Usage
 from sympflow.show.cards import cut
@@ -23,7 +24,7 @@ out = Console(soft_wrap=True, highlight=False)
 err = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
-OPTIONS = {
+OPTIONS = {  # arguments of the library that commands have by other names: the first one counts that the command has
     "t_span": ("t_end",),
     "t_eval": ("n_outputs",),
     "method": ("method_name", "method_names"),
@@ -33,7 +34,6 @@ OPTIONS = {
     "n": ("batch", "orbits"),
     "dtype": ("dtypes",),
 }
-"""Arguments of the library that commands have by other names: the first one counts that the command has."""
 COMMANDS = {"poincare_section": "section", "work_precision": "bench", "available": "methods", "shipped_flows": "flows"}
 """Functions of the library that are commands by other names."""
 PHRASES: dict[str, str | Callable[[re.Match[str]], str]] = {
@@ -62,10 +62,7 @@ OF_METHODS = "rtol", "atol", "max_step", "max_steps", "splitting", "clock", "shi
 
 
 def in_options(message: str, context: typer.Context) -> str:
-    """A message of the library in the options of the command that runs: `t_span` is `--t-end`, backend='array' too.
-
-    Arguments that the command has no option for stay as they are.
-    """
+    """A message of the library in the options of the command: `t_span` is `--t-end`, backend='array' too."""
     parameters = context.command.params
     named = {
         str(p.name): max(p.opts, key=lambda word: (word.startswith("--"), -p.opts.index(word))) for p in parameters
@@ -129,10 +126,13 @@ def _set_quiet(quiet: bool) -> bool:
 
 Quiet = Annotated[
     bool,
-    typer.Option(
-        "--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."
-    ),
+    Option("--quiet", "-q", callback=_set_quiet, is_eager=True, help="Print errors and warnings alone; files as ever."),
 ]
+
+
+def asked(context: typer.Context, names: str) -> dict[str, Any]:
+    """The options of these names that were given, for a function of the library that takes them by the same names."""
+    return {name: context.params[name] for name in names.split() if context.params[name] is not None}
 
 
 @contextlib.contextmanager
@@ -161,30 +161,19 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], width: int
     out.print(text_table(columns), markup=False)
 
 
-def ready_folder(folder: Path) -> None:
-    """Make the folder of `--out`, and be sure that files and figures can be written there, before anything is computed.
-
-    Raises
-    ------
-    ValueError
-        If the folder cannot be made or written to.
-    ImportError
-        Without matplotlib, which draws the figures.
-    """
+def ready_folder(folder: Path | None) -> None:
+    """Make the folder of `--out`, and be sure that files and figures can be written, before anything is computed."""
     from sympflow.show.style import new_figure
 
-    new_figure(1, 1)
-    _ready(folder, folder, "a folder")
+    if folder is not None:
+        new_figure(1, 1)
+        _ready(folder, folder, "a folder")
 
 
-def ready_file(path: Path, option: str = "--out") -> None:
-    """Make the folder of the file of an option, and be sure that it can be written, before anything is computed.
-
-    Raises
-    ------
-    ValueError
-        If it cannot.
-    """
+def ready_file(path: Path | None, option: str = "--out") -> None:
+    """Make the folder of an option's file, and be sure that it can be written, before anything is computed."""
+    if path is None:
+        return
     if path.is_dir():
         raise ValueError(f"`{option}` {str(path)!r} is a folder: name a file in it.")
     _ready(path.parent, path, "a file", option)
@@ -211,6 +200,11 @@ def write_solution(sol: Any, path: Path) -> None:
     d = sol.system.ndof
     names = ["t", *(f"{v}{i}" if d > 1 else v for v in "qp" for i in range(1, d + 1))]
     np.savetxt(path, np.column_stack([sol.t, sol.y.T]), delimiter=",", header=",".join(names), comments="", fmt="%.17g")
+
+
+def tell(folder: Path, written: list[Path]) -> None:
+    """Say which files were written to a folder."""
+    out.print(f"\nWritten to {folder}: {', '.join(path.name for path in written)}")
 
 
 def write_comparisons(

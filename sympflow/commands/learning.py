@@ -3,58 +3,55 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Option
 
-from sympflow.commands.console import Quiet, out, print_table, ready_file, reporting, show
-from sympflow.commands.words import Usage, one_scene
+from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, reporting, show
+from sympflow.commands.words import File, Number, Text, Usage, numbers, one_scene, parsed
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
-    from sympflow.learning.trajectories import Trajectories
 
 
 def learn(
     ctx: typer.Context,
     data: Annotated[Path, typer.Argument(help="A CSV, Parquet, npz, NetCDF or zarr file: t, q1 …, p1 …, the orbit.")],
-    ndof: Annotated[int | None, typer.Option(help="Degrees of freedom, where columns bear other names.")] = None,
-    dt: Annotated[float | None, typer.Option(help="Δt of the flow. Default: what suits its frequencies.")] = None,
-    noise: Annotated[float | None, typer.Option(help="Standard deviation of the data. Default: estimated.")] = None,
-    period: Annotated[float | None, typer.Option(help="Of all q, if these are angles.")] = None,
-    damping: Annotated[bool, typer.Option("--damping", help="Learn a rate of friction as well.")] = False,
-    drag: Annotated[bool, typer.Option("--drag", help="Learn quadratic drag in place of that.")] = False,
-    drive: Annotated[
-        str | None, typer.Option(help="Learn a drive as well: its angular frequency, about, or find.")
-    ] = None,
+    ndof: Annotated[int | None, Option(help="Degrees of freedom, where columns bear other names.")] = None,
+    dt: Annotated[Number, Option(help="Δt of the flow. Default: what suits its frequencies.")] = None,
+    noise: Annotated[Number, Option(help="Standard deviation of the data. Default: estimated.")] = None,
+    period: Annotated[Number, Option(help="Of all q, if these are angles.")] = None,
+    damping: Annotated[bool, Option("--damping", help="Learn a rate of friction as well.")] = False,
+    drag: Annotated[bool, Option("--drag", help="Learn quadratic drag in place of that.")] = False,
+    drive: Annotated[Text, Option(help="Learn a drive as well: its angular frequency, about, or find.")] = None,
     separable: Annotated[
         bool | None,
-        typer.Option("--separable/--not-separable", help="H = T(p) + V(q), or known not to be. Default: by the data."),
+        Option("--separable/--not-separable", help="H = T(p) + V(q), or known not to be. Default: by the data."),
     ] = None,
-    mass: Annotated[str | None, typer.Option(help="M of T = p²/2M, one number or d of them, as 1,2.5.")] = None,
+    mass: Annotated[Text, Option(help="M of T = p²/2M, one number or d of them, as 1,2.5.")] = None,
     known: Annotated[
-        str | None, typer.Option(help="A system that is a part of H, as own.toml or pendulum; the rest is learned.")
+        Text, Option(help="A system that is a part of H, as own.toml or pendulum; the rest is learned.")
     ] = None,
     family: Annotated[
-        str | None, typer.Option(help="The only family of models, as polynomial, network or sympflow. Default: all.")
+        Text, Option(help="The only family of models, as polynomial, network or sympflow. Default: all.")
     ] = None,
     order: Annotated[
-        str, typer.Option(help="Of columns without the names q1 …: halves, q1 q2 p1 p2, or pairs, q1 p1 q2 p2.")
+        str, Option(help="Of columns without the names q1 …: halves, q1 q2 p1 p2, or pairs, q1 p1 q2 p2.")
     ] = "halves",
     observed: Annotated[
-        str,
-        typer.Option(help="qp, states; qv, positions and velocities, of a mass that is not known; q, positions alone."),
+        str, Option(help="qp, states; qv, positions and velocities, of a mass that is not known; q, positions alone.")
     ] = "qp",
-    loss: Annotated[str, typer.Option(help="squares, or huber for data with outliers.")] = "squares",
+    loss: Annotated[str, Option(help="squares, or huber for data with outliers.")] = "squares",
     unit: Annotated[
-        list[str] | None, typer.Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
+        list[str] | None, Option("--unit", help="Units of columns, as t=ms, q=deg, p=deg/ms; may be repeated.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Which trajectories are held out.")] = 0,
-    time_budget: Annotated[float, typer.Option(help="Seconds that it may take.")] = 60.0,
-    checkpoint: Annotated[Path | None, typer.Option(help="File to keep the state of the run in.")] = None,
-    resume: Annotated[Path | None, typer.Option(help="Checkpoint to go on from.")] = None,
-    to: Annotated[Path, typer.Option("--out", help="File for the flow.")] = Path("flow.safetensors"),
-    plot: Annotated[Path | None, typer.Option(help="File for a figure: predictions and energies, held out.")] = None,
+    seed: Annotated[int, Option(help="Which trajectories are held out.")] = 0,
+    time_budget: Annotated[float, Option(help="Seconds that it may take.")] = 60.0,
+    checkpoint: Annotated[File, Option(help="File to keep the state of the run in.")] = None,
+    resume: Annotated[File, Option(help="Checkpoint to go on from.")] = None,
+    to: Annotated[Path, Option("--out", help="File for the flow.")] = Path("flow.safetensors"),
+    plot: Annotated[File, Option(help="File for a figure: predictions and energies, held out.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Learn a flow, and the H behind it, from trajectories.
@@ -78,28 +75,16 @@ def learn(
         if damping and drag:
             raise ValueError("`--drag` is learned in place of `--damping`: leave out one of them.")
         ready_file(to)
-        if plot is not None:
-            ready_file(plot, "--plot")
+        ready_file(plot, "--plot")
         runs = Trajectories.read(data, ndof, units=_units(unit), order=order, period=period, observed=observed)
         out.print(f"{len(runs.runs)} trajectories, {runs.n_points} points, {runs.ndof} degree(s) of freedom")
-        flow = learn_flow(
-            runs,
-            dt=dt,
-            noise=noise,
-            period=period,
-            separable=separable,
-            mass=_masses(mass),
-            damping="quadratic" if drag else damping,
-            drive=_drive(drive),
-            known=_known(known),
-            family=family,
-            loss=loss,
-            seed=seed,
-            time_budget=time_budget,
-            checkpoint=checkpoint,
-            resume=resume,
-            progress=not quiet,
-        )
+        options = asked(ctx, "dt noise period separable family loss seed time_budget checkpoint resume")
+        options["damping"] = "quadratic" if drag else damping
+        found = drive in (None, "find")
+        options["drive"] = bool(drive) if found else parsed("--drive", drive, float, "an angular frequency, or find")
+        masses = parsed("--mass", mass, numbers, "a number, or numbers with commas, as 1,2.5")
+        options["mass"] = masses[0] if masses and len(masses) == 1 else masses
+        flow = learn_flow(runs, known=_known(known), progress=not quiet, **options)
         flow.save(to)
         titles = ["model", "numbers", "held-out loss", "correlation"]
         rows = [
@@ -119,7 +104,9 @@ def learn(
         out.print(", ".join(f"{k} = {v:.3g}" for k, v in shown.items() if v is not None))
         out.print(f"Written: {to}")
         if plot is not None:
-            _draw(flow, runs, seed, plot)
+            from sympflow.learning.figures import held_out_figure
+
+            held_out_figure(flow, runs.split(seed=seed)[1]).savefig(plot, dpi=110)
             out.print(f"Written: {plot}")
 
 
@@ -134,37 +121,9 @@ def _units(given: list[str] | None) -> dict[str, str]:
     return made
 
 
-def _masses(given: str | None) -> float | list[float] | None:
-    """One mass for all coordinates, or one for each."""
-    if given is None:
-        return None
-    try:
-        masses = [float(number) for number in given.split(",")]
-    except ValueError:
-        raise ValueError(f"`--mass` must be a number, or numbers with commas, as 1,2.5; got {given!r}.") from None
-    return masses[0] if len(masses) == 1 else masses
-
-
-def _drive(word: str | None) -> bool | float:
-    """The angular frequency of a drive, True for one that is to be found."""
-    if word is None or word == "find":
-        return word is not None
-    try:
-        return float(word)
-    except ValueError:
-        raise ValueError(f"`--drive` must be an angular frequency, or find; got {word!r}.") from None
-
-
 def _known(word: str | None) -> HamiltonianSystem | None:
     """The part of H that is known."""
     try:
         return None if word is None else one_scene([word]).system
     except ValueError as error:
         raise Usage(str(error).replace("`system`", "`--known`")) from error
-
-
-def _draw(flow: Any, runs: Trajectories, seed: int, path: Path) -> None:
-    """Predictions of the flow beside held-out trajectories, and H along both."""
-    from sympflow.learning.figures import held_out_figure
-
-    held_out_figure(flow, runs.split(seed=seed)[1]).savefig(path, dpi=110)

@@ -3,29 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
+from typer import Option
 
 from sympflow.arguments import MAX_ASKED_VALUES, check_counts
-from sympflow.commands import completion
-from sympflow.commands.console import Quiet, in_options, out, print_table, ready_file, reporting, show, write_solution
-from sympflow.commands.words import (
-    Backend,
-    OneMethod,
-    Own,
-    State,
-    Step,
-    Systems,
-    TEnd,
-    TStart,
-    configured,
-    interval,
-    one_scene,
-    state,
-    widths,
-)
+from sympflow.commands import completion, console, words
+from sympflow.commands.console import Quiet, asked, out, print_table, ready_file, reporting, show
+from sympflow.commands.words import Count, File, Number, OneMethod, Own, State, Step, Systems, TEnd, Text, TStart
 
 
 def solve(
@@ -37,25 +24,15 @@ def solve(
     t_end: TEnd = None,
     y0: State = None,
     dt: Step = None,
-    tol: Annotated[
-        float | None, typer.Option(help="Choose the step, or the shipped flow, for this relative energy error.")
-    ] = None,
-    n_outputs: Annotated[
-        int | None, typer.Option(help="Number of equal intervals between outputs. Default: every step.")
-    ] = None,
-    save_every: Annotated[int | None, typer.Option(help="Only every so many-th step is an output.")] = None,
-    backend: Backend = "auto",
-    to: Annotated[Path | None, typer.Option("--out", help="File for the solution: .csv or .npz.")] = None,
-    store: Annotated[
-        Path | None, typer.Option(help="Folder that takes the outputs as they come, a zarr store.")
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the run in --store, given the same options.")
-    ] = False,
-    checkpoint_every: Annotated[
-        float | None, typer.Option(help="Seconds of work that a kill loses at most. Default: 10.")
-    ] = None,
-    progress: Annotated[bool, typer.Option("--progress", help="Show a bar on stderr.")] = False,
+    tol: Annotated[Number, Option(help="Choose the step, or the shipped flow, for this relative energy error.")] = None,
+    n_outputs: Annotated[Count, Option(help="Number of equal intervals between outputs. Default: every step.")] = None,
+    save_every: Annotated[Count, Option(help="Only every so many-th step is an output.")] = None,
+    backend: words.Backend = "auto",
+    to: Annotated[File, Option("--out", help="File for the solution: .csv or .npz.")] = None,
+    store: Annotated[File, Option(help="Folder that takes the outputs as they come, a zarr store.")] = None,
+    resume: Annotated[bool, Option("--resume", help="Go on with the run in --store, given the same options.")] = False,
+    checkpoint_every: Annotated[Number, Option(help="Seconds of work that a kill loses at most. Default: 10.")] = None,
+    progress: Annotated[bool, Option("--progress", help="Show a bar on stderr.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Solve one system by one method.
@@ -86,31 +63,20 @@ def solve(
 
         if to is not None and to.suffix not in (".csv", ".npz"):
             raise ValueError(f"`--out` must end in .csv or .npz; got {str(to)!r}.")
-        scene = one_scene(system, own)
-        chosen = None if method_name is None else configured(method_name)
-        span = interval(scene, t_start, t_end)
+        scene = words.one_scene(system, own)
+        chosen = None if method_name is None else words.configured(method_name)
+        span = words.interval(scene, t_start, t_end)
         times = None if n_outputs is None else _instants(*span, n_outputs)
+        ready_file(to)
+        options = asked(ctx, "dt tol save_every store checkpoint_every backend resume")
+        options["progress"] = progress and not quiet
+        sol = solve_system(scene.system, chosen, span, words.state(y0), t_eval=times, **options)
         if to is not None:
-            ready_file(to)
-        asked = {"dt": dt, "tol": tol, "save_every": save_every, "store": store, "checkpoint_every": checkpoint_every}
-        options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-        sol = solve_system(
-            scene.system,
-            chosen,
-            span,
-            state(y0),
-            t_eval=times,
-            backend=backend,
-            resume=resume,
-            progress=progress and not quiet,
-            **options,
-        )
-        if to is not None:
-            write_solution(sol, to)
+            console.write_solution(sol, to)
         worst = "" if store is None else f" in {store}"
         if store is None and scene.system.shows_energy:
             worst = f", largest energy error {max_energy_error(sol) if len(sol.t) else np.nan:.2e}"
-        out.print(in_options(sol.message, ctx), markup=False)
+        out.print(console.in_options(sol.message, ctx), markup=False)
         out.print(f"{len(sol.t)} outputs{worst}")
         out.print(", ".join(f"{k} = {v:.4g}" if isinstance(v, float) else f"{k} = {v}" for k, v in sol.stats.items()))
         if store is None and len(sol.t):
@@ -133,52 +99,41 @@ def train(
     ctx: typer.Context,
     system: Systems = None,
     own: Own = None,
-    dt: Annotated[float | None, typer.Option(help="Δt, the longest time of the map. Default: what suits it.")] = None,
+    dt: Annotated[Number, Option(help="Δt, the longest time of the map. Default: what suits it.")] = None,
     kind: Annotated[
-        str | None,
-        typer.Option(
+        Text,
+        Option(
             help="primed (with V and T), sympflow (a network), or mlp (the baseline). Default: the best.",
             autocompletion=completion.of(("primed", "sympflow", "mlp")),
         ),
     ] = None,
-    stages: Annotated[int | None, typer.Option(help="Kicks of a primed flow.")] = None,
-    processor: Annotated[int | None, typer.Option(help="Kicks of a primed flow's processor; 0 for none.")] = None,
-    pairs: Annotated[int | None, typer.Option(help="Pairs of kick and drift of a network. Default: 3.")] = None,
+    stages: Annotated[Count, Option(help="Kicks of a primed flow.")] = None,
+    processor: Annotated[Count, Option(help="Kicks of a primed flow's processor; 0 for none.")] = None,
+    pairs: Annotated[Count, Option(help="Pairs of kick and drift of a network. Default: 3.")] = None,
     hidden: Annotated[
-        str | None, typer.Option(help="Widths of the hidden layers of each potential of a network. Default: 10,10.")
+        Text, Option(help="Widths of the hidden layers of each potential of a network. Default: 10,10.")
     ] = None,
-    activation: Annotated[str | None, typer.Option(help="Activation function of a network. Default: tanh.")] = None,
+    activation: Annotated[Text, Option(help="Activation function of a network. Default: tanh.")] = None,
     optimizer: Annotated[
-        str | None,
-        typer.Option(
+        Text,
+        Option(
             help="gauss-newton, adam, lbfgs or bfgs. Default: gauss-newton for primed flows, else adam.",
             autocompletion=completion.of(("gauss-newton", "adam", "lbfgs", "bfgs")),
         ),
     ] = None,
-    steps: Annotated[
-        int | None, typer.Option("--steps", "--epochs", help="Training steps. Default: the optimizer's.")
-    ] = None,
-    points: Annotated[int | None, typer.Option(help="Collocation points a step. Default: the optimizer's.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="Largest learning rate of adam. Default: 0.005.")] = None,
-    residual_weight: Annotated[float | None, typer.Option(help="Weight of the residual loss.")] = None,
-    matching_weight: Annotated[float | None, typer.Option(help="Weight of Hamiltonian matching.")] = None,
-    label_weight: Annotated[float | None, typer.Option(help="Weight of labels, the exact flow of states.")] = None,
-    restarts: Annotated[int | None, typer.Option(help="Starts of the search for a primed flow.")] = None,
-    time_budget: Annotated[
-        float | None,
-        typer.Option(help="Stop after so many seconds. Default: as long as it takes."),
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that share the starts of a search; -1 for all cores.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of points and initial weights.")] = 0,
-    to: Annotated[
-        Path | None, typer.Option("--out", help="File for the flow. Default: SYSTEM-KIND.safetensors.")
-    ] = None,
-    checkpoint: Annotated[
-        Path | None, typer.Option(help="File for the state of the run, written at intervals.")
-    ] = None,
-    resume: Annotated[Path | None, typer.Option(help="Go on from this checkpoint, given the same options.")] = None,
+    steps: Annotated[Count, Option("--steps", "--epochs", help="Training steps. Default: the optimizer's.")] = None,
+    points: Annotated[Count, Option(help="Collocation points a step. Default: the optimizer's.")] = None,
+    learning_rate: Annotated[Number, Option(help="Largest learning rate of adam. Default: 0.005.")] = None,
+    residual_weight: Annotated[Number, Option(help="Weight of the residual loss.")] = None,
+    matching_weight: Annotated[Number, Option(help="Weight of Hamiltonian matching.")] = None,
+    label_weight: Annotated[Number, Option(help="Weight of labels, the exact flow of states.")] = None,
+    restarts: Annotated[Count, Option(help="Starts of the search for a primed flow.")] = None,
+    time_budget: Annotated[Number, Option(help="Stop after so many seconds. Default: as long as it takes.")] = None,
+    workers: Annotated[Count, Option(help="Processes that share the starts of a search; -1 for all cores.")] = None,
+    seed: Annotated[int, Option(help="Of points and initial weights.")] = 0,
+    to: Annotated[File, Option("--out", help="File for the flow. Default: SYSTEM-KIND.safetensors.")] = None,
+    checkpoint: Annotated[File, Option(help="File for the state of the run, written at intervals.")] = None,
+    resume: Annotated[File, Option(help="Go on from this checkpoint, given the same options.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Train a flow for a system and save it.
@@ -202,33 +157,18 @@ def train(
     with reporting(ctx):
         from sympflow.training.trainer import train as train_flow
 
-        scene = one_scene(system, own)
-        chosen = {
-            "kind": kind,
-            "stages": stages,
-            "processor": processor,
-            "pairs": pairs,
-            "hidden": None if hidden is None else widths(hidden),
-            "activation": activation,
-            "optimizer": optimizer,
-            "steps": steps,
-            "points": points,
-            "learning_rate": learning_rate,
-            "residual_weight": residual_weight,
-            "matching_weight": matching_weight,
-            "label_weight": label_weight,
-            "restarts": restarts,
-            "time_budget": time_budget,
-            "workers": workers,
-        }
-        options: dict[str, Any] = {name: value for name, value in chosen.items() if value is not None}
+        scene = words.one_scene(system, own)
+        options = asked(ctx, "kind stages processor pairs activation optimizer steps points learning_rate restarts")
+        options |= asked(ctx, "residual_weight matching_weight label_weight time_budget workers seed checkpoint resume")
+        if hidden is not None:
+            whole = "whole numbers separated by commas"
+            options["hidden"] = tuple(words.parsed("--hidden", hidden, lambda text: words.numbers(text, int), whole))
         to = to or Path(f"{scene.key}-{kind or 'sympflow'}.safetensors")
         if to.suffix != ".safetensors":
             raise ValueError(f"`--out` must end in .safetensors; got {str(to)!r}.")
         ready_file(to)
-        if checkpoint is not None:
-            ready_file(checkpoint, "--checkpoint")
-        flow = train_flow(scene.system, dt, seed=seed, checkpoint=checkpoint, resume=resume, **options)
+        ready_file(checkpoint, "--checkpoint")
+        flow = train_flow(scene.system, dt, **options)
         flow.save(to)
         figures = [
             (k.replace("_", " "), f"{v:.3g}" if isinstance(v, float) else str(v)) for k, v in flow.figures.items()
@@ -242,20 +182,20 @@ def certificate(
     system: Systems = None,
     own: Own = None,
     flow_name: Annotated[
-        str | None,
-        typer.Option(
+        Text,
+        Option(
             "--flow",
             help="A flow that ships, or a .safetensors file. Default: the one that solve takes.",
             autocompletion=completion.flows,
         ),
     ] = None,
-    t_end: Annotated[float, typer.Option(help="How far the held-out orbits are followed.")] = 1000.0,
-    states: Annotated[int, typer.Option(help="States of the domain in the sample.")] = 2000,
-    times: Annotated[int, typer.Option(help="Times of a step in the sample.")] = 33,
-    held_out: Annotated[int, typer.Option(help="Orbits that are measured.")] = 100,
-    seed: Annotated[int, typer.Option(help="Of the sample and the orbits.")] = 0,
+    t_end: Annotated[float, Option(help="How far the held-out orbits are followed.")] = 1000.0,
+    states: Annotated[int, Option(help="States of the domain in the sample.")] = 2000,
+    times: Annotated[int, Option(help="Times of a step in the sample.")] = 33,
+    held_out: Annotated[int, Option(help="Orbits that are measured.")] = 100,
+    seed: Annotated[int, Option(help="Of the sample and the orbits.")] = 0,
     to: Annotated[
-        Path | None, typer.Option("--out", help="File: .json for the figures, .safetensors for the flow with them.")
+        File, Option("--out", help="File: .json for the figures, .safetensors for the flow with them.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -276,17 +216,16 @@ def certificate(
 
         if to is not None and to.suffix not in (".json", ".safetensors"):
             raise ValueError(f"`--out` must end in .json or .safetensors; got {str(to)!r}.")
-        scene = one_scene(system, own)
+        scene = words.one_scene(system, own)
         if flow_name is None:
             flow = choose(scene.system).load(scene.system)
         elif flow_name.endswith(".safetensors"):
             flow = load(flow_name, system=scene.system)
         else:
             flow = named(flow_name).load(scene.system)
-        if to is not None:
-            ready_file(to)
+        ready_file(to)
         end = t_end if scene.t_end is None else scene.t_end
-        found = flow.certificate(scene.system, states=states, times=times, held_out=held_out, t_end=end, seed=seed)
+        found = flow.certificate(scene.system, t_end=end, **asked(ctx, "states times held_out seed"))
         show(str(found))
         if to is not None:
             if to.suffix == ".json":

@@ -3,43 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
+from typer import Option
 
 from sympflow.arguments import check_counts
-from sympflow.commands import completion
-from sympflow.commands.console import Quiet, out, progress, ready_folder, reporting, show, write_comparisons
-from sympflow.commands.words import (
-    Backend,
-    OneMethod,
-    Own,
-    Scene,
-    State,
-    Step,
-    Systems,
-    TEnd,
-    TStart,
-    configured,
-    interval,
-    methods,
-    one_scene,
-    scenes,
-    state,
-    varied,
-)
+from sympflow.commands import completion, console, words
+from sympflow.commands.console import Quiet, asked, out, progress, ready_folder, reporting, show
+from sympflow.commands.words import Count, File, Number, OneMethod, Own, State, Step, Systems, TEnd, Text, TStart
 
 Methods = Annotated[
     str,
-    typer.Option(
+    Option(
         "--methods",
         "--method",
         help="Separated by commas; options as rk45:rtol=1e-8; also .safetensors files.",
         autocompletion=completion.methods,
     ),
 ]
-Folder = Annotated[Path | None, typer.Option("--out", help="Folder for the figures, CSV and JSON.")]
+Folder = Annotated[File, Option("--out", help="Folder for the figures, CSV and JSON.")]
 METRICS = ("error", "energy", "drift", "volume", "symplecticity", "reversal", "balance", "conformal")
 DIRECTIONS = {"up": 1, "down": -1, "both": 0}
 
@@ -54,23 +38,23 @@ def compare(
     y0: State = None,
     dt: Step = None,
     metrics: Annotated[
-        str | None,
-        typer.Option(
+        Text,
+        Option(
             help="Any of error, energy, drift, volume, symplecticity, reversal; of driven systems balance, of damped "
             "ones conformal. Default: all that apply, but reversal.",
             autocompletion=completion.several(METRICS),
         ),
     ] = None,
-    n_outputs: Annotated[int, typer.Option(help="Number of instants at which every method is measured.")] = 1000,
-    repeats: Annotated[int, typer.Option(help="Timed runs of each method, interleaved.")] = 5,
+    n_outputs: Annotated[int, Option(help="Number of instants at which every method is measured.")] = 1000,
+    repeats: Annotated[int, Option(help="Timed runs of each method, interleaved.")] = 5,
     match: Annotated[
-        str | None,
-        typer.Option(
+        Text,
+        Option(
             help="Tune the methods to the first in: time, evaluations or energy_error.",
             autocompletion=completion.of(("time", "evaluations", "energy_error")),
         ),
     ] = None,
-    backend: Backend = "auto",
+    backend: words.Backend = "auto",
     to: Folder = None,
     quiet: Quiet = False,
 ) -> None:
@@ -88,32 +72,22 @@ def compare(
         from sympflow.studies.comparison import combined_table
         from sympflow.studies.comparison import compare as compare_methods
 
-        chosen, found = methods(method_names), scenes(systems, own)
-        start = state(y0)
-        if to is not None:
-            ready_folder(to)
+        chosen, found = words.methods(method_names), words.scenes(systems, own)
+        options = asked(ctx, "dt n_outputs repeats match backend") | {"y0": words.state(y0)}
+        measured = None if metrics is None else words.listed(metrics)
+        ready_folder(to)
         with progress() as say:
+            options["progress"] = say
+            spans = [words.interval(scene, t_start, t_end) for scene in found]
             comparisons = [
-                compare_methods(
-                    scene.system,
-                    chosen,
-                    None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()],
-                    t_span=interval(scene, t_start, t_end),
-                    y0=start,
-                    dt=dt,
-                    n_outputs=n_outputs,
-                    repeats=repeats,
-                    match=match,
-                    backend=backend,
-                    progress=say,
-                )
-                for scene in found
+                compare_methods(scene.system, chosen, measured, t_span=span, **options)
+                for scene, span in zip(found, spans, strict=True)
             ]
         show(combined_table(comparisons, out.width if out.is_terminal else None))
         if to is not None:
             with progress() as say:
-                written = write_comparisons(comparisons, found, to, say)
-            out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
+                written = console.write_comparisons(comparisons, found, to, say)
+            console.tell(to, written)
         if not any(row.status == "ok" for c in comparisons for row in c.rows):
             raise typer.Exit(1)
 
@@ -127,15 +101,13 @@ def bench(
     t_end: TEnd = None,
     y0: State = None,
     batch: Annotated[
-        int | None,
-        typer.Option(
-            help="Also a batch of this many states of the domain; 0 for none. Default: 1000 if there is a domain."
-        ),
+        Count,
+        Option(help="Also a batch of this many states of the domain; 0 for none. Default: 1000 if there is a domain."),
     ] = None,
-    n_outputs: Annotated[int, typer.Option(help="Number of instants at which errors are measured.")] = 100,
-    repeats: Annotated[int, typer.Option(help="Timed runs of each point, interleaved.")] = 5,
-    budget: Annotated[float, typer.Option(help="Seconds that the repeats of one point may take.")] = 20.0,
-    backend: Backend = "auto",
+    n_outputs: Annotated[int, Option(help="Number of instants at which errors are measured.")] = 100,
+    repeats: Annotated[int, Option(help="Timed runs of each point, interleaved.")] = 5,
+    budget: Annotated[float, Option(help="Seconds that the repeats of one point may take.")] = 20.0,
+    backend: words.Backend = "auto",
     to: Folder = None,
     quiet: Quiet = False,
 ) -> None:
@@ -151,30 +123,20 @@ def bench(
         from sympflow.show.style import save
         from sympflow.studies.precision import work_precision
 
-        chosen, found, start = methods(method_names), scenes(systems, own), state(y0)
-        if to is not None:
-            ready_folder(to)
+        chosen, found = words.methods(method_names), words.scenes(systems, own)
+        options = asked(ctx, "n_outputs repeats budget backend") | {"y0": words.state(y0)}
+        ready_folder(to)
         for scene in found:
+            many = (1000 if batch is None and scene.system.domain is not None else batch) or None
+            span = words.interval(scene, t_start, t_end)
             with progress() as say:
-                report = work_precision(
-                    scene.system,
-                    chosen,
-                    t_span=interval(scene, t_start, t_end),
-                    y0=start,
-                    batch=(1000 if batch is None and scene.system.domain is not None else batch) or None,
-                    n_outputs=n_outputs,
-                    repeats=repeats,
-                    budget=budget,
-                    backend=backend,
-                    progress=say,
-                )
+                report = work_precision(scene.system, chosen, t_span=span, batch=many, progress=say, **options)
             show(report.table())
             if to is not None:
                 name = f"{scene.key}-work-precision"
                 written = [report.to_csv(to / f"{name}.csv"), report.to_json(to / f"{name}.json")]
                 figures = {to / f"{name}.png": report.measure, to / f"{name}-state.png": "error"}
-                written += [save(report.figure(measure), path) for path, measure in figures.items()]
-                out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
+                console.tell(to, written + [save(report.figure(measure), path) for path, measure in figures.items()])
 
 
 def stability(
@@ -182,25 +144,23 @@ def stability(
     systems: Systems = None,
     own: Own = None,
     method_names: Methods = "sympflow, verlet, leapfrog, kahan_li8, implicit_midpoint, rk4, rk45",
-    vary: Annotated[
-        str | None, typer.Option(help="A parameter and its values, for a stability map: omega=1,10,100.")
-    ] = None,
+    vary: Annotated[Text, Option(help="A parameter and its values, for a stability map: omega=1,10,100.")] = None,
     steps: Annotated[
-        str | None, typer.Option(help="Steps, separated by commas. Default: from half the system's to 64 times it.")
+        Text, Option(help="Steps, separated by commas. Default: from half the system's to 64 times it.")
     ] = None,
     t_start: TStart = None,
     t_end: TEnd = None,
     y0: State = None,
-    dtypes: Annotated[str, typer.Option(help="float64, float32 or both, separated by a comma.")] = "float64",
+    dtypes: Annotated[str, Option(help="float64, float32 or both, separated by a comma.")] = "float64",
     metrics: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Any of energy, drift, volume, symplecticity, domain.",
             autocompletion=completion.several(("energy", "drift", "volume", "symplecticity", "domain")),
         ),
     ] = "energy, drift, volume, symplecticity, domain",
-    bound: Annotated[float, typer.Option(help="Relative energy error above which a run counts as unstable.")] = 1e3,
-    limits: Annotated[bool, typer.Option(help="Find the longest stable step by bisection.")] = True,
+    bound: Annotated[float, Option(help="Relative energy error above which a run counts as unstable.")] = 1e3,
+    limits: Annotated[bool, Option(help="Find the longest stable step by bisection.")] = True,
     to: Folder = None,
     quiet: Quiet = False,
 ) -> None:
@@ -215,34 +175,25 @@ def stability(
     with reporting(ctx):
         from sympflow.studies.step_stability import stability as find_stability
 
-        chosen, found = methods(method_names), scenes(systems, own)
-        lengths = None if steps is None else [_number("--steps", word) for word in steps.split(",")]
-        if to is not None:
-            ready_folder(to)
+        chosen, found = words.methods(method_names), words.scenes(systems, own)
+        options = asked(ctx, "bound limits") | {"dtypes": words.listed(dtypes), "metrics": words.listed(metrics)}
+        options["steps"] = words.parsed("--steps", steps, words.numbers, "numbers separated by commas")
+        ready_folder(to)
         for scene in found:
             family = [scene.system]
             if vary is not None:
-                name, values = varied(scene, vary)
+                name, values = words.varied(scene, vary)
                 family = [scene.factory(**(scene.params | {name: value})) for value in values]
-            span = None if (scene.t_end, t_start, t_end) == (None, None, None) else interval(scene, t_start, t_end)
+            span = (
+                None if (scene.t_end, t_start, t_end) == (None, None, None) else words.interval(scene, t_start, t_end)
+            )
             with progress() as say:
-                report = find_stability(
-                    family,
-                    chosen,
-                    steps=lengths,
-                    t_span=span,
-                    y0=state(y0),
-                    dtypes=[word.strip() for word in dtypes.split(",") if word.strip()],
-                    metrics=[word.strip() for word in metrics.split(",") if word.strip()],
-                    bound=bound,
-                    limits=limits,
-                    progress=say,
-                )
+                report = find_stability(family, chosen, t_span=span, y0=words.state(y0), progress=say, **options)
             show(report.table())
             if to is not None:
-                written = [report.to_csv(to / f"{scene.key}-stability.csv")]
-                report.plot(to / f"{scene.key}-stability.png")
-                out.print(f"\nWritten to {to}: {written[0].name}, {scene.key}-stability.png")
+                written, picture = report.to_csv(to / f"{scene.key}-stability.csv"), to / f"{scene.key}-stability.png"
+                report.plot(picture)
+                console.tell(to, [written, picture])
 
 
 def section(
@@ -254,40 +205,34 @@ def section(
     t_end: TEnd = None,
     y0: Annotated[
         list[str] | None,
-        typer.Option("--y0", help="Initial state q,p; several times for several orbits. Default: the system's."),
+        Option("--y0", help="Initial state q,p; several times for several orbits. Default: the system's."),
     ] = None,
     energy: Annotated[
-        float | None, typer.Option(help="Instead: states of this energy on the plane, 16 or as many as --orbits.")
+        Number, Option(help="Instead: states of this energy on the plane, 16 or as many as --orbits.")
     ] = None,
-    orbits: Annotated[int | None, typer.Option(help="Instead: so many initial states drawn from the domain.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the states that are drawn.")] = 0,
+    orbits: Annotated[Count, Option(help="Instead: so many initial states drawn from the domain.")] = None,
+    seed: Annotated[int, Option(help="Of the states that are drawn.")] = 0,
     dt: Step = None,
-    tol: Annotated[
-        float | None, typer.Option(help="Take the cheapest shipped flow with so small a relative energy error.")
-    ] = None,
+    tol: Annotated[Number, Option(help="Take the cheapest shipped flow with so small a relative energy error.")] = None,
     coordinate: Annotated[
-        str | None, typer.Option(help="The coordinate that is constant on the plane: q1, p2. Default: the first.")
+        Text, Option(help="The coordinate that is constant on the plane: q1, p2. Default: the first.")
     ] = None,
-    level: Annotated[float | None, typer.Option(help="Its value there. Default: 0.")] = None,
+    level: Annotated[Number, Option(help="Its value there. Default: 0.")] = None,
     direction: Annotated[
-        str | None,
-        typer.Option(help="Crossings up, down or both. Default: up.", autocompletion=completion.of(tuple(DIRECTIONS))),
+        Text, Option(help="Crossings up, down or both. Default: up.", autocompletion=completion.of(tuple(DIRECTIONS)))
     ] = None,
     sample: Annotated[
-        float | None, typer.Option(help="Longest time between two looks at the plane. Default: the system's step.")
+        Number, Option(help="Longest time between two looks at the plane. Default: the system's step.")
     ] = None,
     period: Annotated[
-        float | None,
-        typer.Option(help="Instead of a plane: the states after each period. Default: that of a driven system."),
+        Number, Option(help="Instead of a plane: the states after each period. Default: that of a driven system.")
     ] = None,
-    since: Annotated[float | None, typer.Option(help="Leave out what is before this time.")] = None,
-    axes: Annotated[
-        str | None, typer.Option(help="Coordinates of the figure, as q2,p2. Default: the first other pair.")
-    ] = None,
+    since: Annotated[Number, Option(help="Leave out what is before this time.")] = None,
+    axes: Annotated[Text, Option(help="Coordinates of the figure, as q2,p2. Default: the first other pair.")] = None,
     turn: Annotated[
-        float | None, typer.Option(help="Length of a turn of the first of them, such as 6.283185307 of an angle.")
+        Number, Option(help="Length of a turn of the first of them, such as 6.283185307 of an angle.")
     ] = None,
-    limit: Annotated[int, typer.Option(help="Crossings in the table; the files have all.")] = 20,
+    limit: Annotated[int, Option(help="Crossings in the table; the files have all.")] = 20,
     to: Folder = None,
     quiet: Quiet = False,
 ) -> None:
@@ -307,8 +252,8 @@ def section(
         from sympflow.show.style import save
         from sympflow.studies.poincare import names, poincare_section
 
-        scene, chosen = one_scene(system, own), None if method_name is None else configured(method_name)
-        span = interval(scene, t_start, t_end)
+        scene, chosen = words.one_scene(system, own), None if method_name is None else words.configured(method_name)
+        span = words.interval(scene, t_start, t_end)
         start = None if energy is not None and not y0 else _starts(scene, y0, orbits, seed)
         if direction is not None and direction not in DIRECTIONS:
             raise ValueError(f"`--direction` must be one of {', '.join(DIRECTIONS)}; got {direction!r}.")
@@ -317,14 +262,12 @@ def section(
             known = ", ".join(names(scene.system.ndof))
             raise ValueError(f"`--axes` must be two of {known}, separated by a comma; got {axes!r}.")
         check_counts(limit=limit)
-        if to is not None:
-            ready_folder(to)
-        way = None if direction is None else DIRECTIONS[direction]
-        asked = {"dt": dt, "tol": tol, "coordinate": coordinate, "level": level, "direction": way, "sample": sample}
-        asked |= {"period": period}
+        ready_folder(to)
+        options = asked(ctx, "dt tol coordinate level sample period energy")
+        if direction is not None:
+            options["direction"] = DIRECTIONS[direction]
         if energy is not None:
-            asked |= {"energy": energy, "n": orbits, "seed": seed}
-        options: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+            options |= {"n": orbits, "seed": seed}
         with progress() as say:
             say(f"{scene.key}: {method_name or 'section'}")
             found = poincare_section(scene.system, chosen, span, start, **options)
@@ -334,16 +277,16 @@ def section(
         if to is not None:
             name = to / f"{scene.key}-section"
             figure = found.figure(pair[0], pair[1], turn)
-            written = [found.to_csv(f"{name}.csv"), found.to_json(f"{name}.json"), save(figure, Path(f"{name}.png"))]
-            out.print(f"\nWritten to {to}: {', '.join(p.name for p in written)}")
+            files = [found.to_csv(f"{name}.csv"), found.to_json(f"{name}.json"), save(figure, Path(f"{name}.png"))]
+            console.tell(to, files)
         if not found.success:
             raise typer.Exit(1)
 
 
-def _starts(scene: Scene, y0: list[str] | None, orbits: int | None, seed: int) -> np.ndarray | None:
+def _starts(scene: words.Scene, y0: list[str] | None, orbits: int | None, seed: int) -> np.ndarray | None:
     """The initial states of several orbits: those given, or so many of the domain."""
     if orbits is None:
-        states = [state(words) for words in y0 or ()]
+        states = [words.state(text) for text in y0 or ()]
         if len({row.size for row in states}) > 1:
             raise ValueError("`--y0` must have the same number of components each time it is given.")
         return None if not states else states[0] if len(states) == 1 else np.array(states)
@@ -355,10 +298,3 @@ def _starts(scene: Scene, y0: list[str] | None, orbits: int | None, seed: int) -
     if seed < 0:
         raise ValueError(f"`--seed` must be a whole number from 0 on; got {seed}.")
     return scene.system.domain.sample(orbits, seed=seed)
-
-
-def _number(option: str, word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise ValueError(f"`{option}` must hold numbers separated by commas; got {word!r}.") from error

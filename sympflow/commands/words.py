@@ -14,6 +14,7 @@ from typing import Annotated, Any, overload
 
 import numpy as np
 import typer
+from typer import Option
 
 from sympflow.arguments import check_t_span, is_number_word
 from sympflow.commands import completion
@@ -25,6 +26,11 @@ from sympflow.systems import SYSTEMS, harmonic_oscillator
 from sympflow.systems import available as available_systems
 from sympflow.systems import get as system_named
 from sympflow.systems.user_files import factory as file_factory
+
+Text = str | None
+Number = float | None
+Count = int | None
+File = Path | None
 
 FILE = re.compile(r"(?P<path>.+?\.(?:py|toml))(?::(?P<rest>.*))?", re.DOTALL)
 """A system in a file: file.toml, file.py:name, and parameters behind them."""
@@ -50,7 +56,7 @@ Systems = Annotated[
 ]
 Own = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--system",
         metavar="SYSTEM",
         help="A system, as the argument is; several times for several.",
@@ -58,18 +64,18 @@ Own = Annotated[
     ),
 ]
 OneMethod = Annotated[
-    str | None,
-    typer.Option(
+    Text,
+    Option(
         "--method",
         "--methods",
         help="A name, name:option=value, or a .safetensors file. Default: one that suits the system.",
         autocompletion=completion.one_method,
     ),
 ]
-TStart = Annotated[float | None, typer.Option(help="Start of the interval. Default: the system's.")]
-TEnd = Annotated[float | None, typer.Option(help="End of the interval. Default: the system's.")]
-State = Annotated[str | None, typer.Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
-Step = Annotated[float | None, typer.Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
+TStart = Annotated[Number, Option(help="Start of the interval. Default: the system's.")]
+TEnd = Annotated[Number, Option(help="End of the interval. Default: the system's.")]
+State = Annotated[Text, Option("--y0", help="Initial state q,p: 0.3,-0.3,0.3,0.15. Default: the system's.")]
+Step = Annotated[Number, Option(help="Step of fixed-step methods. Default: the system's, the flow's Δt.")]
 BACKENDS = ("auto", "compiled", "array")
 
 
@@ -80,7 +86,7 @@ def _backend(word: str) -> str:
 
 
 Backend = Annotated[
-    str, typer.Option(help="auto, compiled or array.", callback=_backend, autocompletion=completion.of(BACKENDS))
+    str, Option(help="auto, compiled or array.", callback=_backend, autocompletion=completion.of(BACKENDS))
 ]
 
 
@@ -104,13 +110,7 @@ def factory_of(scene: str) -> Callable[..., HamiltonianSystem]:
 
 
 def made(scene: str, **params: Any) -> HamiltonianSystem:
-    """The system of a scene; one of a plug-in may fail.
-
-    Raises
-    ------
-    ImportError
-        If a plug-in's cannot be loaded or makes something else.
-    """
+    """The system of a scene; an ImportError if a plug-in's cannot be loaded or makes something else."""
     system = factory_of(scene)(**params)
     if not isinstance(system, HamiltonianSystem):
         what = type(system).__name__
@@ -130,20 +130,7 @@ def _making(scene: str) -> Callable[..., HamiltonianSystem]:
 
 @dataclass(frozen=True)
 class Scene:
-    """A system as asked for.
-
-    Attributes
-    ----------
-    key : str
-        Names its files.
-    system : HamiltonianSystem
-    t_end : float or None
-        Where it should end, if that was said.
-    factory : callable
-        Makes the system of other parameters.
-    params : dict
-        The parameters that were said.
-    """
+    """A system as asked for; its key names its files."""
 
     key: str
     system: HamiltonianSystem
@@ -162,16 +149,7 @@ def _defaults(factory: Callable[..., HamiltonianSystem]) -> dict[str, Any]:
 
 
 def scenes(words: Sequence[str] | None, own: Sequence[str] | None = None) -> list[Scene]:
-    """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10:t_end=5`` and ``--omega 100``.
-
-    A parameter behind two dashes holds for every scene that has it. A scene may be one of a file: ``file.toml``,
-    ``file.py:name``. `own` are more of them.
-
-    Raises
-    ------
-    ValueError
-        For a scene or a parameter that does not exist.
-    """
+    """Scenes from words such as ``henon-heiles``, ``harmonic-oscillator:omega=10`` and ``--omega 100``."""
     names, shared = _split(words or ())
     names += own or ()
     if not names:
@@ -248,7 +226,7 @@ def _split(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
 
 
 SYSTEM = "name a scene, of those that `sympflow systems` lists, an own one, file.py:name or file.toml, or write H"
-MEANT = {
+MEANT = {  # options by the names that users try
     **dict.fromkeys(("solver", "integrator", "scheme"), "method"),
     **dict.fromkeys(("steps", "n_steps", "step", "h", "stepsize", "step_size"), "dt"),
     **dict.fromkeys(("t", "tmax", "t_max", "tend", "t_span", "time", "duration", "end"), "t-end"),
@@ -256,9 +234,7 @@ MEANT = {
     **dict.fromkeys(("q0", "p0", "x0", "q", "p", "initial", "ic"), "y0"),
     **dict.fromkeys(("output", "save", "plot", "file", "csv", "o"), "out"),
 }
-"""Options by the names that users try."""
-FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")
-"""A word that is H, and not the name of a scene."""
+FORMULA = re.compile(r"\*|[²³]|(?<![A-Za-z])[qp]\d*\s*[-+/^]")  # a word that is H, and not the name of a scene
 
 
 def _formula(text: str) -> Callable[..., HamiltonianSystem]:
@@ -357,15 +333,14 @@ def varied(scene: Scene, words: str) -> tuple[str, list[Any]]:
     return name, [_value("--vary", word, known[name]) for word in values.split(",")]
 
 
-def methods(words: str) -> list[Any]:
-    """Methods from a list such as ``verlet,rk45:rtol=1e-8,flow.safetensors``, for `compare`.
+def listed(words: str) -> list[str]:
+    """Words that are separated by commas."""
+    return [word.strip() for word in words.split(",") if word.strip()]
 
-    Raises
-    ------
-    ValueError, TypeError
-        For an unknown method or option.
-    """
-    entries = [word.strip() for word in words.split(",") if word.strip()]
+
+def methods(words: str) -> list[Any]:
+    """Methods from a list such as ``verlet,rk45:rtol=1e-8,flow.safetensors``, for `compare`."""
+    entries = listed(words)
     if not entries:
         raise ValueError("`--methods` is empty: give names separated by commas, such as verlet,rk45.")
     return [method(word) for word in entries]
@@ -430,16 +405,18 @@ def state(words: str | None) -> np.ndarray | None:
     return np.array([_float("--y0", word) for word in re.split(r"\s*[,\s]\s*", words.strip("[]() "))])
 
 
-def widths(words: str) -> tuple[int, ...]:
-    """Layer widths from ``10,10``."""
+def parsed(option: str, words: str | None, read: Callable[[str], Any], what: str) -> Any:
+    """The value that an option's words are read as, None without any; a ValueError says what they must be."""
     try:
-        return tuple(int(word) for word in words.split(","))
+        return None if words is None else read(words)
     except ValueError as error:
-        raise ValueError(f"`--hidden` must be whole numbers separated by commas; got {words!r}.") from error
+        raise ValueError(f"`{option}` must be {what}; got {words!r}.") from error
+
+
+def numbers(words: str, kind: Callable[[str], Any] = float) -> list[Any]:
+    """Numbers that are separated by commas."""
+    return [kind(word) for word in words.split(",")]
 
 
 def _float(name: str, word: str) -> float:
-    try:
-        return float(word)
-    except ValueError as error:
-        raise ValueError(f"`{name}` must be a number; got {word!r}.") from error
+    return parsed(name, word, float, "a number")

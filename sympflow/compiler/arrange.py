@@ -86,10 +86,10 @@ class Plan(NamedTuple):
 
 
 class Arrangement:
-    """States, constants, and what is made of them.
+    """States, constants, and what is made of them, as numbers to be calculated with.
 
-    Of `states` names are given, and when each is known, in cycles; of `constants`, which do not change in a run, names.
-    Both are attributes then, as numbers to be calculated with. Without `expand`, products of sums (`times`) stay so.
+    Of `states` names are given, and when each is known, in cycles. Without `expand`, products of sums (`times`) stay
+    so.
     """
 
     def __init__(self, states: Sequence[tuple[str, int]], constants: Sequence[str] = (), expand: bool = True) -> None:
@@ -262,8 +262,8 @@ class Arrangement:
     def moved(self, base: Any, factor: Any, x: Any) -> Any:
         """base + factor·x, of numbers of the body, with the shortest chain.
 
-        Where x is made as u·v + w, it is (factor·u)·v + (base + factor·w) as well, which does not wait for x. Constants
-        alone are not multiplied by the factor before: their product would be rounded alike in each step.
+        Where x is u·v + w, it is (factor·u)·v + (base + factor·w) as well, which does not wait for x. Constants alone
+        are not multiplied by the factor before: their product would be rounded alike in each step.
         """
         return self._moved(base, factor, x).write()
 

@@ -494,10 +494,7 @@ class Code:
         self._begin(after, before)
 
     def loop(self, count: Any, carried: Sequence[Value], body: Callable[..., Sequence[Value]]) -> list[Value]:
-        """Execute `body(k, values)` for k = 0 … count − 1, none if the count is not positive.
-
-        Returns the values after the last one.
-        """
+        """Return the values after `body(k, values)` for k = 0 … count − 1, none if the count is not positive."""
         variables = [self.variable(x) for x in carried]
         with self.over(count) as k:
             for variable, x in zip(variables, body(k, [x.value for x in variables]), strict=True):
@@ -612,10 +609,7 @@ class Sweep:
         self._types: dict[Any, Type] = {}
 
     def get(self, key: Any, d: int, type: Type) -> Value:
-        """The value of a key at the place k + d: read from memory when that is met first, unless it is put there.
-
-        A value that is put is 0 for places before the first one where it was.
-        """
+        """The value of a key at the place k + d: read from memory, or put there, and 0 before the first place."""
         self._types[key] = type
         values = self._values.setdefault(key, {})
         if d not in values:

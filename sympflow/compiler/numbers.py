@@ -13,10 +13,7 @@ __all__ = ["Number"]
 
 
 class Number:
-    """A number of a kind: a subclass says in `apply` what an operation means.
-
-    Operators and functions of mixed operands, numbers of one kind and Python floats, come to `apply` of the number.
-    """
+    """A number of a kind: a subclass says in `apply` what an operation of its numbers and floats means."""
 
     __slots__ = ()
     __array_ufunc__ = None  # NumPy leaves the operators to this class

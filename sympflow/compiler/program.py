@@ -349,8 +349,7 @@ def tangent(outputs: Sequence[Any], x: Sequence[Traced], v: Sequence[Any]) -> li
 def adjoint(program: Program) -> Program:
     """Return the program from the inputs, and from cotangents of the outputs behind them, to those of the inputs.
 
-    In the reverse mode, number by number, or with the derivatives of each output by the inputs and by other outputs
-    that it is made of, which do not wait for cotangents: the better one.
+    In the reverse mode, number by number, or with derivatives by other outputs too, which do not wait: the better one.
     """
     recording, n = program.inputs[0].recording, len(program.outputs)
     cotangents = [recording.input(f"of_{i}") for i in range(n)]

@@ -678,19 +678,7 @@ def _linear_layer(x: Any, weight: Any, bias: Any = None) -> np.ndarray:
 
 
 class Chain(NamedTuple):
-    """A function of x (n,): linear layers one after the other, with a function of each number between two of them.
-
-    Attributes
-    ----------
-    first : Program
-        From x to what the first layer takes.
-    between : list of Program
-        From one number to one, behind each layer but the last.
-    last : Program
-        From x and what the last layer returns to the value.
-    layers : list of (weight, bias)
-        Tensors (to, from) and (to,), or None.
-    """
+    """A function of x (n,): layers (weight, bias), a program of one number between two, others before and behind."""
 
     first: Program
     between: list[Program]
@@ -733,10 +721,7 @@ def _check_inputs(program: Program, inputs: Sequence[Traced]) -> None:
 
 
 def trace(function: Callable[..., Any], names: Sequence[Sequence[str] | str], torch: bool = False) -> Program:
-    """Record a function of arrays, which returns one number; an `Untraceable` has the reason why not.
-
-    Of each argument `names` has those of the elements of an array, or that of a number; `torch` if it takes tensors.
-    """
+    """Record a function of arrays, or of tensors, that returns one number; `names` are those of the elements."""
     inputs, value = _recorded(_Recorded(), function, names, torch)
     return Program(inputs, [value])
 

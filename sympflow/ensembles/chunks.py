@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +21,7 @@ from sympflow.solver import solve
 
 BLOCK = 64
 """Rows that array operations take together: what they round depends on their number, and on a row's place in them."""
-MOST_VALUES = 1 << 21
-"""Values of states that are held at a time, of 16 MB."""
+MOST_VALUES = 1 << 21  # values of states that are held at a time, of 16 MB
 FAILED = -1
 LONGEST_MESSAGE = 400
 
@@ -55,16 +55,7 @@ class Chunk:
     def rows(self, start: int, stop: int) -> Chunk:
         """A chunk of the rows start … stop alone."""
         params = {name: values[start:stop] for name, values in self.params.items()}
-        return Chunk(
-            self.system,
-            self.integrator,
-            self.t_span,
-            self.t_eval,
-            self.y0[start:stop],
-            params,
-            self.backend,
-            self.first + start,
-        )
+        return replace(self, y0=self.y0[start:stop], params=params, first=self.first + start)
 
     def take(self, part: Chunk) -> None:
         """Take over what became of the orbits of `part`, some rows of this chunk."""
@@ -106,10 +97,7 @@ class Chunk:
         return Grid(*self.t_span, length).outputs(None, 1)
 
     def windows(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), one window after another.
-
-        States of an orbit from where it failed are NaN.
-        """
+        """The states along the orbits, in bounded memory: times (m,) and states (n, 2d, m), window by window."""
         times = self.times
         stepper = self._stepper
         most = max(1, MOST_VALUES // self.y0.size)
@@ -160,17 +148,10 @@ class Chunk:
     def _run(self, y: np.ndarray, times: np.ndarray, rows: np.ndarray) -> None:
         """Fill the states of some rows, each of them perhaps more than once."""
         try:
-            sol = solve(
-                self.system,
-                self.integrator,
-                self.t_span,
-                self.y0[rows],
-                params={name: values[rows] for name, values in self.params.items()} or None,
-                t_eval=times,
-                backend=self.backend,
-                on_domain_exit="ignore",
-                diagnose=len(rows) == 1,  # else the messages are those of each orbit, without it
-            )
+            options: dict[str, Any] = {"t_eval": times, "backend": self.backend, "on_domain_exit": "ignore"}
+            options["params"] = {name: values[rows] for name, values in self.params.items()} or None
+            options["diagnose"] = len(rows) == 1  # else the messages are those of each orbit, without it
+            sol = solve(self.system, self.integrator, self.t_span, self.y0[rows], **options)
         except (KeyboardInterrupt, MemoryError):
             raise
         except Exception as error:  # of one orbit, most likely, which is then found

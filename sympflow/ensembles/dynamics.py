@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -14,16 +13,7 @@ from sympflow.compiler import NotCompiled
 from sympflow.ensembles.chunks import BLOCK, MOST_VALUES, Chunk
 from sympflow.ensembles.reductions import Fields, Reduction
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.metrics.chaos import (
-    ALIGNED,
-    ALIGNMENT,
-    NONE,
-    VOLUME,
-    Indicator,
-    check_followed,
-    checked_threshold,
-    indicator,
-)
+from sympflow.metrics.chaos import ALIGNED, ALIGNMENT, NONE, VOLUME, check_followed, checked_threshold, indicator
 from sympflow.metrics.crossings import Plane, crossings
 from sympflow.metrics.escapes import escapes, region_of
 from sympflow.metrics.frequencies import Signal, lines, rotations, signals
@@ -52,14 +42,17 @@ class _Indicator(Reduction):
     """A chaos indicator, and the time at which it was read."""
 
     name: ClassVar[str]
+    fixed: ClassVar[dict[str, Any]]  # arguments of `indicator` that are no options
     own_loops: ClassVar[bool] = True
 
-    @abstractmethod
-    def follow(self, chunk: Chunk, rows: np.ndarray) -> Indicator:
-        """The indicator of some rows."""
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of `indicator`: `k` is the number of vectors."""
+        return self.fixed | {"vectors" if name == "k" else name: value for name, value in vars(self).items()}
 
-    @abstractmethod
-    def vectors(self) -> int: ...
+    def __post_init__(self) -> None:
+        checked_threshold(self.arguments["below"])
+        check_counts(k=self.arguments["vectors"])
 
     def fields(self, problem: Chunk) -> Fields:
         check_followed(_orbits(problem))
@@ -68,12 +61,12 @@ class _Indicator(Reduction):
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:
         value, time = np.full(len(chunk), np.nan), np.full(len(chunk), np.nan)
         try:
-            chunk.integrator.tangent_kernel(chunk.system, self.vectors())
+            chunk.integrator.tangent_kernel(chunk.system, self.arguments["vectors"])
             together = chunk.backend != "array"
         except NotCompiled:
             together = False
         for rows in _blocks(chunk, together):
-            found = self.follow(chunk, rows)
+            found = indicator(_orbits(chunk, rows), backend=chunk.backend, **self.arguments)
             value[rows], time[rows] = found.value, found.t_end
             for i in set(rows[np.asarray(found.status) < 0].tolist()):
                 text = f"The orbit or its deviation vectors ceased to be finite after t = {time[i]:.15g}. Reduce `dt`, "
@@ -87,12 +80,7 @@ class Lyapunov(_Indicator):
 
     seed: int = 0
     name: ClassVar[str] = "lyapunov"
-
-    def vectors(self) -> int:
-        return 1
-
-    def follow(self, chunk: Chunk, rows: np.ndarray) -> Indicator:
-        return indicator(_orbits(chunk, rows), 1, NONE, 0.0, seed=self.seed, backend=chunk.backend)
+    fixed: ClassVar[dict[str, Any]] = {"vectors": 1, "kind": NONE, "below": 0.0}
 
 
 @dataclass(frozen=True)
@@ -102,15 +90,7 @@ class Sali(_Indicator):
     below: float = ALIGNED
     seed: int = 0
     name: ClassVar[str] = "sali"
-
-    def __post_init__(self) -> None:
-        checked_threshold(self.below)
-
-    def vectors(self) -> int:
-        return 2
-
-    def follow(self, chunk: Chunk, rows: np.ndarray) -> Indicator:
-        return indicator(_orbits(chunk, rows), 2, ALIGNMENT, self.below, seed=self.seed, backend=chunk.backend)
+    fixed: ClassVar[dict[str, Any]] = {"vectors": 2, "kind": ALIGNMENT}
 
 
 @dataclass(frozen=True)
@@ -121,21 +101,12 @@ class Gali(_Indicator):
     below: float = ALIGNED
     seed: int = 0
     name: ClassVar[str] = "gali"
-
-    def __post_init__(self) -> None:
-        checked_threshold(self.below)
-        check_counts(k=self.k)
-
-    def vectors(self) -> int:
-        return self.k
+    fixed: ClassVar[dict[str, Any]] = {"kind": VOLUME}
 
     def fields(self, problem: Chunk) -> Fields:
         if not 2 <= self.k <= 2 * problem.system.ndof:
             raise ValueError(f"`k` must be from 2 to {2 * problem.system.ndof}, the dimension; got {self.k}.")
         return super().fields(problem)
-
-    def follow(self, chunk: Chunk, rows: np.ndarray) -> Indicator:
-        return indicator(_orbits(chunk, rows), self.k, VOLUME, self.below, seed=self.seed, backend=chunk.backend)
 
 
 @dataclass(frozen=True)
@@ -186,9 +157,8 @@ class Escape(Reduction):
     own_loops: ClassVar[bool] = True
 
     def fields(self, problem: Chunk) -> Fields:
-        escapes(
-            _orbits(problem)._replace(t_span=(problem.t_span[0],) * 2), region_of(self.outside, problem.system), "auto"
-        )
+        begin = _orbits(problem)._replace(t_span=(problem.t_span[0],) * 2)
+        escapes(begin, region_of(self.outside, problem.system), "auto")
         return {"escape_time": NUMBER, "escape_state": ((problem.y0.shape[1],), np.dtype(float))}
 
     def reduce(self, chunk: Chunk) -> dict[str, np.ndarray]:

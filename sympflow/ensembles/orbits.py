@@ -16,8 +16,7 @@ from sympflow.storage.identity import digest
 DRAWN = 4096
 """States that a sampler draws at a time, from a seed and their number, so that no state depends on the chunks."""
 
-MOST_DIGESTED = 1 << 20
-"""Drawn states that are all compared, to know those of a store."""
+MOST_DIGESTED = 1 << 20  # drawn states that are all compared, to know those of a store
 
 
 @dataclass(frozen=True)
@@ -26,8 +25,7 @@ class Given:
 
     y0: np.ndarray
 
-    together: ClassVar[int] = 1
-    """States of which a chunk should be a multiple."""
+    together: ClassVar[int] = 1  # states of which a chunk should be a multiple
 
     def __len__(self) -> int:
         return len(self.y0)

@@ -17,19 +17,8 @@ from sympflow.integrators.contract import Integrator, method_text
 from sympflow.show.cards import Card, Shown, numbers
 from sympflow.show.pictures import histogram_figure, points_figure
 from sympflow.show.style import saved
-from sympflow.storage.layout import (
-    DOF,
-    NAMED,
-    ORBIT,
-    RESERVED,
-    TIME,
-    axis_name,
-    described,
-    dofs,
-    halves,
-    imported,
-    table,
-)
+from sympflow.storage import layout as names
+from sympflow.storage.layout import DOF, ORBIT, TIME, axis_name, halves, imported
 from sympflow.storage.store import STORABLE, Field, is_name
 
 if TYPE_CHECKING:
@@ -110,10 +99,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Layout:
-    """The axes of an ensemble, `n` orbits at each of their values, and the fields that are kept of each orbit.
-
-    `state` is the field that holds states [q, p] along its first axis; "" if there is none.
-    """
+    """The axes of an ensemble, `n` orbits at each of their values, and the fields that are kept of each orbit."""
 
     axes: dict[str, np.ndarray]
     n: int
@@ -123,7 +109,7 @@ class Layout:
     state: str
 
     def __post_init__(self) -> None:
-        own = {*RESERVED, *self.axes, *dir(Ensemble), *Ensemble.__dataclass_fields__}
+        own = {*names.RESERVED, *self.axes, *dir(Ensemble), *Ensemble.__dataclass_fields__}
         taken = [name for name in self.fields if name in own]
         if taken:
             raise ValueError(f"`reduce` returns {taken[0]!r}, a name that the result has already: take another one.")
@@ -152,7 +138,7 @@ class Layout:
 
     def coordinates(self) -> dict[str, np.ndarray]:
         """Return the values along dimensions, by the names of these."""
-        found = {**{axis_name(name): values for name, values in self.axes.items()}, DOF: dofs(self.ndof)}
+        found = {**{axis_name(name): values for name, values in self.axes.items()}, DOF: names.dofs(self.ndof)}
         if self.state and len(self.fields[self.state][0]) == 2 and self.times is not None:
             found[TIME] = self.times
         return found
@@ -172,15 +158,13 @@ class Layout:
             made[name] = ((name,), values.shape, values.dtype, values.shape)
         missing = {"status": NOT_RUN}
         return {
-            name: Field(*array, attributes=NAMED.get(name, {}), missing=missing.get(name))
+            name: Field(*array, attributes=names.NAMED.get(name, {}), missing=missing.get(name))
             for name, array in made.items()
         }
 
 
-MOST_SHOWN = 10_000_000
-"""Numbers of an ensemble beyond which a notebook shows no figure of it."""
-NOT_RUN = 2
-"""The status of orbits of a store that have not been run yet."""
+MOST_SHOWN = 10_000_000  # numbers of an ensemble beyond which a notebook shows no figure of it
+NOT_RUN = 2  # the status of orbits of a store that have not been run yet
 
 
 class Keeper(Protocol):
@@ -238,7 +222,7 @@ class Memory:
         y0 = self.orbits.states(0, layout.n)
         data |= {f"{letter}0": ((ORBIT, DOF), y0[:, rows]) for letter, rows in halves(layout.ndof)}
         coords = {name: (name, values) for name, values in layout.coordinates().items()}
-        return xr.Dataset(described(data), coords=described(coords), attrs=dict(self.attributes()))
+        return xr.Dataset(names.described(data), coords=names.described(coords), attrs=dict(self.attributes()))
 
 
 @dataclass(repr=False)
@@ -380,4 +364,4 @@ class Ensemble(Shown):
         """
         imported("pandas", "to_dataframe()")
         data = self.to_xarray()
-        return table(data, (*map(axis_name, self.params), ORBIT, TIME))
+        return names.table(data, (*map(axis_name, self.params), ORBIT, TIME))

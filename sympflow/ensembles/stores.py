@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 
 MESSAGES = "messages"
 """The folder of the messages of orbits that failed, a file for each chunk with some; readers of zarr pass over it."""
-KNOWN = "sympflow_ensemble"
-"""The attribute that says of which ensemble a store is."""
+KNOWN = "sympflow_ensemble"  # the attribute that says of which ensemble a store is
 
 
 # what an ensemble is known by ----------------------------------------------------------------------------------------

@@ -34,8 +34,7 @@ from sympflow.workers import LostWorkers, PickledTask, Unpicklable, checked_work
 if TYPE_CHECKING:
     from sympflow.ensembles.stores import EnsembleStore
 
-MOST_WORK = 50_000_000
-"""Steps times degrees of freedom of a chunk, of about a quarter of a second."""
+MOST_WORK = 50_000_000  # steps times degrees of freedom of a chunk, of about a quarter of a second
 LONGEST_CHUNK, SHORTEST_CHUNK = 65536, 64
 PIECES = 16  # chunks, or more, of which a large ensemble is made
 MOST_PIECES = 10_000_000
@@ -255,11 +254,7 @@ def _runs_together(
     y0: np.ndarray,
     backend: str,
 ) -> bool:
-    """True if one compiled run takes orbits with different parameters; else each value has runs of its own.
-
-    It does not depend on the chunk, so that each orbit is run alike in any of them: a value that leaves its part of H
-    as it is, other than 0, 1 and −1, tells for all.
-    """
+    """True if one compiled run takes orbits with different parameters; else each value has runs of its own."""
     from sympflow.hamiltonian.parameter_rows import ParameterRows
 
     if not axes or system.symbols is None:
@@ -325,8 +320,7 @@ class Task:
     fields: Fields = field(default_factory=dict)
     varied: bool = False
     """True if the orbits of a chunk run together whatever their parameters, in loops that take those of each."""
-    ready: set[int] = field(default_factory=set)
-    """Processes in which the method is compiled."""
+    ready: set[int] = field(default_factory=set)  # processes in which the method is compiled
 
     def prepare(self, y0: np.ndarray) -> None:
         """Compile the method, or load it, once in each process, by a few steps from some first orbits (n, 2d)."""

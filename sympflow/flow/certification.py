@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -30,14 +30,11 @@ def certify(
     system: HamiltonianSystem,
     domain: Domain,
     weights: str,
-    *,
-    states: int,
-    times: int,
-    held_out: int,
+    size: Mapping[str, int],
     t_end: float,
-    seed: int,
 ) -> Certificate:
     """Find the certificate of a flow on a domain: `FlowMap.certificate`; `weights` is their checksum."""
+    states, times, held_out, seed = (size[name] for name in ("states", "times", "held_out", "seed"))
     system.check_conservative(
         "which takes energy away, and a certificate bounds the error of an energy that is kept",
         "see flow.figures, or sympflow.reference_error of a run",

@@ -13,17 +13,18 @@ with the c_k trained, orbit and time are exact but for what the series leaves ou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
+from sympflow.arguments import check_counts
 from sympflow.flow.layers import Drift, Kick, Layer
 from sympflow.flow.potentials import Potential, Time
 from sympflow.flow.primed_potentials import KINETIC, POTENTIAL, PrimedPotential
 from sympflow.flow.records import MAX_DEGREE, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, doubles
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.schemes import SCHEMES, scheme_evaluations
@@ -35,12 +36,10 @@ if TYPE_CHECKING:  # a flow needs it only to be compiled
 class ClockPotential(Potential):
     """Σ_k c_k t^(3+2k) B^(k+1)/(k+1), B the last momentum, of d + 1 degrees of freedom; `numbers` are the c_k."""
 
-    def __init__(
-        self, ndof: int, terms: int, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None
-    ) -> None:
+    def __init__(self, ndof: int, terms: int, **like: Any) -> None:
         super().__init__()
         self.ndof = ndof
-        self.numbers = nn.Parameter(torch.zeros(terms, dtype=dtype, device=device))
+        self.numbers = nn.Parameter(torch.zeros(terms, **like))
 
     def value(self, t: Time, x: Tensor) -> Tensor:
         B = x[-1]
@@ -70,32 +69,16 @@ class Share:
 
 
 class ClockedFlow(SystemFlow):
-    """A symmetric splitting scheme on a logarithmic Hamiltonian, and after it the trained clock.
+    """A symmetric splitting scheme on a logarithmic Hamiltonian, and after it the trained clock of so many `terms`.
 
-    Both are odd in the flow's time s, and commute: ψ̄_{−s} = (ψ̄_s)⁻¹, continued to negative s by its formulas. What is
-    trained is the clock; it is no approximation of the exact flow in s, for a scheme is early or late there, but in
-    the physical time: ψ̄_s(x) lies on the solution through x, at the time t that it holds.
-
-    Parameters
-    ----------
-    ndof : int
-        Of the transformed system.
-    scheme : str
-        A symmetric one of `sympflow.schemes.SCHEMES`, without force gradients.
-    terms : int
-        Of the clock.
-    dt : float
-        Δ, the longest step in s.
-    system : HamiltonianSystem, optional
-        One of `sympflow.time_transformed`. Without it the flow has no values.
-    dtype, device
-        Of the parameters.
-
-    Raises
-    ------
-    ValueError
-        If the scheme is not symmetric or has force gradients, or the system has no `shift`.
+    Both are odd in the flow's time s, and commute: ψ̄_{−s} = (ψ̄_s)⁻¹, continued to negative s by its formulas. It is
+    no approximation of the exact flow in s, for a scheme is early or late there, but in the physical time: ψ̄_s(x) lies
+    on the solution through x, at the time t that it holds. `dt` is the longest step in s, `ndof` of the transformed
+    system, one of `sympflow.time_transformed`, without which the flow has no values. A ValueError if the scheme is not
+    symmetric or has force gradients, or the system has no `shift`.
     """
+
+    PLAN = "clocked"
 
     def __init__(
         self,
@@ -104,17 +87,15 @@ class ClockedFlow(SystemFlow):
         terms: int = 8,
         dt: float = 1.0,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt, system)
+        super().__init__(ndof, dt, **like)
         table = SCHEMES.get(scheme)
         if table is None or not table.symmetric or any(table.gradients) or table.nystrom:
             raise ValueError(f"`scheme` {scheme!r} is not a symmetric one without force gradients: take 'leapfrog'.")
-        if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
-            raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
+        check_counts(terms=terms)
         self.scheme = table
-        self.clock = ClockPotential(ndof, terms, checked_dtype(dtype), checked_device(device))
+        self.clock = ClockPotential(ndof, terms, **self._like)
         self._numbers: Kept[tuple[float, ...]] = Kept([self.clock._parameters])
         maps: list[Layer] = []
         for kind, c, *_ in table.substeps:
@@ -123,17 +104,7 @@ class ClockedFlow(SystemFlow):
             maps.append(Drift(potential) if kind == "drift" else Kick(potential))
         # A tuple, not a ModuleList: the clock is the only one with parameters, and they are the flow's.
         self.layers = (*maps, Drift(self.clock))
-        if system is not None:
-            self._check(system)
-            self.identify(system)
-
-    @staticmethod
-    def _check(system: HamiltonianSystem) -> None:
-        check_for_flows(system)
-        if "shift" not in system.params:
-            raise ValueError(
-                "`system` is not a logarithmic Hamiltonian: make one by sympflow.time_transformed(system)."
-            )
+        self._made_of(system)
 
     def _number(self) -> Tensor:
         return self.clock.numbers
@@ -159,16 +130,18 @@ class ClockedFlow(SystemFlow):
         return scheme_evaluations(self.scheme, n_steps, n_saved, n_extra, backend)
 
     def _take(self, system: HamiltonianSystem) -> None:
-        self._check(system)
+        check_for_flows(system)
+        if "shift" not in system.params:
+            raise ValueError(
+                "`system` is not a logarithmic Hamiltonian: make one by sympflow.time_transformed(system)."
+            )
         super()._take(system)
 
-    def architecture(self) -> dict[str, Any]:
-        return {"ndof": self.ndof, "clocked": {"scheme": self.scheme.name, "terms": len(self.clock.numbers)}}
+    def plan(self) -> dict[str, Any]:
+        return {"scheme": self.scheme.name, "terms": len(self.clock.numbers)}
 
     @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        described = plan["clocked"]
-        if not isinstance(described, dict) or not isinstance(described.get("scheme"), str):
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        if not isinstance(plan.get("scheme"), str):
             raise Refused("its scheme is missing")
-        terms = checked_integer(described.get("terms"), "number of terms", MAX_DEGREE)
-        return cls(ndof, described["scheme"], terms, dt, dtype=dtype)
+        return {"scheme": plan["scheme"], "terms": checked_integer(plan.get("terms"), "number of terms", MAX_DEGREE)}

@@ -20,14 +20,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from sympflow.arguments import floats, plain
+from sympflow.arguments import checked_count, floats, plain
 from sympflow.arrays import per_state
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time
-from sympflow.flow.records import Refused, checked_integer
+from sympflow.flow.records import checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import checked_device, checked_dtype
 from sympflow.hamiltonian import collocation
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -109,6 +108,7 @@ class CollocatedFlow(SystemFlow):
     """
 
     takes_friction = True
+    PLAN = "collocated"
     MADE = "made of steps with the H of a system"
 
     def __init__(
@@ -121,17 +121,16 @@ class CollocatedFlow(SystemFlow):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str | None = None,
     ) -> None:
-        super().__init__(ndof, dt, system)
-        self.stages, self.steps = _count("stages", stages, MOST_STAGES), _count("steps", steps, MOST_STEPS)
+        super().__init__(ndof, dt, dtype, device)
+        self.stages = checked_count("stages", plain(stages), 1, MOST_STAGES, f"an integer from 1 to {MOST_STAGES}")
+        self.steps = checked_count("steps", plain(steps), 1, MOST_STEPS, f"an integer from 1 to {MOST_STEPS}")
         self.tableau = collocation.gauss_legendre(self.stages)
         _, B, scale = self.tableau
         weights = [b * unit for b, unit in zip(B, scale, strict=True)] if self.stages > 2 else list(B)
-        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        self.register_buffer("weights", torch.tensor(weights, **like), persistent=False)
+        self.register_buffer("weights", torch.tensor(weights, **self._like), persistent=False)
         # A tuple, not a ModuleList: the layers own nothing.
         self.layers = tuple(CollocationLayer(self) for _ in range(self.steps))
-        if system is not None:
-            self.identify(system)
+        self._made_of(system)
 
     @classmethod
     def of(
@@ -158,16 +157,12 @@ class CollocatedFlow(SystemFlow):
         return made
 
     @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        described = plan["collocated"]
-        if not isinstance(described, dict):
-            raise Refused("its plan of a collocated flow is missing")
-        stages = checked_integer(described.get("stages"), "number of stages", MOST_STAGES)
-        steps = checked_integer(described.get("steps"), "number of steps", MOST_STEPS)
-        return cls(ndof, stages, steps, dt, dtype=dtype)
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        most = {"stages": MOST_STAGES, "steps": MOST_STEPS}
+        return {name: checked_integer(plan.get(name), f"number of {name}", m) for name, m in most.items()}
 
-    def architecture(self) -> dict[str, Any]:
-        return {"ndof": self.ndof, "collocated": {"stages": self.stages, "steps": self.steps}}
+    def plan(self) -> dict[str, Any]:
+        return {"stages": self.stages, "steps": self.steps}
 
     # the maps -----------------------------------------------------------------------------------------------
 
@@ -199,13 +194,6 @@ class CollocatedFlow(SystemFlow):
     def bound_system(self) -> HamiltonianSystem:
         """The system whose H the flow uses."""
         return self._binding.system
-
-
-def _count(name: str, value: Any, most: int) -> int:
-    value = plain(value)
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
-        raise ValueError(f"`{name}` must be an integer from 1 to {most}; got {value!r}.")
-    return value
 
 
 def _checked_states(states: ArrayLike, ndof: int) -> np.ndarray:

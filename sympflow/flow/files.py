@@ -14,7 +14,6 @@ import json
 import math
 import os
 import struct
-import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,24 +26,11 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from sympflow._version import __version__
-from sympflow.arguments import naming_path, writable
+from sympflow.arguments import naming_path, put_file, writable
+from sympflow.flow import records
 from sympflow.flow.families import family_of
 from sympflow.flow.potentials import Unregistered
-from sympflow.flow.records import (
-    FORMAT,
-    KEY,
-    MAX_DT,
-    MAX_HEADER,
-    MAX_WIDTH,
-    MIN_DT,
-    SUM,
-    Provenance,
-    Refused,
-    checked_integer,
-    checked_path,
-    read,
-    text_checksum,
-)
+from sympflow.flow.records import KEY, MAX_DT, MIN_DT, Provenance, Refused, checked_integer, checked_path, text_checksum
 from sympflow.flow.weights import checked_device, checksum
 from sympflow.hamiltonian.system import HamiltonianSystem
 
@@ -69,7 +55,7 @@ def write(
         if not torch.isfinite(value).all():
             raise ValueError(f"`flow` has weights that are not finite ({name}): train it again before saving.")
     record = {
-        "format": FORMAT,
+        "format": records.FORMAT,
         "version": __version__,
         "kind": kind,
         "architecture": architecture,
@@ -93,22 +79,14 @@ def write(
     except Refused as reason:
         raise ValueError(f"`flow` cannot be saved as it is: {reason}. Set it right first.") from None
     text = json.dumps(record, allow_nan=False, separators=(",", ":"))
-    content = save_tensors(tensors, {KEY: text, SUM: text_checksum(text)})
-    if (length := struct.unpack("<Q", content[:8])[0]) > MAX_HEADER:
+    content = save_tensors(tensors, {KEY: text, records.SUM: text_checksum(text)})
+    if (length := struct.unpack("<Q", content[:8])[0]) > records.MAX_HEADER:
         raise ValueError(
-            f"`flow` cannot be saved as it is: its description takes {length:,} bytes, more than {MAX_HEADER:,}. "
-            "Describe its domain with fewer numbers, for instance a Tube around fewer states."
+            f"`flow` cannot be saved as it is: its description takes {length:,} bytes, more than "
+            f"{records.MAX_HEADER:,}. Describe its domain with fewer numbers, for instance a Tube around fewer states."
         )
     with naming_path(writable(file)):
-        handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
-    try:
-        with os.fdopen(handle, "wb") as temporary:
-            temporary.write(content)
-        Path(name).chmod(0o644)
-        os.replace(name, file)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+        put_file(file, content, durable=False)
 
 
 def _finite(value: Any) -> Any:
@@ -157,7 +135,7 @@ def load(
     """
     file, device = checked_path(path), checked_device(device)
     try:
-        content, header, record, altered = read(file)
+        content, header, record, altered = records.read(file)
         flow = _build(record, _dtype_of(header))
         _fill(flow, content, header, record)
         provenance = Provenance.of_record(record, flow.ndof)
@@ -196,7 +174,7 @@ def _build(record: dict[str, Any], dtype: torch.dtype) -> Any:
         raise Refused("its architecture is missing")
     if isinstance(dt, bool) or not isinstance(dt, (int, float)) or not MIN_DT <= dt <= MAX_DT:
         raise Refused(f"its dt {dt!r} is not a number between {MIN_DT:g} and {MAX_DT:g}")
-    ndof = checked_integer(plan.get("ndof"), "ndof", MAX_WIDTH)
+    ndof = checked_integer(plan.get("ndof"), "ndof", records.MAX_WIDTH)
     try:
         return family_of(record["kind"], plan).from_architecture(ndof, plan, dt, dtype)
     except Unregistered as error:

@@ -448,8 +448,8 @@ class FlowMap(KnownFlow, Shown, nn.Module):
         domain = self.bound(system).domain_for(system)
         if domain is None:
             raise ValueError("`flow` has no domain and neither has its system: give the system a `domain`, say a Box.")
-        size: Any = {"states": states, "times": times, "held_out": held_out, "t_end": t_end, "seed": seed}
-        self.certified = certify(self, system, domain, checksum(self.state_dict()), **size)
+        size = {name: value for name, (value, _) in counts.items()}
+        self.certified = certify(self, system, domain, checksum(self.state_dict()), size, t_end)
         return self.certified
 
     def save(self, path: str | os.PathLike[str]) -> None:

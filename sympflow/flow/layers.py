@@ -105,11 +105,33 @@ class Binding:
         return Binding(self._system, self._made, self._parts)
 
 
-class _PotentialLayer(Layer):
+class PotentialLayer(Layer):
+    """A layer that moves p by the impulse of a potential of q, or q by that of one of p."""
+
     def __init__(self, potential: Potential) -> None:
         super().__init__()
         self.potential = potential
         self.ndof = potential.ndof
+
+    def _argument(self, q: Tensor, p: Tensor) -> Tensor:
+        return q if self.kind == "kick" else p
+
+    def _moved(self, q: Tensor, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+        return (q, p - g) if self.kind == "kick" else (q + g, p)
+
+    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self._moved(q, p, self.potential.impulse(t, self._argument(q, p)))
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self._moved(q, p, -self.potential.impulse(t, self._argument(q, p)))
+
+    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        g, dg = self.potential.impulse_and_tangent(t, self._argument(q, p), self._argument(dq, dp))
+        return *self._moved(q, p, g), *self._moved(dq, dp, dg)
+
+    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        g, rate = self.potential.impulse_and_rate(t, self._argument(q, p))
+        return *self._moved(q, p, -g), rate
 
     def to_dict(self) -> dict[str, Any]:
         return {"kind": self.kind, "potential": self.potential.to_dict()}
@@ -121,44 +143,16 @@ class _PotentialLayer(Layer):
         return self.potential.trained()
 
 
-class Kick(_PotentialLayer):
+class Kick(PotentialLayer):
     """φ_t(q, p) = (q, p − (∇V(t, q) − ∇V(0, q))), the flow of H_t = ∂_tV(t, q)."""
 
     kind = "kick"
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return q, p - self.potential.impulse(t, q)
 
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return q, p + self.potential.impulse(t, q)
-
-    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        g, dg = self.potential.impulse_and_tangent(t, q, dq)
-        return q, p - g, dq, dp - dg
-
-    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        g, rate = self.potential.impulse_and_rate(t, q)
-        return q, p + g, rate
-
-
-class Drift(_PotentialLayer):
+class Drift(PotentialLayer):
     """φ_t(q, p) = (q + (∇V(t, p) − ∇V(0, p)), p), the flow of H_t = ∂_tV(t, p)."""
 
     kind = "drift"
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return q + self.potential.impulse(t, p), p
 
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return q - self.potential.impulse(t, p), p
-
-    def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        g, dg = self.potential.impulse_and_tangent(t, p, dp)
-        return q + g, p, dq + dg, dp
-
-    def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        g, rate = self.potential.impulse_and_rate(t, p)
-        return q - g, p, rate
-
-
-LAYERS: dict[str, type[_PotentialLayer]] = {layer.kind: layer for layer in (Kick, Drift)}
+LAYERS: dict[str, type[PotentialLayer]] = {layer.kind: layer for layer in (Kick, Drift)}

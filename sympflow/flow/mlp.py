@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any, Self
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from sympflow.flow.flow_map import FlowMap, to_values
-from sympflow.flow.potentials import activation_named, count_weights, hidden_widths, outer
+from sympflow.flow.potentials import activation_named, count_weights, hidden_widths, outer, uniform_weights
 from sympflow.flow.records import checked_widths
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.sympflow import SympFlow
@@ -61,11 +62,7 @@ class MLPFlow(FlowMap):
         check_memory(f"`hidden` {self.hidden!r}", weights, "take narrower layers")
         scale = Scaling.unit(ndof, dt) if scale is None else scale
         generator = torch.Generator().manual_seed(seed)
-
-        def uniform(*shape: int, fan_in: int) -> nn.Parameter:
-            w = (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1) / fan_in**0.5
-            return nn.Parameter(w.to(dtype=dtype, device=device))
-
+        uniform = partial(uniform_weights, generator=generator, dtype=dtype, device=device)
         widths = (2 * ndof, *self.hidden, 2 * ndof)
         fans = (2 * ndof + 1, *self.hidden)
         self.weights = nn.ParameterList(
@@ -73,13 +70,9 @@ class MLPFlow(FlowMap):
         )
         self.biases = nn.ParameterList(uniform(n, fan_in=fan) for n, fan in zip(widths[1:], fans, strict=True))
         self.weight_t = uniform(self.hidden[0], fan_in=2 * ndof + 1)
-
-        def constant(value: Any) -> Tensor:
-            return torch.as_tensor(value, dtype=dtype, device=device)
-
-        self.register_buffer("scale", constant(list(scale.x)))
-        self.register_buffer("center", constant([*scale.q_center, *scale.p_center]))
-        self.register_buffer("tau", constant(scale.t))
+        center = [*scale.q_center, *scale.p_center]
+        for name, unit in (("scale", list(scale.x)), ("center", center), ("tau", scale.t)):
+            self.register_buffer(name, torch.as_tensor(unit, dtype=dtype, device=device))
 
     @classmethod
     def matching(cls, flow: FlowMap, seed: int = 0, scale: Scaling | None = None, activation: str = "tanh") -> MLPFlow:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from sympflow.flow.layers import OwnLayer
 from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, check_compilable, doubles
 from sympflow.hamiltonian.planets import Frame, frame_of
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
@@ -104,32 +104,15 @@ class PlanetLayer(OwnLayer):
 class KeplerFlow(SystemFlow):
     """A flow of planets about a star with trained coordinates; made by `sympflow.train` of a system of planets.
 
-    Parameters
-    ----------
-    ndof : int
-    reach : int
-        M, in steps.
-    n_gradients : int
-        The number of force gradients, 0 to 2M.
-    dt : float
-        Δt.
-    periods : sequence of float, optional
-        Periods of the planets; the numbers hold for these orbits alone.
-    system : HamiltonianSystem, optional
-        One of `HamiltonianSystem.planets`, in Jacobi's coordinates. Without it the flow has no values.
-    dtype, device
-        Of the parameters.
-
-    Attributes
-    ----------
-    kicks, gradients : Tensor
-        β (2M,) and γ.
-    periods : tuple of float
+    `reach` is M, in steps, `n_gradients` is 0 to 2M, and `periods` those of the planets, for whose orbits alone the
+    numbers `kicks`, β (2M,), and `gradients`, γ, hold. The system is one of `HamiltonianSystem.planets`, in Jacobi's
+    coordinates; without it the flow has no values.
     """
 
     kicks: Tensor
     gradients: Tensor
 
+    PLAN = "kepler"
     MADE = "made of Kepler's motion and the interaction of planets"
 
     def __init__(
@@ -140,20 +123,16 @@ class KeplerFlow(SystemFlow):
         dt: float = 1.0,
         periods: Sequence[float] | None = None,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
-        kind: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
-        self.register_buffer("kicks", torch.zeros(2 * reach, **kind))
-        self.register_buffer("gradients", torch.zeros(n_gradients, **kind))
+        super().__init__(ndof, dt, **like)
+        self.register_buffer("kicks", torch.zeros(2 * reach, **self._like))
+        self.register_buffer("gradients", torch.zeros(n_gradients, **self._like))
         self.periods = None if periods is None else tuple(map(float, periods))
         self._kept: Kept[_Kept] = Kept([self._buffers])
         # A tuple, not a ModuleList: the layers own no numbers.
         self.layers = tuple(PlanetLayer(self, *m) for b, a, _ in BETWEEN for m in ((b, 0.0), (0.0, a)) if any(m))
-        if system is not None:
-            self._take(system)
-            self.identify(system)
+        self._made_of(system)
 
     @property
     def frame(self) -> Frame:
@@ -170,7 +149,7 @@ class KeplerFlow(SystemFlow):
 
     def _frame_of(self, system: HamiltonianSystem) -> Frame:
         """The frame of a system, whose planets are on the orbits for which the numbers hold."""
-        frame = frame_of(system.local, system.y0)
+        frame = frame_of(system)
         if frame is None or not frame.jacobi:
             raise ValueError(
                 f"`system` {system.name!r} has no planets in Jacobi's coordinates, which the flow needs: make it by "
@@ -257,19 +236,15 @@ class KeplerFlow(SystemFlow):
         forces = n_steps + kicks * (1 + n_saved) + sum(kick != 0 for kick, *_ in BETWEEN) * n_extra
         return {"force_evaluations": forces, "hessian_evaluations": 2 * len(self.gradients) * (1 + n_saved)}
 
-    def architecture(self) -> dict[str, Any]:
-        shape = {"reach": len(self.kicks) // 2, "gradients": len(self.gradients), "periods": list(self.periods or ())}
-        return {"ndof": self.ndof, "kepler": shape}
+    def plan(self) -> dict[str, Any]:
+        return {"reach": len(self.kicks) // 2, "gradients": len(self.gradients), "periods": list(self.periods or ())}
 
     @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        shape = plan["kepler"]
-        if not isinstance(shape, dict):
-            raise Refused("its plan of a flow of planets is missing")
-        reach = checked_integer(shape.get("reach"), "reach", MOST_REACH)
-        gradients, periods = shape.get("gradients"), shape.get("periods")
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        reach = checked_integer(plan.get("reach"), "reach", MOST_REACH)
+        gradients, periods = plan.get("gradients"), plan.get("periods")
         if gradients != 0:
             gradients = checked_integer(gradients, "number of force gradients", 2 * reach)
         if not (isinstance(periods, list) and len(periods) == ndof // 3 - 1 and all(map(_is_period, periods))):
             raise Refused("its periods are not those of its planets")
-        return cls(ndof, reach, gradients, dt, periods, dtype=dtype)
+        return {"reach": reach, "n_gradients": gradients, "periods": periods}

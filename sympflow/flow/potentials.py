@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
@@ -388,24 +388,17 @@ class MLPPotential(Potential):
         self.ndof, self.features, self.hidden, self.activation = int(ndof), features, hidden, activation
         self._sigma = activation_named(activation)
 
-        def uniform(*shape: int, fan_in: int) -> nn.Parameter:
-            # Drawn in float64 on the CPU, so that a seed means the same flow in every dtype and on every device.
-            w = (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1) / fan_in**0.5
-            return nn.Parameter(w.to(dtype=dtype, device=device))
-
+        uniform = partial(uniform_weights, generator=generator, dtype=dtype, device=device)
+        constant = partial(torch.as_tensor, dtype=dtype, device=device)
         self.weight_x = uniform(hidden[0], inputs, fan_in=inputs + 1)
         self.weight_t = uniform(hidden[0], fan_in=inputs + 1)
         fans = (inputs + 1, *hidden[:-1])
         self.biases = nn.ParameterList(uniform(h, fan_in=fan) for h, fan in zip(hidden, fans, strict=True))
         self.weights = nn.ParameterList(uniform(h, fan, fan_in=fan) for fan, h in pairwise(hidden))
         self.weight_out = uniform(hidden[-1], fan_in=hidden[-1])
-
-        def constant(value: Any) -> Tensor:
-            return torch.as_tensor(value, dtype=dtype, device=device)
-
-        self.register_buffer("scale", constant([*([1.0] * ndof if scale is None else scale), *[1.0] * features]))
-        self.register_buffer("tau", constant(tau))
-        self.register_buffer("gain", constant(gain))
+        units = [*([1.0] * ndof if scale is None else scale), *[1.0] * features]
+        for name, unit in (("scale", units), ("tau", tau), ("gain", gain)):
+            self.register_buffer(name, constant(unit))
         if center is not None:
             with torch.no_grad():
                 self.biases[0] -= self.weight_x @ (constant([*center, *[0.0] * features]) / self.scale)
@@ -546,31 +539,24 @@ class MLPPotential(Potential):
         return torch.cat([gradient[:d], torch.zeros_like(gradient[d:])]) if self.features else gradient
 
     def impulse(self, t: Time, x: Tensor) -> Tensor:
-        K, k, b, W, w = self.folded()
-        r = self._sweeps(self._both_times(t, K @ x + b[0][:, None], k), b, W, w)
-        r_t, r_0 = r.chunk(2, 1)
-        return self._by_x(K.T @ (r_t - r_0))
+        return self._swept(t, x)[0]
 
     def impulse_and_rate(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor]:
+        impulse, k, r_t = self._swept(t, x)
+        return impulse, k @ r_t
+
+    def _swept(self, t: Time, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The impulse, k/τ, and ∂V/∂a at t (h_1, N)."""
         K, k, b, W, w = self.folded()
-        r = self._sweeps(self._both_times(t, K @ x + b[0][:, None], k), b, W, w)
-        r_t, r_0 = r.chunk(2, 1)
-        return self._by_x(K.T @ (r_t - r_0)), k @ r_t
+        r_t, r_0 = self._sweeps(_both_times(t, K @ x + b[0][:, None], k), b, W, w).chunk(2, 1)
+        return self._by_x(K.T @ (r_t - r_0)), k, r_t
 
     def impulse_and_tangent(self, t: Time, x: Tensor, dx: Tensor) -> tuple[Tensor, Tensor]:
         K, k, b, W, w = self.folded()
-        a = self._both_times(t, K @ x + b[0][:, None], k)
-        da = K @ dx
+        a, da = _both_times(t, K @ x + b[0][:, None], k), K @ dx
         r, dr = self._sweeps_tangent(a, torch.cat([da + k[:, None], da], 1), b, W, w)
         (r_t, r_0), (dr_t, dr_0) = r.chunk(2, 1), dr.chunk(2, 1)
         return self._by_x(K.T @ (r_t - r_0)), self._by_x(K.T @ (dr_t - dr_0))
-
-    # sweeps ---------------------------------------------------------------------------------------------
-
-    @staticmethod
-    def _both_times(t: Time, a: Tensor, k: Tensor) -> Tensor:
-        """Pre-activations at t beside those at 0: (h_1, 2N)."""
-        return torch.cat([a + outer(k, t), a], 1)
 
     def _sweeps(self, a: Tensor, b: list[Tensor], W: list[Tensor], w: Tensor) -> Tensor:
         """∂V/∂a (h_1, N), by a sweep forward through the layers and one back."""
@@ -600,9 +586,22 @@ class MLPPotential(Potential):
         return r, dr
 
 
+def _both_times(t: Time, a: Tensor, k: Tensor) -> Tensor:
+    """Pre-activations at t beside those at 0: (h_1, 2N)."""
+    return torch.cat([a + outer(k, t), a], 1)
+
+
 def _backward_weights(W: list[Tensor], w: Tensor) -> list[Tensor]:
     """The weights as the reverse sweep meets them, w multiplied into the first: cheaper than into the features."""
     return [w[:, None] * W[-1], *reversed(W[:-1])] if W else []
+
+
+def uniform_weights(
+    *shape: int, fan_in: int, generator: torch.Generator | None, dtype: Any, device: Any
+) -> nn.Parameter:
+    """Weights uniform in ±1/√(fan in), drawn in float64 on the CPU: a seed means the same flow everywhere."""
+    w = (2 * torch.rand(*shape, dtype=torch.float64, generator=generator) - 1) / fan_in**0.5
+    return nn.Parameter(w.to(dtype=dtype, device=device))
 
 
 def outer(k: Tensor, t: Time) -> Tensor:

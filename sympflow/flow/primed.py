@@ -43,7 +43,7 @@ from sympflow.flow.primed_potentials import (
 from sympflow.flow.records import MAX_LAYERS
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Columns, Entry, Kind, PrimedShape, Tables, columns_of
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, check_compilable, doubles
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.monomials import Monomials, in_monomials, monomials
@@ -70,21 +70,21 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         The maps in the order in which they are executed: χ⁻¹, K, χ.
     """
 
+    PLAN = "primed"
+
     def __init__(
         self,
         ndof: int,
         shape: PrimedShape,
         dt: float = 1.0,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt, system)
+        super().__init__(ndof, dt, **like)
         self.shape = shape
-        like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
 
         def columns(inside: bool) -> Columns:
-            made = shape.columns(inside, lambda name, *given: Coefficients(*given, dt=self.dt, **like))
+            made = shape.columns(inside, lambda name, *given: Coefficients(*given, dt=self.dt, **self._like))
             return made if made.polynomials is None else made._replace(polynomials=nn.ModuleList(made.polynomials))
 
         inside, outside = columns(True), columns(False)
@@ -95,8 +95,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         self._tables: Kept[Tables] = Kept(column._parameters for column in columns_of(self.substeps))
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(map(self._layer, range(len(self.substeps))))
-        if system is not None:
-            self.identify(system)
+        self._made_of(system)
 
     @classmethod
     def untrained(cls, system: HamiltonianSystem, *, dt: float, dtype: Any, device: Any, **given: Any) -> Self:
@@ -151,11 +150,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
             processor=processor,
             curvature=curvature,
             monomials=exponents,
-            timed=_is_timed(system),
+            timed=not system.keeps_energy,
             gradient_kicks=some,
             curvature_kicks=curved,
         )
-        flow = cls(system.ndof, shape, dt, system, dtype, device)
+        flow = cls(system.ndof, shape, dt, system, dtype=dtype, device=device)
         kicks, drifts = _kicks(scheme), [s for s in substeps if s.kind == "drift"]
         flow.kicks.set_constant([s.one for s in kicks])
         flow.drifts.set_constant([s.one for s in drifts])
@@ -166,11 +165,11 @@ class PrimedFlow(PrimedKnown, SystemFlow):
         return flow
 
     @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        return cls(ndof, PrimedShape.from_dict(plan["primed"], ndof), dt, dtype=dtype)
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        return {"shape": PrimedShape.from_dict(plan, ndof)}
 
-    def architecture(self) -> dict[str, Any]:
-        return {"ndof": self.kept_ndof, "primed": self.shape.to_dict()}
+    def plan(self) -> dict[str, Any]:
+        return self.shape.to_dict()
 
     @property
     def palindromic(self) -> bool:
@@ -259,10 +258,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     def _partly(self, t: Time, x: Tensor, part: slice, back: bool = False) -> Tensor:
         t, y, batch = self._columns(t, x)
-        q, p = y.chunk(2)
-        for layer in reversed(self.layers[part]) if back else self.layers[part]:
-            q, p = layer.inverse(t, q, p) if back else layer(t, q, p)  # type: ignore[operator]
-        return self._states(torch.cat([q, p]), batch)
+        return self._states(self._applied(self.layers[part], t, y, back), batch)
 
     # its system ---------------------------------------------------------------------------------------------
 
@@ -296,7 +292,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
                 f"`system` {system.name!r} has no kicks and drifts such as the flow's: it must be H = ½ pᵀM⁻¹p + V(q), "
                 "with `hessian_vector` where V is a function."
             )
-        return self._of(system, replace(self.shape, timed=_is_timed(system)))
+        return self._of(system, replace(self.shape, timed=not system.keeps_energy))
 
     def of_any_size(self, system: HamiltonianSystem) -> Self:
         """Return the flow of a system with the numbers of this one, of a piece of it by its coordinates."""
@@ -308,7 +304,7 @@ class PrimedFlow(PrimedKnown, SystemFlow):
 
     def _of(self, system: HamiltonianSystem, shape: PrimedShape) -> Self:
         """A flow of a system with the numbers of this one."""
-        other = type(self)(system.ndof, shape, self.dt, system, self.dtype, self.device)
+        other = type(self)(system.ndof, shape, self.dt, system, dtype=self.dtype, device=self.device)
         mine = dict(self.columns())
         for name, column in other.columns():
             column.set(to_numpy(mine[name].table))
@@ -350,11 +346,6 @@ class PrimedFlow(PrimedKnown, SystemFlow):
     def initial_velocity(self, x: Tensor, t0: Any = None) -> Tensor:
         """d/dt ψ̄_t(x) at t = 0: that of its system, as the coefficients of V and T sum up to 1."""
         return super().initial_velocity(x, t0) if self.system is None else self.system.vector_field(x, t0)
-
-
-def _is_timed(system: HamiltonianSystem) -> bool:
-    """Return True if the drifts of a kernel must add up to t."""
-    return not system.keeps_energy
 
 
 def _check_counts(stages: Any, processor: Any) -> None:

@@ -165,7 +165,7 @@ class PrimedDrift(Drift):
         """True without friction and driving."""
         return self._binding.system.keeps_energy
 
-    def _moved(self, s: Time, q: Tensor, p: Tensor, passed: Time = 0.0) -> tuple[Tensor, Tensor]:
+    def _drifted(self, s: Time, q: Tensor, p: Tensor, passed: Time = 0.0) -> tuple[Tensor, Tensor]:
         """The linear map of a drift over s, and by how much the time moves with it."""
         system = self._binding.system
         if not system.friction:
@@ -180,21 +180,21 @@ class PrimedDrift(Drift):
         if self._plain:
             return super().forward(t, q, p)
         s = self._time.value(t)
-        return self._moved(s, q, p, s)
+        return self._drifted(s, q, p, s)
 
     def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
         if self._plain:
             return super().inverse(t, q, p)
         s = -self._time.value(t)
-        return self._moved(s, q, p, s)
+        return self._drifted(s, q, p, s)
 
     def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         if self._plain:
             return super().tangent(t, q, p, dq, dp)
         system = self._binding.system
         s, rate = self._time.value(t), self._time.rate(t)
-        q, p = self._moved(s, q, p, s)
-        dq, dp = self._moved(s, dq, dp, rate)
+        q, p = self._drifted(s, q, p, s)
+        dq, dp = self._drifted(s, dq, dp, rate)
         d = system.ndof
         if system.friction:
             dp = dp + rate * system.friction.force(p.T).T

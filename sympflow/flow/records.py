@@ -7,10 +7,10 @@ import json
 import math
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from sympflow.flow.families import KINDS
 from sympflow.flow.scaling import Scaling
 from sympflow.hamiltonian.domain import Domain, domain_from_dict
 from sympflow.hamiltonian.fingerprint import Identity
+
+T = TypeVar("T")
 
 FORMAT = 2
 KEY, SUM = "sympflow", "sympflow_checksum"
@@ -250,14 +252,19 @@ def count_parameters(widths: tuple[int, ...], inputs: int) -> int:
     return sum(m * n for m, n in zip((inputs + 2, *widths), (*widths, inputs), strict=True))
 
 
+def _made(what: str, make: Callable[..., T], *given: Any) -> T:
+    """Return what a part of the record describes; else it is refused."""
+    try:
+        return make(*given)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise Refused(f"its {what} is not admissible ({error})") from None
+
+
 def _certificate(record: dict[str, Any]) -> Certificate | None:
     """Return the certificate in the record, if there is one; it must be of the weights that the file holds."""
     if record.get("certificate") is None:
         return None
-    try:
-        certificate = Certificate.from_dict(record["certificate"])
-    except ValueError as error:
-        raise Refused(f"its certificate is not admissible ({error})") from None
+    certificate = _made("certificate", Certificate.from_dict, record["certificate"])
     if certificate.weights != record.get("checksum"):
         raise Refused("its certificate is one of other weights")
     return certificate
@@ -265,12 +272,8 @@ def _certificate(record: dict[str, Any]) -> Certificate | None:
 
 def _identity(record: dict[str, Any], ndof: int) -> Identity | None:
     """Return the identity of the system in the record, if there is one; a text in it is not read yet."""
-    if record.get("identity") is None:
-        return None
-    try:
-        return Identity.from_dict(record["identity"], ndof)
-    except ValueError as error:
-        raise Refused(f"its identity of the system is not admissible: {error}") from None
+    kept = record.get("identity")
+    return None if kept is None else _made("identity of the system", Identity.from_dict, kept, ndof)
 
 
 def _intervals(pairs: Any, what: str) -> tuple[tuple[float, float], ...]:
@@ -321,21 +324,18 @@ def _check_recipe(recipe: Any, ndof: int) -> None:
     if not isinstance(recipe.get("torch", ""), str):
         raise Refused("its recipe has a version of torch that is not a string")
     if "scaling" in recipe:
-        scaling = recipe["scaling"]
-        try:
-            if not all(_is_number(v) for u in scaling.values() for v in (u if isinstance(u, list) else [u])):
-                raise TypeError("not numbers")
-            if len(Scaling.from_dict(scaling).q) != ndof:
-                raise ValueError(f"not of {ndof} degrees of freedom")
-        except (TypeError, ValueError, AttributeError) as error:
-            raise Refused(f"its recipe has a scaling that is not admissible ({error})") from None
+        _made("recipe's scaling", _scaling, recipe["scaling"], ndof)
+
+
+def _scaling(told: Any, ndof: int) -> None:
+    if not all(_is_number(v) for u in told.values() for v in (u if isinstance(u, list) else [u])):
+        raise TypeError("not numbers")
+    if len(Scaling.from_dict(told).q) != ndof:
+        raise ValueError(f"not of {ndof} degrees of freedom")
 
 
 def _domain(description: Any, ndof: int) -> Domain:
-    try:
-        domain = domain_from_dict(description)
-    except (ValueError, TypeError, AttributeError) as error:
-        raise Refused(f"its domain is not admissible ({error})") from None
+    domain = _made("domain", domain_from_dict, description)
     if domain.width not in (None, 2 * ndof):
         raise Refused(f"its domain has states of length {domain.width}, not {2 * ndof}")
     return domain

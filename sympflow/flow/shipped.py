@@ -47,7 +47,7 @@ class ShippedFlow:
     polynomial : int
         Degree of the polynomials of its kicks, 0 for none.
     cost : float or None
-        Of a unit of time, in force evaluations, see `primed_cost` in `sympflow.training.shipped.judges`. Outputs are
+        Of a unit of time, in force evaluations, see `cost_of` in `sympflow.training.shipped.judges`. Outputs are
         not counted.
     energy_error : float or None
         Largest relative energy error up to `t_end`, that 95 % of the states of Ω stay below: an upper 99 % confidence

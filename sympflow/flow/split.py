@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sympflow.arguments import check_flag, plain
+from sympflow.arguments import check_counts, check_flag, plain
 from sympflow.flow.coefficients import Column
 from sympflow.flow.flow_map import check_system
 from sympflow.flow.layers import OwnLayer
@@ -26,7 +26,7 @@ from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Memory, Total
-from sympflow.flow.weights import Kept, check_compilable, checked_device, checked_dtype, doubles
+from sympflow.flow.weights import Kept, check_compilable, doubles
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts, map_evaluations
@@ -113,6 +113,7 @@ class SplitFlow(SystemFlow):
     `gradients`, part by part. Without a system the flow has maps, but no values.
     """
 
+    PLAN = "split"
     MADE = "made of the parts of a system"
 
     def __init__(
@@ -127,38 +128,35 @@ class SplitFlow(SystemFlow):
         dt: float = 1.0,
         expressions: Sequence[str] | None = None,
         system: HamiltonianSystem | None = None,
-        dtype: torch.dtype = torch.float64,
-        device: torch.device | str | None = None,
+        **like: Any,
     ) -> None:
-        super().__init__(ndof, dt)
+        super().__init__(ndof, dt, **like)
         self.expressions = None if expressions is None else tuple(expressions)
         self.sequence, self.kinds, self.classes = tuple(sequence), tuple(kinds), tuple(classes)
         if not self.sequence or self.sequence != self.sequence[::-1]:
             raise ValueError("`sequence` must read the same backwards: make it a palindrome.")
         if set(self.sequence) - set(range(len(self.kinds) + 1)):
             raise ValueError(f"`sequence` names parts beyond the {len(self.kinds)} there are: check `kinds`.")
-        if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
-            raise ValueError(f"`terms` must be a positive integer; got {terms!r}.")
+        check_counts(terms=terms)
         self.terms, self.filtered, self.gradient_kicks = terms, bool(filters), tuple(sorted(set(gradients)))
         n_kicks = self.sequence.count(1)
         if self.gradient_kicks != tuple(sorted(n_kicks - 1 - i for i in self.gradient_kicks)):
             raise ValueError(f"`force_gradient` {gradients!r} is not the same from either end of {n_kicks} kicks.")
         if not set(self.gradient_kicks) <= set(range(n_kicks)) or (gradients and "shear" in self.kinds):
             raise ValueError(f"`force_gradient` {gradients!r} names no kicks: count them from 0 to {n_kicks - 1}.")
-        like: dict[str, Any] = {"dt": self.dt, "dtype": checked_dtype(dtype), "device": checked_device(device)}
 
-        def column(part: int, power: int, total: Total) -> Column:
-            return Column(self.sequence.count(part), range(terms), power, total=total, **like)
+        def column(n: int, power: int, total: Total = None) -> Column:
+            return Column(n, range(terms), power, total=total, dt=self.dt, **self._like)
 
         modules = torch.nn.ModuleList
         rest = [k for k in range(1, len(self.kinds) + 1) if k in self.sequence]
         turning = [f for f, kind in enumerate(self.classes) if kind in FILTERED]
         linear = range(len(self.classes)) if LINEAR in self.sequence else ()
-        self.linear = modules(column(LINEAR, 1, "always") for _ in linear)
-        self.weights = modules(column(k, 1, "start") for k in rest)
-        self.filters = modules(column(k, 0, None) for k in rest for _ in turning if filters)
-        n_gradients = len(self.gradient_kicks)
-        self.gradients = modules(Column(n_gradients, range(terms), 3, **like) for _ in range(n_gradients > 0))
+        count = self.sequence.count
+        self.linear = modules(column(count(LINEAR), 1, "always") for _ in linear)
+        self.weights = modules(column(count(k), 1, "start") for k in rest)
+        self.filters = modules(column(count(k), 0) for k in rest for _ in turning if filters)
+        self.gradients = modules(column(len(self.gradient_kicks), 3) for _ in range(bool(self.gradient_kicks)))
         self._slot = {k: i for i, k in enumerate(rest)}
         self._turning = turning
         for c in self.columns():  # equal steps, φ = 1
@@ -167,9 +165,7 @@ class SplitFlow(SystemFlow):
         self._maps: Kept[KeptMaps] = Kept(column._parameters for column in self.columns())
         # A tuple, not a ModuleList: the layers own no parameters, they share the columns.
         self.layers = tuple(SplitLayer(self, i) for i in range(len(self.sequence)))
-        if system is not None:
-            self._take(system)
-            self.identify(system)
+        self._made_of(system)
 
     @classmethod
     def untrained(cls, system: HamiltonianSystem, *, parts: Sequence[str] | None, **given: Any) -> Self:
@@ -205,11 +201,6 @@ class SplitFlow(SystemFlow):
             system=system,
             **like,
         )
-
-    @classmethod
-    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
-        shape = _checked_plan(plan["split"])
-        return cls(ndof, dt=dt, dtype=dtype, **shape)
 
     def columns(self) -> list[Column]:
         """Return all coefficients: s, w, φ, γ."""
@@ -323,19 +314,34 @@ class SplitFlow(SystemFlow):
         if self.gradient_kicks and not parts.has_force_gradient:
             raise ValueError("`force_gradient` needs H = ½ pᵀM⁻¹p + ½ qᵀKq + U(q): leave it out.")
 
-    def architecture(self) -> dict[str, Any]:
-        return {
-            "ndof": self.ndof,
-            "split": {
-                "sequence": list(self.sequence),
-                "kinds": list(self.kinds),
-                "classes": list(self.classes),
-                "terms": self.terms,
-                "filters": self.filtered,
-                "gradients": list(self.gradient_kicks),
-                "expressions": None if self.expressions is None else list(self.expressions),
-            },
-        }
+    def plan(self) -> dict[str, Any]:
+        told = {"terms": self.terms, "filters": self.filtered, "gradients": list(self.gradient_kicks)}
+        told |= {name: list(getattr(self, name)) for name in ("sequence", "kinds", "classes")}
+        return told | {"expressions": None if self.expressions is None else list(self.expressions)}
+
+    @classmethod
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        if not isinstance(plan.get("filters"), bool):
+            raise Refused("its filters are neither true nor false")
+        gradients = plan.get("gradients")
+        if not isinstance(gradients, list) or not all(isinstance(i, int) and 0 <= i < MAX_LAYERS for i in gradients):
+            raise Refused("its gradients are not a list of kicks")
+        for name, admissible in (("kinds", ("kick", "shear")), ("classes", KINDS_OF_MODES)):
+            value = plan.get(name)
+            if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(each in admissible for each in value):
+                raise Refused(f"its {name} are not a list of {', '.join(admissible)}")
+        sequence, expressions, n = plan.get("sequence"), plan.get("expressions"), len(plan["kinds"])
+        if not isinstance(sequence, list) or not 1 <= len(sequence) <= MAX_LAYERS:
+            raise Refused("its sequence of maps is missing or absurdly long")
+        if not all(isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= n for k in sequence):
+            raise Refused("its sequence of maps does not consist of numbers of parts")
+        if expressions is not None:
+            _check_expressions(expressions, n)
+        terms = checked_integer(plan.get("terms"), "number of terms", MAX_DEGREE)
+        if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
+            raise Refused("its architecture is absurdly large")
+        names = ("sequence", "kinds", "classes", "terms", "filters", "gradients", "expressions")
+        return {name: plan.get(name) for name in names}
 
 
 def part_kinds(parts: ExactParts) -> tuple[str, ...]:
@@ -348,33 +354,6 @@ def class_kinds(parts: ExactParts) -> tuple[str, ...]:
     if parts.linear is None:
         return ()
     return tuple(parts.linear.kinds[j] for j in parts.linear.representatives)
-
-
-def _checked_plan(plan: Any) -> dict[str, Any]:
-    """Return the arguments of a `SplitFlow` that a file describes, all of which are checked."""
-    if not isinstance(plan, dict):
-        raise Refused("its plan of a split flow is missing")
-    if not isinstance(plan.get("filters"), bool):
-        raise Refused("its filters are neither true nor false")
-    gradients = plan.get("gradients")
-    if not isinstance(gradients, list) or not all(isinstance(i, int) and 0 <= i < MAX_LAYERS for i in gradients):
-        raise Refused("its gradients are not a list of kicks")
-    for name, admissible in (("kinds", ("kick", "shear")), ("classes", KINDS_OF_MODES)):
-        value = plan.get(name)
-        if not isinstance(value, list) or len(value) > MAX_LAYERS or not all(entry in admissible for entry in value):
-            raise Refused(f"its {name} are not a list of {', '.join(admissible)}")
-    sequence, expressions = plan.get("sequence"), plan.get("expressions")
-    if not isinstance(sequence, list) or not 1 <= len(sequence) <= MAX_LAYERS:
-        raise Refused("its sequence of maps is missing or absurdly long")
-    if not all(isinstance(k, int) and not isinstance(k, bool) and 0 <= k <= len(plan["kinds"]) for k in sequence):
-        raise Refused("its sequence of maps does not consist of numbers of parts")
-    if expressions is not None:
-        _check_expressions(expressions, len(plan["kinds"]))
-    terms = checked_integer(plan.get("terms"), "number of terms", MAX_DEGREE)
-    if len(sequence) * terms * (len(plan["classes"]) + 2) > MAX_PARAMETERS // 100:
-        raise Refused("its architecture is absurdly large")
-    names = ("sequence", "kinds", "classes", "terms", "filters", "gradients", "expressions")
-    return {name: plan.get(name) for name in names}
 
 
 def _check_expressions(expressions: Any, kinds: int) -> None:

@@ -28,7 +28,7 @@ from sympflow.flow.potentials import (
 )
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_widths, count_parameters
 from sympflow.flow.scaling import Scaling
-from sympflow.flow.weights import Kept, check_compilable, check_memory
+from sympflow.flow.weights import Kept, check_compilable, check_memory, checked_device, checked_dtype
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.protocol import Kernel
 from sympflow.schemes import Scheme
@@ -562,7 +562,6 @@ class SympFlow(FlowMap):
         return self._opened(self._columns(0.0, self.lift(x, *t0))[1], 0.0)[0][self.ndof :]
 
     def hamiltonian_unchecked(self, t: float | Tensor, x: Tensor, t0: Any = None) -> Tensor:
-        """`hamiltonian` without checks, for inner loops."""
         t, y, batch = self._columns(t, self.lift(x, t0, t))
         q, p = self._opened(y, t)
         H = torch.zeros_like(y[0])
@@ -586,47 +585,67 @@ class SympFlow(FlowMap):
         return torch.cat([q, p] if self.drive is None else [q[:d], y[d : d + 1] + passed, p[:d]])
 
     def _map(self, t: float | Tensor, y: Tensor) -> Tensor:
-        return self._closed(*self._forwards(t, *self._opened(y, 0.0)), y, t)
+        return self._applied(self.layers, t, y)
 
     def _map_inverse(self, t: float | Tensor, y: Tensor) -> Tensor:
-        return self._closed(*self._backwards(t, *self._opened(y, t)), y, -t)
+        return self._applied(self.layers, t, y, back=True)
+
+    def _applied(self, layers: Any, t: float | Tensor, y: Tensor, back: bool = False) -> Tensor:
+        """Columns after some layers in turn, or after their inverses, the last first."""
+        q, p = self._opened(y, t if back else 0.0)
+        for layer in reversed(layers) if back else layers:
+            q, p = layer.inverse(t, q, p) if back else layer(t, q, p)
+        return self._closed(q, p, y, -t if back else t)
 
     def _map_tangent(self, t: float | Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        q, p, dq, dp = self._tangents(t, *self._opened(y, 0.0))
-        return self._closed(q, p, y, t), self._closed(dq, dp, torch.zeros_like(y), 1.0)
-
-    def _forwards(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        """All layers in turn."""
-        for layer in self.layers:
-            q, p = layer(t, q, p)
-        return q, p
-
-    def _backwards(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        """The inverses of all layers, the last first."""
-        for layer in reversed(self.layers):
-            q, p = layer.inverse(t, q, p)
-        return q, p
-
-    def _tangents(self, t: float | Tensor, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """All layers in turn, and the derivatives by t."""
+        q, p = self._opened(y, 0.0)
         dq, dp = torch.zeros_like(q), torch.zeros_like(p)
         for layer in self.layers:
             q, p, dq, dp = layer.tangent(t, q, p, dq, dp)  # type: ignore[operator]
-        return q, p, dq, dp
+        return self._closed(q, p, y, t), self._closed(dq, dp, torch.zeros_like(y), 1.0)
 
 
 class SystemFlow(SympFlow):
     """A SympFlow whose maps are made of a system's own functions, which its file does not hold."""
 
+    PLAN: ClassVar[str]
+    """The name of its plan in a file, which `plan` tells, and `checked_plan` makes arguments of."""
     MADE: ClassVar[str] = "primed with the V and T of a system"
 
-    def __init__(self, ndof: int, dt: float, system: HamiltonianSystem | None = None) -> None:
+    def __init__(self, ndof: int, dt: float, dtype: Any = torch.float64, device: Any = None) -> None:
         super().__init__(ndof, dt=dt, layers=())
-        self._binding = Binding(system, self.MADE)
+        self._like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
+        self._binding = Binding(None, self.MADE)
         self._loops: tuple[HamiltonianSystem, Any] | None = None  # compiled, of the system that was asked for last
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_loops": None}  # copies and pickles make their own
+
+    def plan(self) -> dict[str, Any]:
+        """The numbers that describe the flow, JSON-able."""
+        raise NotImplementedError
+
+    @classmethod
+    def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
+        """Return the arguments of the class that a file describes, all of which are checked."""
+        raise NotImplementedError
+
+    def architecture(self) -> dict[str, Any]:
+        return {"ndof": self.kept_ndof, self.PLAN: self.plan()}
+
+    @classmethod
+    def from_architecture(cls, ndof: int, plan: dict[str, Any], dt: float, dtype: torch.dtype) -> Self:
+        described = plan[cls.PLAN]
+        if not isinstance(described, dict):
+            raise Refused(f"its plan of a {cls.PLAN} flow is missing")
+        made: Any = cls
+        return made(ndof, dt=dt, dtype=dtype, **cls.checked_plan(described, ndof))
+
+    def _made_of(self, system: HamiltonianSystem | None) -> None:
+        """Become the flow of a system, where there is one."""
+        if system is not None:
+            self._take(system)
+            self.identify(system)
 
     @property
     def system(self) -> HamiltonianSystem | None:

@@ -19,26 +19,19 @@ from sympflow.hamiltonian.poles import PairsPoles, Poles
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, without_deltas
 
 MOST_AXES = 3
-MOST_NEAR = 300
-"""About how many bodies each is compared with where there are cells."""
-MOST_PAIRS = 1_000_000
-"""Pairs whose values stand in memory at a time."""
+MOST_NEAR = 300  # about how many bodies each is compared with where there are cells
+MOST_PAIRS = 1_000_000  # pairs whose values stand in memory at a time
 ALL_AT_ONCE = 24
 """Bodies up to which the pairs are met by one product with the matrix of their ends, which is faster than indices."""
-SHORTEST, LONGEST, SCANNED = 1e-30, 1e30, 30001
-"""Distances between which a minimum of V is looked for."""
+SHORTEST, LONGEST, SCANNED = 1e-30, 1e30, 30001  # distances between which a minimum of V is looked for
 FAR, REACH = (10.0, 100.0), 2.0
 """Bond lengths at which V must have fallen off faster than bodies grow in number, and which a cut-off must have."""
-MOST_WRITTEN = 45
-"""Differences of coordinates of two bodies up to which pairs are written out: six bodies in space."""
-MOST_SPELLED_PAIRS = 400
-"""Pairs up to which H is written in symbols, term by term, for methods that need it so."""
-ASLANT = np.array([1.0, 0.6180339887498949, 0.3247179572447460])
-"""A direction at which no places differ by accident."""
+MOST_WRITTEN = 45  # differences of coordinates of two bodies up to which pairs are written out: six bodies in space
+MOST_SPELLED_PAIRS = 400  # pairs up to which H is written in symbols, term by term, for methods that need it so
+ASLANT = np.array([1.0, 0.6180339887498949, 0.3247179572447460])  # a direction at which no places differ by accident
 STRAIGHT, TINY = 1e-9, float(np.finfo(float).tiny)
 """Share of a velocity that is across the line between two bodies, below which they move along it."""
-NEARLY = 1 - 1e-12
-"""Squared cosine of the angle between velocity and line, at least, where that share is looked for."""
+NEARLY = 1 - 1e-12  # squared cosine of the angle between velocity and line, at least, where that share is looked for
 CHEAP_PAIRS, MANY_STEPS = 2016, 1000
 """Pairs up to which the ends of a run are always looked at, and steps beside which it costs nothing."""
 
@@ -218,11 +211,11 @@ class PairsHamiltonian(LocalHamiltonian):
     # a few of many ----------------------------------------------------------------------------------------------------
 
     @property
-    def uniform(self) -> bool:
+    def uniform(self) -> bool:  # type: ignore[override]
         return all((x == x[0]).all() for x in (self.masses, *self.columns))
 
     @property
-    def apart(self) -> float:
+    def apart(self) -> float:  # type: ignore[override]
         """A power of two near six bonds: bodies nearer than one repel each other, beside which all else is rounding."""
         return (
             1.0 if self.box is not None or self.bond_length is None else 2.0 ** round(math.log2(6 * self.bond_length))
@@ -320,7 +313,8 @@ class PairsHamiltonian(LocalHamiltonian):
         for pairs in self._pairs(q, p / np.repeat(self.inertia, self.dim)):
             x, w = pairs.x
             r, side = np.sqrt(pairs.s), np.sign(x @ ASLANT[: self.dim])
-            straight = _is_straight(x, w)
+            speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
+            straight = (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
             along = straight.all(0, keepdims=True) if together else straight
             yield pairs.i, pairs.j, np.where(along, side, 1.0) * r, pairs.symbol_values
 
@@ -502,12 +496,6 @@ def _incidence(n: int) -> np.ndarray:
     """1 at the first and −1 at the second end of each pair of n bodies: (P, n)."""
     i, j = np.triu_indices(n, 1)
     return np.eye(n)[i] - np.eye(n)[j]
-
-
-def _is_straight(x: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """True where velocities w (..., dim) are along differences x of places."""
-    speed, across = _dot(w, w), w - (_dot(x, w) / np.maximum(_dot(x, x), TINY))[..., None] * x
-    return (speed > 0) & (_dot(across, across) <= STRAIGHT**2 * speed)
 
 
 def _dot(x: Array, y: Array) -> Array:

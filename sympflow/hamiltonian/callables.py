@@ -19,6 +19,7 @@ from sympflow.arrays import (
     concatenate,
     differentiable,
     is_tensor,
+    jacobian,
     library,
     library_name,
     like,
@@ -44,22 +45,12 @@ CLOSE = 1e-9  # of the largest value
 class CallableHamiltonian(Definition):
     """The functions of a system given by V(q) or H(q, p), as a program where they can be traced: `form`.
 
-    They are traced when they are first used, and compared by value with the program. Those of a driven system take the
-    time before the states, one number: a float beside arrays, and a tensor of one double beside tensors. See
-    `HamiltonianSystem` for the arguments.
-
-    Attributes
-    ----------
-    library : str
-        "numpy" or "torch", whose arrays the functions take; "" if they fail on both.
-    untraced : str
-        The reason for which there is no program, a clause; "" if there is one.
+    Those of a driven system take the time first: a float beside arrays, a tensor of one double beside tensors.
     """
 
-    library: str = ""
+    library: str = ""  # "numpy" or "torch", whose arrays the functions take; "" if they fail on both
     untraced: str = ""
-    guard: Callable[[], None] | None = None
-    """Raises a ValueError if something else has changed that the system is made of."""
+    guard: Callable[[], None] | None = None  # refuses a system of which something else has changed
     _scene: tuple[Any, ...] = (None, None, None, (0.0, 1.0))
     _functions: tuple[Any, Any, Any, Any]
     _potential: Any
@@ -417,7 +408,7 @@ class CallableHamiltonian(Definition):
                 f"`gradient` out; it was not, for {self.untraced}."
             )
         if self._gradient is not None:
-            return _jacobian(partial(self._gradient, *t), x)
+            return jacobian(partial(self._gradient, *t), x)[1]
         return self._derived("hessian", _hessian_of, x, (n, n), t)
 
     potential, potential_gradient, hessian = hamiltonian, gradient, potential_hessian
@@ -538,16 +529,7 @@ def _gradient_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Ar
 
 
 def _hessian_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Array]:
-    return lambda x: _jacobian(_gradient_of(f, name), x)
-
-
-def _jacobian(f: Callable[[Array], Array], x: Array) -> Array:
-    """Jacobian of a batched vector field by forward mode, one direction at a time: (..., k, k)."""
-    import torch
-
-    from sympflow.arrays import jvp
-
-    return torch.stack([jvp(f, x, e)[1] for e in _basis(x)], dim=-1)
+    return lambda x: jacobian(_gradient_of(f, name), x)[1]
 
 
 def _with_torch(f: Callable[[Array], Array], x: Array, name: str, tail: tuple[int, ...], untraced: str = "") -> Array:
@@ -661,11 +643,7 @@ def _time_difference(value: Callable[[Any], Array], t: Any) -> Array:
 
 
 class NumbaFunction:
-    """V, ∇V or ∇²V·v of a system, by its order 0, 1 or 2, for any batch of states, of a driven one with the time first.
-
-    Tensors are taken through NumPy; derivatives of V and of ∇V flow back by ∇V and ∇²V·v, in reverse and forward mode.
-    The Numba functions are V(q), gradient(q, out) and hessian_vector(q, v, out).
-    """
+    """V, ∇V or ∇²V·v of Numba functions, by the order, for any batch of states; the time comes first."""
 
     def __init__(self, functions: tuple[Any, Any, Any | None], order: int, times: tuple[float, ...] = ()) -> None:
         self.functions, self.order, self.times = functions, order, times

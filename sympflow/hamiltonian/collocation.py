@@ -28,8 +28,7 @@ Tableau = tuple[tuple[tuple[float, ...], ...], tuple[float, ...], tuple[float, .
 
 In Butcher's letters a_ij = A_ij scale_j and b_i = B_i scale_i."""
 MOST_ITERATIONS = 50
-DIFFERENTIATED = 3
-"""Iterations in the graph, and so the orders of derivatives that are right."""
+DIFFERENTIATED = 3  # iterations in the graph, and so the orders of derivatives that are right
 TRACED_ITERATIONS = 8
 """Newton's iterations in a graph that `torch.compile` traces; from K = 0 some five converge where dt is sensible."""
 
@@ -145,12 +144,10 @@ def newton_matrix(
         p = system.friction.drift(Y[..., d:], tau[..., None])[1]
         Y = concatenate([Y[..., :d], p])
     S = system.hessian(Y, times)
-    D = concatenate([S[..., d:, :].swapaxes(-1, -2), -S[..., :d, :].swapaxes(-1, -2)]).swapaxes(-1, -2)
+    D = concatenate([S[..., d:, :], -S[..., :d, :]], -2)
     if tau is not None:
-        by_P, grown = D[..., d:] @ decays(system, tau), decays(system, -tau)
-        D = concatenate([D[..., :d], by_P])
-        lower = grown @ D[..., d:, :]
-        D = concatenate([D[..., :d, :].swapaxes(-1, -2), lower.swapaxes(-1, -2)]).swapaxes(-1, -2)
+        D = concatenate([D[..., :d], D[..., d:] @ decays(system, tau)])
+        D = concatenate([D[..., :d, :], decays(system, -tau) @ D[..., d:, :]], -2)
     outer = h[..., None, None, None] if getattr(h, "ndim", 0) else h
     blocks = outer * (scale[:, None] * A)[:, None, :, None] * D[..., :, :, None, :]
     M = -blocks.reshape(*Y.shape[:-2], s * n, s * n)

@@ -29,6 +29,7 @@ from sympflow.arrays import Array, concatenate, library, like, stack
 from sympflow.hamiltonian.linear_part import LinearPart, check_parts_conservative
 from sympflow.hamiltonian.parts import ExactParts, PartFunctions
 from sympflow.hamiltonian.scales import fastest_rate, natural_scale
+from sympflow.lazy import kept
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
@@ -67,8 +68,15 @@ class FunctionsOfCopies:
         return concatenate([x[..., :d], x[..., 3 * d :]]) if self.first else x[..., d : 3 * d]
 
 
-def two_copies(system: HamiltonianSystem, omega: float) -> ExactParts:
-    """H(q, y), H(x, p) and the coupling, in the order of a splitting with the coupling innermost."""
+@kept
+def two_copies(system: HamiltonianSystem, omega: float | None) -> ExactParts:
+    """H(q, y), H(x, p) and the coupling, by default of the fastest rate of the motion, which is the innermost part."""
+    omega = fastest_rate(system) if omega is None else float(omega)
+    if omega is None:
+        raise ValueError(
+            f"`system` {system.name!r} has neither a `y0` of its own nor a domain to take the coupling from: give "
+            "`omega`, or the system one of these."
+        )
     check_parts_conservative(system)
     import sympy as sp
 
@@ -102,14 +110,3 @@ def distance(x: Array, s: np.ndarray) -> Array:
     apart = concatenate([x[..., :d] - x[..., d : 2 * d], x[..., 2 * d : 3 * d] - x[..., 3 * d :]])
     xp = library(x)
     return stack([xp.amax(abs(apart), -1), xp.amax(abs(x), -1)], axis=-1)
-
-
-def coupling_strength(system: HamiltonianSystem) -> float:
-    """The default ω: the fastest rate of the linearised motion, see `fastest_rate`."""
-    rate = fastest_rate(system)
-    if rate is None:
-        raise ValueError(
-            f"`system` {system.name!r} has neither a `y0` of its own nor a domain to take the coupling from: give "
-            "`omega`, or the system one of these."
-        )
-    return rate

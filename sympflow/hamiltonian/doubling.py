@@ -25,28 +25,19 @@ from typing import Any
 import numpy as np
 
 from sympflow.arguments import warn
-from sympflow.arrays import Array, concatenate, is_tensor, of_library
+from sympflow.arrays import Array, as_tensor, concatenate, is_tensor, jacobian, of_library
 from sympflow.hamiltonian.domain import Box, Domain
-from sympflow.hamiltonian.hamiltonian import ExternalForce
 from sympflow.hamiltonian.system import HamiltonianSystem
 
 Force = Callable[[Array, Array], Array]
 
-THIN = 0.1
-"""Width of the default domain in q₋ and p₋, over that in q and p."""
+THIN = 0.1  # width of the default domain in q₋ and p₋, over that in q and p
 _DRAWN = 1000  # states that find the extent of a domain
 
 
 class DoubledSystem(HamiltonianSystem):
-    """A Hamiltonian system in twice the variables whose physical limit has friction and any other force.
-
-    `doubled` makes it, and documents it.
-
-    Attributes
-    ----------
-    physical : HamiltonianSystem
-        The system of the physical limit, of d degrees of freedom: that which was doubled, with F as its
-        `external_force`. Runge–Kutta methods and `solve_ivp` integrate it as it is; all others take the doubled one.
+    """A Hamiltonian system in twice the variables whose physical limit has friction and any other force: see `doubled`.
+    `physical` is the system of the limit, with F as its `external_force`, which Runge–Kutta methods integrate as it is.
     """
 
     _continuous = False
@@ -57,13 +48,7 @@ class DoubledSystem(HamiltonianSystem):
         return self
 
     def lift(self, y: Array) -> Array:
-        """[q, 0, 0, p], the state for a physical state y = [q, p]: (..., 2d) to (..., 4d).
-
-        Raises
-        ------
-        ValueError
-            If y has another width.
-        """
+        """[q, 0, 0, p], the state for a physical state y = [q, p]: (..., 2d) to (..., 4d)."""
         d = self.ndof // 2
         if y.ndim == 0 or y.shape[-1] != 2 * d:
             raise ValueError(
@@ -171,7 +156,7 @@ def doubled(
                 f"`force` is given by symbols, but `system` {system.name!r} by functions: give it as a function "
                 "F(q, p), written with torch."
             )
-        F: ExternalForce = GivenForce(force if given else lambda q, p: 0 * p)
+        F: Any = GivenForce(force if given else lambda q, p: 0 * p)
         made = DoubledSystem(hamiltonian=_DoubledFunctions(system, F), ndof=2 * system.ndof, check=False, **scene)
     else:
         from sympflow.hamiltonian.forces import SymbolicForce, doubled_hamiltonian
@@ -190,7 +175,7 @@ def doubled(
 
 
 class GivenForce:
-    """F(q, p) of a user, written with torch functions: see `ExternalForce`."""
+    """F(q, p) of a user, written with torch functions."""
 
     expressions: Sequence[Any] = ()
 
@@ -210,24 +195,14 @@ class GivenForce:
         return of_library(value, p)
 
     def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
-        import torch
-
-        from sympflow.arrays import jvp
-
-        d, x = p.shape[-1], torch.as_tensor(concatenate([q, p]))
-        columns = []
-        for i in range(2 * d):
-            along = torch.zeros_like(x)
-            along[..., i] = 1
-            columns.append(jvp(lambda z: self(z[..., :d], z[..., d:]), x, along)[1])
-        found = torch.stack(columns, dim=-1)
-        return of_library(found, p)
+        d, x = p.shape[-1], as_tensor(concatenate([q, p]))
+        return of_library(jacobian(lambda z: self(z[..., :d], z[..., d:]), x)[1], p)
 
 
 class _DoubledFunctions:
     """A of a system that is given by functions, or has a force that is."""
 
-    def __init__(self, system: HamiltonianSystem, force: ExternalForce) -> None:
+    def __init__(self, system: HamiltonianSystem, force: Any) -> None:
         self.system, self.force = system, force
 
     def __call__(self, Q: Array, P: Array) -> Array:

@@ -19,11 +19,9 @@ from sympy.core.symbol import Str
 from sympflow.arrays import Array, opaque
 from sympflow.hamiltonian.expression import ELEMENTARY
 
-JUMP = 1e-9
-"""Share of the largest value by which both sides of an end of an interval differ where samples jump."""
+JUMP = 1e-9  # share of the largest value by which both sides of an end of an interval differ where samples jump
 
-MOST_TURNS = 10_000
-"""Periods of samples, and zeros of a function, beyond which jumps are not listed."""
+MOST_TURNS = 10_000  # periods of samples, and zeros of a function, beyond which jumps are not listed
 
 # samples -------------------------------------------------------------------------------------------
 
@@ -219,8 +217,7 @@ def with_symbols(f: list[sp.Expr]) -> tuple[list[sp.Expr], dict[sampled, sp.Symb
 
 # drifts of T(p, t) ---------------------------------------------------------------------------------
 
-DURATION = sp.Symbol("duration", real=True)
-"""s, how long a drift lasts, in expressions of it."""
+DURATION = sp.Symbol("duration", real=True)  # s, how long a drift lasts, in expressions of it
 
 
 def drift(slope: tuple[sp.Expr, ...], time: sp.Symbol | None) -> tuple[sp.Expr, ...]:

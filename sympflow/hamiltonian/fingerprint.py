@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self
-from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
 from sympflow.arrays import to_numpy
 from sympflow.hamiltonian.domain import Domain, domain_of
+from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.hamiltonian import Hamiltonian
 
-DRAWN = 512
-"""States of a domain from which those of an identity are chosen."""
+DRAWN = 512  # states of a domain from which those of an identity are chosen
 MOST_STATES, FEWEST_STATES, MOST_NUMBERS = 64, 8, 4096
-LONGEST_EXPRESSION = 20_000
-"""Characters of an H that is kept as a text; a longer one is known by its values alone."""
-LONGEST_COMPARED = 2_000
-"""Characters of two formulas that are compared as such, where their texts differ."""
-TOLERANCE = 1e-9
-"""Share of the largest difference of energies among the states, and of the largest entry of Γ."""
+LONGEST_EXPRESSION = 20_000  # characters of an H that is kept as a text; a longer one is known by its values alone
+LONGEST_COMPARED = 2_000  # characters of two formulas that are compared as such, where their texts differ
+TOLERANCE = 1e-9  # share of the largest difference of energies among the states, and of the largest entry of Γ
 LATEST, GOLDEN = 20.0, (5**0.5 - 1) / 2
 """Times at which a driven H is probed are multiples of the golden ratio, modulo 1, of the first."""
-PROBES = 8
-"""Fixed states whose energies begin a fingerprint."""
+PROBES = 8  # fixed states whose energies begin a fingerprint
 
 
 def fingerprint(system: Hamiltonian) -> tuple[float, ...]:
@@ -95,9 +90,6 @@ def without_friction(mine: Sequence[float], identity: Identity | None, system: H
     return bool(system.friction) and recognised(mine, identity, system, friction=False)
 
 
-Known = WeakKeyDictionary["Hamiltonian", bool]
-
-
 @dataclass(eq=False)
 class Identity:
     """The H of a system as a flow keeps it, to know it again all over its domain, and along a run."""
@@ -105,13 +97,6 @@ class Identity:
     states: np.ndarray
     energies: np.ndarray
     expression: str | None
-    _agreed: Known = field(default_factory=WeakKeyDictionary, init=False, repr=False)
-    _proved: Known = field(default_factory=WeakKeyDictionary, init=False, repr=False)
-    _last: ref[Hamiltonian] | None = field(default=None, init=False, repr=False)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Everything but what was found out about systems."""
-        return Identity, (self.states, self.energies, self.expression)
 
     @classmethod
     def of(cls, system: Hamiltonian, domain: Domain | None, seed: int = 20260103) -> Self:
@@ -125,12 +110,7 @@ class Identity:
 
     def agrees(self, system: Hamiltonian) -> bool:
         """Return True if H of a system has these energies at these states, up to a constant; found out once."""
-        if self._last is not None and self._last() is system:  # in nearly all calls
-            return True
-        found = self._agreed.get(system)
-        if found is None:
-            found = self._agreed[system] = self.is_proved(system) or self.first_difference(system) is None
-        return found
+        return _agrees(system, self)
 
     def first_difference(self, system: Hamiltonian, states: np.ndarray | None = None) -> int | None:
         """The index of the first of the states (n, 2d), by default its own, where H differs from a system's."""
@@ -167,29 +147,7 @@ class Identity:
 
     def is_proved(self, system: Hamiltonian) -> bool:
         """Return True if the formula of a system is this one, up to a constant; found out once."""
-        if self._last is not None and self._last() is system:
-            return True
-        found = self._proved.get(system)
-        if found is None:
-            found = self._proved[system] = self._prove(system)
-        if found:
-            self._last = ref(system)
-        return found
-
-    def _prove(self, system: Hamiltonian) -> bool:
-        mine, theirs = self.expression, system.expression
-        if mine is None or theirs is None:
-            return False
-        if mine == theirs:
-            return True
-        if len(mine) + len(theirs) > LONGEST_COMPARED:
-            return False
-        import sympy
-
-        read, given = _read(mine, system.ndof), system.symbols
-        if read is None or read.symbols is None or given is None:
-            return False
-        return bool(sympy.expand(read.symbols.H - given.H).is_number)
+        return _is_proved(system, self.expression)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -209,6 +167,26 @@ class Identity:
         if states.shape != (len(energies), 2 * ndof) or not np.isfinite(states).all():
             raise ValueError("its states and energies do not fit each other")
         return cls(states, energies, expression)
+
+
+@lately_kept
+def _agrees(system: Hamiltonian, identity: Identity) -> bool:
+    return identity.is_proved(system) or identity.first_difference(system) is None
+
+
+@lately_kept
+def _is_proved(system: Hamiltonian, mine: str | None) -> bool:
+    theirs = system.expression
+    if mine is None or theirs is None or mine == theirs:
+        return mine is not None and mine == theirs
+    if len(mine) + len(theirs) > LONGEST_COMPARED:
+        return False
+    import sympy
+
+    read, given = _read(mine, system.ndof), system.symbols
+    if read is None or read.symbols is None or given is None:
+        return False
+    return bool(sympy.expand(read.symbols.H - given.H).is_number)
 
 
 def _floats(values: Any, ndim: int) -> np.ndarray:

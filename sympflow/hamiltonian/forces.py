@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class SymbolicForce:
-    """F(q, p) by expressions, one for each momentum: an `ExternalForce`."""
+    """F(q, p) by expressions, one for each momentum."""
 
     def __init__(self, system: HamiltonianSystem, force: Any, params: Mapping[str, float] | None) -> None:
         symbols = system.symbols

@@ -93,5 +93,4 @@ def _factors(rates: Array, s: Any) -> tuple[Array, Array]:
     return s * xp.where(still, 1.0 + 0.0 * x, -xp.expm1(-safe) / safe), xp.exp(-x)
 
 
-FRICTIONLESS = Friction()
-"""No friction, of systems that are not damped."""
+FRICTIONLESS = Friction()  # no friction, of systems that are not damped

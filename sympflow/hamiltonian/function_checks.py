@@ -15,18 +15,15 @@ import numpy as np
 from sympflow.arrays import Array, like, one_lane
 from sympflow.hamiltonian.domain import Domain
 
-SPREAD = 0.05
-"""The distance of the probes about a given state from it, relative to its size."""
+SPREAD = 0.05  # the distance of the probes about a given state from it, relative to its size
 FEW = 4
-EVERY_COMPONENT = 64
-"""Most components that are tested one by one; of more, as many random directions as DIRECTIONS."""
+EVERY_COMPONENT = 64  # most components that are tested one by one; of more, as many random directions as DIRECTIONS
 DIRECTIONS = 8
 STEPS = {np.dtype(np.float64): (1e-5, 1e-4), np.dtype(np.float32): (3e-3, 1e-2)}
 """Steps of the differences, relative to the size of the state: a derivative is wrong if both say so."""
 FINER = [10.0**-k for k in range(1, 10)]
 """Fractions of the smaller step that are tried before a derivative is refused: a function may vary within the step."""
-FARTHER = 0.25
-"""A run is tested where it left the states tested before by this share of their extent."""
+FARTHER = 0.25  # a run is tested where it left the states tested before by this share of their extent
 REMEDY = "where all is as it should be, pass check=False to HamiltonianSystem."
 
 

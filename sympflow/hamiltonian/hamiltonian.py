@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -22,23 +22,6 @@ if TYPE_CHECKING:
 
 
 NEWTON, FOUND = 20, 1e-12  # steps at most, and the error of a velocity relative to the largest
-
-
-class ExternalForce(Protocol):
-    """F(q, p) in p' = −∂H/∂q + F, not the force of any H; of a driven system t, a number or (...), follows p."""
-
-    @property
-    def expressions(self) -> Sequence[Any]:
-        """One for each momentum; none of a function."""
-        ...
-
-    def __call__(self, q: Array, p: Array, *t: Any) -> Array:
-        """F: (..., d), each, to (..., d)."""
-        ...
-
-    def jacobian(self, q: Array, p: Array, *t: Any) -> Array:
-        """∂F/∂(q, p): (..., d), each, to (..., d, 2d)."""
-        ...
 
 
 class Hamiltonian:
@@ -78,8 +61,8 @@ class Hamiltonian:
     autonomous: bool = True
     period: float | None = None
     energy_scale: float | None = None
-    external_force: ExternalForce | None = None
-    """F of the physical limit of a doubled system, p' = −∂H/∂q + F; it is part of `vector_field`."""
+    external_force: Any = None
+    """F(q, p, *t) of a physical limit, p' = −∂H/∂q + F, (..., d), with its `jacobian`; part of `vector_field`."""
 
     def __init__(self, name: str, definition: Any, inverse_mass: np.ndarray | None, quadratic_kinetic: bool) -> None:
         self.name = name
@@ -125,7 +108,7 @@ class Hamiltonian:
         d = self.ndof
         A, B = self.potential_hessian(y[..., :d], t), self.kinetic_hessian(y[..., d:], t)
         B = B + 0 * A
-        return concatenate([_rows(A, 0 * A), _rows(0 * B, B)]).swapaxes(-1, -2)
+        return concatenate([concatenate([A, 0 * A]), concatenate([0 * B, B])], -2)
 
     def momenta(self, q: Array, v: Array, t: Any = None) -> Array:
         """p with ∂H/∂p(q, p) = v, by Newton's method from p = v: (..., d) and (..., d) to (..., d).
@@ -199,7 +182,7 @@ class Hamiltonian:
             A = A + concatenate([0 * F, F], -2)
         return A
 
-    def with_force(self, force: ExternalForce) -> Self:
+    def with_force(self, force: Any) -> Self:
         """Return the system with p' = −∂H/∂q − Γp + F(q, p), which its vector field, and no H, holds."""
         forced = bare_copy(self)
         forced.name, forced.external_force = f"{self.name}_forced", force
@@ -599,10 +582,6 @@ class Hamiltonian:
     def numba_functions(self) -> tuple[Any, Any, Any] | None:
         """(potential, gradient, hessian_vector) if the system was given by Numba functions, else None."""
         return self.definition.numba_functions
-
-
-def _rows(left: Array, right: Array) -> Array:
-    return concatenate([left, right]).swapaxes(-1, -2)
 
 
 def third_derivative(system: Hamiltonian, q: Array, v: Array, w: Array, t: Any = None) -> Array:

@@ -24,18 +24,13 @@ from sympflow.hamiltonian.removable import triangle
 MISMATCH = 1e-6
 """Share of the values on both sides of a border by which pieces that are joined may differ there: their constants are
 often written with seven figures."""
-PERIOD_TOLERANCE = 1e-9
-"""Share of itself by which a period may differ from a multiple of that of a term."""
-MOST_POINTS = 2**20
-"""Times at which a function that is neither a polynomial nor periodic is looked at for its zeros."""
+PERIOD_TOLERANCE = 1e-9  # share of itself by which a period may differ from a multiple of that of a term
+MOST_POINTS = 2**20  # times at which a function that is neither a polynomial nor periodic is looked at for its zeros
 MOST_IMPULSES = 1_000_000
 POINTS_A_PERIOD = 4096
-LONGEST_MULTIPLE = 64
-"""Periods of a term that the common period of all may have."""
-NEAR = 1e-3
-"""Share of two places by which they differ, so that what jumps at one is constant at the other."""
-MOST_ROOTS = 64
-"""Zeros in a state at which an expression is tried."""
+LONGEST_MULTIPLE = 64  # periods of a term that the common period of all may have
+NEAR = 1e-3  # share of two places by which they differ, so that what jumps at one is constant at the other
+MOST_ROOTS = 64  # zeros in a state at which an expression is tried
 EPS = float(np.finfo(float).eps)
 
 # borders -------------------------------------------------------------------------------------------

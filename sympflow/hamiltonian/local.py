@@ -12,6 +12,7 @@ import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -26,8 +27,7 @@ from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printab
 __all__ = ["LocalHamiltonian", "check_memory", "checked_params", "named_values", "numbered", "parsed"]
 
 MOST_SPELLED = 128  # degrees of freedom
-MOST_DENSE = 50_000_000
-"""Entries of matrices ∇²V that are made at a time."""
+MOST_DENSE = 50_000_000  # entries of matrices ∇²V that are made at a time
 VECTORS_OF_A_RUN = 12
 """Vectors of d numbers that a run holds: its state, the next one, copies to look for what is not finite, forces."""
 
@@ -44,14 +44,16 @@ class LocalHamiltonian(Definition, ABC):
     shape: tuple[int, ...] = ()  # sites along the axes of a lattice
     ends: tuple[str, ...] = ()  # how each axis of a lattice ends
     noun: str = "system"  # in messages
+    has_subsystem: bool = False  # True if a few parts behave as those of a large system do
+    uniform: bool = False  # True if all sites or bodies are alike
+    apart: float = 1.0  # a distance at which the terms differ from others, if positions drawn about 0 do not tell
+    terms: Mapping[str, str] = MappingProxyType({})  # by name, as texts, for messages
     felt: np.ndarray | None = None
     """1 of the momenta that count in H, 0 of those of bodies without mass (d,); None where all do."""
     frame: Any = None
     """The coordinates of planets about a star, of a system that knows its star: see `sympflow.hamiltonian.planets`."""
-    arrays_only: str = ""
-    """The part of the system without compiled kicks; "" if all has them."""
-    in_terms: bool = False
-    """True where compiled kicks are made of all terms of H."""
+    arrays_only: str = ""  # the part of the system without compiled kicks; "" if all has them
+    in_terms: bool = False  # True where compiled kicks are made of all terms of H
     written: SymbolicHamiltonian | None = None
     """H in symbols, of a system so small that it is written out when symbols are asked for."""
     loops: str
@@ -104,11 +106,6 @@ class LocalHamiltonian(Definition, ABC):
             f"by HamiltonianSystem.{self.loops}."
         )
 
-    @property
-    def has_subsystem(self) -> bool:
-        """True if a few parts behave as those of a large system do: `subsystem` is defined."""
-        return False
-
     def judged(self) -> tuple[Any, ...]:
         """Arguments of `subsystem` for a system that is large, and small enough to judge a flow on; () for itself."""
         return ()
@@ -123,24 +120,9 @@ class LocalHamiltonian(Definition, ABC):
         return self.ndof
 
     @property
-    def apart(self) -> float:
-        """A distance at which the terms of the system differ from others, if positions drawn about 0 do not tell."""
-        return 1.0
-
-    @property
     def numbers(self) -> int:
         """Numbers that a force by array operations handles."""
         return 2 * self.ndof
-
-    @property
-    def uniform(self) -> bool:
-        """True if all sites or bodies are alike, so that a few of them tell all of the rest."""
-        return False
-
-    @property
-    def terms(self) -> dict[str, str]:
-        """The terms by name, as texts, for messages; {} where there are no pieces."""
-        return {}
 
     @cached_property
     def spelled(self) -> SymbolicHamiltonian | None:

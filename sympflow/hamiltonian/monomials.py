@@ -19,8 +19,7 @@ __all__ = ["MOST_MONOMIALS", "Monomials", "in_monomials", "monomials"]
 MOST_MONOMIALS = 60
 MOST_MIRRORED = 6  # coordinates of which all combinations of signs are tried
 
-Monomials = tuple[tuple[int, ...], ...]
-"""Exponents of q1 … qd, one tuple a monomial."""
+Monomials = tuple[tuple[int, ...], ...]  # exponents of q1 … qd, one tuple a monomial
 
 
 def monomials(symbols: SymbolicHamiltonian, degree: int) -> Monomials:

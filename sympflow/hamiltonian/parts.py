@@ -26,6 +26,7 @@ from sympflow.hamiltonian.linear_part import (
 )
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, parse
 from sympflow.hamiltonian.times import stage_time
+from sympflow.lazy import kept
 
 if TYPE_CHECKING:
     import sympy as sp
@@ -333,6 +334,7 @@ def _low(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(low), low, 0.0)
 
 
+@kept
 def linear_and_rest(system: HamiltonianSystem) -> ExactParts:
     """The linear part and U(q), for the kicks and exact linear flows of Nyström splittings."""
     linear = system.linear_part

@@ -24,6 +24,7 @@ from sympflow.hamiltonian.jumps import check_continuous
 from sympflow.hamiltonian.kepler import elements_of, kepler_flow, states_of
 from sympflow.hamiltonian.local import MOST_SPELLED, checked_params, numbered, parsed
 from sympflow.hamiltonian.recorded import NotRecorded
+from sympflow.lazy import kept
 from sympflow.schemes import Substeps
 
 COORDINATES = ("jacobi", "democratic")
@@ -37,8 +38,7 @@ TIMES = {"s": 1.0, "day": 86_400.0, "year": 365.25 * 86_400.0}
 MASSES = {"kg": 6.67430e-11, "solar mass": SUN, "Jupiter mass": 1.2668653e17, "Earth mass": 3.986004e14}
 """Units in SI, masses times G: IAU 2012 B2, IAU 2015 B3, CODATA 2018."""
 
-PLACE = "x", "y", "z", "r"
-"""Names in an extra potential: the place of a body as seen from the star, and its distance."""
+PLACE = "x", "y", "z", "r"  # names in an extra potential: the place of a body as seen from the star, and its distance
 FEWEST_STEPS = 20  # of a method in the shortest period
 MOON = 0.5  # of a Hill radius: bodies that are nearer may be bound
 
@@ -306,12 +306,14 @@ class Frame:
         return None
 
 
-def frame_of(local: Any, y0: Any) -> Frame | None:
+@kept
+def frame_of(system: Any) -> Frame | None:
     """The frame of planets, or of a star and bodies in pairs that attract each other so; None for other systems."""
+    local = system.local
     if isinstance(local, PlanetsHamiltonian):
         return local.frame
     G = newtonian(local) if isinstance(local, PairsHamiltonian) else None
-    return None if G is None or y0 is None else Frame(local, G, np.asarray(to_numpy(y0)))
+    return None if G is None or system.y0 is None else Frame(local, G, system.y0)
 
 
 def newtonian(local: PairsHamiltonian) -> float | None:

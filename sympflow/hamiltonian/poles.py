@@ -63,10 +63,8 @@ class Cancelling(NamedTuple):
 class Poles(Protocol):
     """The places at which H of a system may be infinite, in columns."""
 
-    cancelling: Sequence[Cancelling]
-    """Terms of H that cancel where each is infinite."""
-    watched: bool
-    """False if H has cancelling terms alone."""
+    cancelling: Sequence[Cancelling]  # terms of H that cancel where each is infinite
+    watched: bool  # False if H has cancelling terms alone
 
     @property
     def exact(self) -> Poles | None:
@@ -141,29 +139,10 @@ class SymbolicPoles(Poles):
         return (np.broadcast_to(t, y.shape[:-1]),) if self._symbols.timed else ()
 
 
-class _Lattice(Protocol):
-    """The attributes of a `LatticeHamiltonian` that poles need."""
-
-    ndof: int
-    shape: tuple[int, ...]
-    boundary: tuple[str, ...]
-    U: sp.Expr
-    x: tuple[sp.Symbol, ...]
-    r: tuple[sp.Symbol, ...]
-    c: tuple[sp.Symbol, ...]
-    bonds: dict[int, sp.Expr]
-    params: Any
-
-    @property
-    def names(self) -> dict[str, tuple[str, ...]]: ...
-
-    def of_terms(self, key: str, expressions: Any, q: Any) -> list[tuple[int | None, int, list[Any]]]: ...
-
-
 class LatticePoles(Poles):
     """The places of the terms of a lattice, at each site and bond."""
 
-    def __init__(self, lattice: _Lattice) -> None:
+    def __init__(self, lattice: Any) -> None:
         self._lattice = lattice
         terms = [(None, lattice.U, lattice.x), *((k, V, lattice.r) for k, V in lattice.bonds.items())]
         self.watched = any(places(f, x) for _, f, x in terms)
@@ -404,7 +383,11 @@ def _split(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
         yield Place(g, sp.floor(g.args[0] / sp.pi + sp.Rational(1, 2)))
     elif (touched := _touched(g)) is not None:
         yield touched
-    elif len(g.free_symbols) <= FACTORED and _is_rational(g):
+    elif (
+        len(g.free_symbols) <= FACTORED
+        and g.is_rational_function(*g.free_symbols)
+        and all(a.exp.is_Integer for a in g.atoms(sp.Pow))
+    ):
         exact = g.xreplace({a: sp.nsimplify(a, rational=True) for a in g.atoms(sp.Number, sp.NumberSymbol)})
         exact, _ = sp.fraction(sp.together(exact))
         for factor, _ in sp.Poly(exact, *sorted(g.free_symbols, key=str), domain="QQ").factor_list()[1]:
@@ -447,11 +430,6 @@ def _of_polynomial(g: sp.Expr, x: tuple[sp.Symbol, ...]) -> Iterator[Place]:
     for root in sp.real_roots(sp.Poly(g, s)):
         root = root if root.is_Integer else root.evalf(17)  # noqa: PLW2901
         yield Place(s - root, sp.sign(s - root))
-
-
-def _is_rational(g: sp.Expr) -> bool:
-    """Return True for a ratio of polynomials of rational numbers and floats."""
-    return g.is_rational_function(*g.free_symbols) and all(a.exp.is_Integer for a in g.atoms(sp.Pow))
 
 
 def _plain(g: sp.Expr) -> sp.Expr:

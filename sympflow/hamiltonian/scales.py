@@ -11,19 +11,14 @@ import numpy as np
 from sympflow.hamiltonian.definition import bare_copy
 from sympflow.lazy import kept, lately_kept
 
-STATES = 64
-"""States of a domain at which Hessians are taken, where there is no y0."""
-MOST_DENSE = 200
-"""Degrees of freedom of lattices and pairs of which steps and Hessians are matrices."""
-SLOW = 0.1
-"""Radians in a step of the system, the rate where nothing in H gives one."""
+STATES = 64  # states of a domain at which Hessians are taken, where there is no y0
+MOST_DENSE = 200  # degrees of freedom of lattices and pairs of which steps and Hessians are matrices
+SLOW = 0.1  # radians in a step of the system, the rate where nothing in H gives one
 
-STEP = 0.05
-"""Radians of the fastest motion in a default step."""
+STEP = 0.05  # radians of the fastest motion in a default step
 MOST_RATES = 16  # states of a batch at which rates are taken
 
-SMALLEST_SCALE = 1e-3
-"""The scale of energy errors, at least, in units of the size of the terms of H along an orbit."""
+SMALLEST_SCALE = 1e-3  # the scale of energy errors, at least, in units of the size of the terms of H along an orbit
 
 
 def natural_scale(scene: Any) -> np.ndarray:

@@ -49,11 +49,9 @@ from sympflow.hamiltonian.poles import Poles, SymbolicPoles
 from sympflow.hamiltonian.removable import BOUNDED, Max, sinc
 
 LARGEST, TINY = sys.float_info.max, 1e-150
-MOST_LEFT_OUT = 100
-"""Degrees of freedom up to the last one that a formula may do without."""
+MOST_LEFT_OUT = 100  # degrees of freedom up to the last one that a formula may do without
 LONGEST_NAME = 40  # in messages
-MOST_COORDINATES = 10_000
-"""Degrees of freedom of an H that is written out."""
+MOST_COORDINATES = 10_000  # degrees of freedom of an H that is written out
 FAR = 1000.0
 """The time before and after 0 in which it is looked if H jumps, where that is at no zeros of linear functions."""
 
@@ -104,8 +102,7 @@ class SymbolicHamiltonian(Definition):
     samples: Mapping[str, Samples] = MappingProxyType({})
     impulses: tuple[tuple[Zeros, SymbolicHamiltonian], ...] = ()
     """The zeros of g, and W, of the terms δ(g(t))·W(q, t) of H."""
-    _rest: SymbolicHamiltonian | None = None
-    """H without its impulses, where it has some."""
+    _rest: SymbolicHamiltonian | None = None  # H without its impulses, where it has some
 
     def __init__(
         self,
@@ -550,14 +547,11 @@ def _read(
     for name in params:
         if names[name] not in H.free_symbols:
             raise ValueError(f"`params` has {name!r}, which the expression does not use: remove it.")
-    return H, {names[name]: _symbolic(name, value, time) for name, value in params.items()}
-
-
-def _symbolic(name: str, value: Any, time: sp.Symbol | None) -> sp.Expr:
-    if isinstance(value, Samples):
-        assert time is not None
-        return sampled_parameter(name, value, time)
-    return exact(value)
+    is_sampled = {name: isinstance(value, Samples) and time is not None for name, value in params.items()}
+    return H, {
+        names[name]: sampled_parameter(name, value, time) if is_sampled[name] else exact(value)
+        for name, value in params.items()
+    }
 
 
 def exact(value: float) -> sp.Expr:

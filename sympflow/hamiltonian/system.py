@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import Kick
 
 MOST_DEGREES = 1_000_000
-TYPESET = 400
-"""Characters of an H that notebooks typeset."""
+TYPESET = 400  # characters of an H that notebooks typeset
 GREEK = {"omega": "ω", "mu": "μ", "epsilon": "ε", "alpha": "α", "beta": "β"}
 PROPER = {"henon_heiles": "Hénon–Heiles"}
 SHOWN_NAMES = (
@@ -154,8 +153,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
 
     _period: float | None = None
     _former_period: float | None = None
-    _continuous = True
-    """False of systems that are made of others, whose H may jump where solutions do not feel it."""
+    _continuous = True  # False of systems that are made of others, whose H may jump where solutions do not feel it
     exact: Callable[[Any], Array] | None = None
 
     def __init__(
@@ -670,12 +668,6 @@ class HamiltonianSystem(Hamiltonian, Answering):
     def step_is_open(self) -> bool:
         """True if `dt` was not given, and the system has no states from which it could be chosen."""
         return self._dt is None and self.y0 is None and self.domain is None
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take the state of a pickle, of earlier versions too: they kept `params` as such, and tested no functions."""
-        earlier = {"functions_given": False, "_tested": {}, "_params": Parameters(state.get("params", {}))}
-        earlier["_dt"] = state.get("dt")
-        vars(self).update({**earlier, **{name: value for name, value in state.items() if name not in ("params", "dt")}})
 
     @property
     def params(self) -> Mapping[str, float]:

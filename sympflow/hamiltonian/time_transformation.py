@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -16,12 +15,12 @@ from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.scene import Scene
 from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
+from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
     from sympflow.hamiltonian.symbolic import SymbolicHamiltonian
 
 LARGEST_SHIFT = 1e100
-_ENERGIES: WeakKeyDictionary[HamiltonianSystem, tuple[bytes, float]] = WeakKeyDictionary()
 
 
 def time_transformed(
@@ -105,17 +104,14 @@ def time_transformed(
 
 def default_shift(system: HamiltonianSystem) -> float:
     """c = E + |E| with the energy E of the system's y0: 0 for a bound system whose V vanishes far out, else 2E."""
-    E = 0.0 if system.y0 is None else _energy(system)
+    E = 0.0 if system.y0 is None else _energy(system, system.y0.tobytes())
     return E + abs(E) if math.isfinite(E) else 0.0
 
 
-def _energy(system: HamiltonianSystem) -> float:
+@lately_kept
+def _energy(system: HamiltonianSystem, y0: bytes) -> float:
     """H at the system's y0, kept: every run asks for it several times."""
-    y0 = np.asarray(system.y0, dtype=float)
-    known = _ENERGIES.get(system)
-    if known is None or known[0] != y0.tobytes():
-        known = _ENERGIES[system] = y0.tobytes(), float(system.hamiltonian(y0))
-    return known[1]
+    return float(system.hamiltonian(np.frombuffer(y0)))
 
 
 def checked_shift(shift: Any) -> float:
@@ -133,7 +129,7 @@ def time_scale(system: HamiltonianSystem, c: float) -> float:
     """ds/dt where the kinetic energy equals B = c − E, at the energy E of the system's y0: 2B."""
     if system.y0 is None:
         return 1.0
-    B = c - _energy(system)
+    B = c - _energy(system, system.y0.tobytes())
     scale = 2 * B if B > 0 else c - float(system.potential(system.y0[: system.ndof]))
     if not scale > 0:
         raise ValueError(
@@ -215,4 +211,4 @@ class _Logarithmic(Definition):
 def _bordered(S: Array) -> Array:
     """S (..., d, d) with a row and a column of zeros added."""
     wide = concatenate([S, 0 * S[..., :1]])
-    return concatenate([wide.swapaxes(-1, -2), 0 * wide.swapaxes(-1, -2)[..., :1]]).swapaxes(-1, -2)
+    return concatenate([wide, 0 * wide[..., :1, :]], -2)

@@ -36,10 +36,8 @@ def checked_time(t: Any, x: Array, batch: tuple[int, ...]) -> Any:
 
 PROBED = np.array([0.0, 0.1327, 0.3819, 0.7211])
 """Parts of a length of time at which functions of the time are probed: at the beginning, and none a simple fraction."""
-PERIOD_TOLERANCE = 1e-8
-"""Share of the largest change of H in time at a state by which it may differ a period later."""
-PERIODS, LATEST = 24, 1000.0
-"""Times at which a period is tested: in the first one, and later up to so many periods."""
+PERIOD_TOLERANCE = 1e-8  # share of the largest change of H in time at a state by which it may differ a period later
+PERIODS, LATEST = 24, 1000.0  # times at which a period is tested: in the first one, and later up to so many periods
 
 
 def probe_times(t0: float, t1: float) -> np.ndarray:

@@ -29,12 +29,9 @@ from sympflow.systems.given import GivenSystem, given_system
 
 TRIAL_STEPS, TRIAL_LENGTH, MOST_TRIAL_STEPS = 4096, 400, 1_000_000
 """Steps of a trial run; where it is compiled, so many of `system.dt`, at most the last number; or the run itself."""
-AT_ROUNDING = 1e-8
-"""Errors that may be rounding: below it, steps that are shorter and no better end the search."""
-FINEST_SINGLE = 2e-6
-"""The smallest tolerance of runs in single precision, 16 units in the last place."""
-KEPT = 1e-12
-"""Errors of the energy that are round-off, whatever the step."""
+AT_ROUNDING = 1e-8  # errors that may be rounding: below it, steps that are shorter and no better end the search
+FINEST_SINGLE = 2e-6  # the smallest tolerance of runs in single precision, 16 units in the last place
+KEPT = 1e-12  # errors of the energy that are round-off, whatever the step
 TRIALS = 12
 MOST_STATES = 16  # of a batch in trials
 LOOKED_AT = 64  # states of a trial at which the size of the terms of H is taken
@@ -44,10 +41,8 @@ NEAR_POLE = tuple(10.0**-k for k in range(1, 7))
 LOGARITHMIC = 0.9  # ratio of differences of V at these distances from a pole, at least: of a logarithm 1
 NEWTON_STEPS, MOST_CENTERS = 8, 12  # of places that are looked for, and coordinates of the motion
 
-Candidate = tuple[str, str]
-"""The name of a method, and why it is chosen."""
-CHOSEN_WITH = {"wisdom_holman": {"corrector": 17}}
-"""Options of methods that are chosen."""
+Candidate = tuple[str, str]  # the name of a method, and why it is chosen
+CHOSEN_WITH = {"wisdom_holman": {"corrector": 17}}  # options of methods that are chosen
 RTOL = 1e-9  # of an adaptive method that is chosen
 
 

@@ -46,31 +46,10 @@ if TYPE_CHECKING:
 
 
 @kept
-def _linear_and_rest(system: HamiltonianSystem) -> ExactParts:
-    from sympflow.hamiltonian.parts import linear_and_rest
-
-    return linear_and_rest(system)
-
-
-@kept
 def _exact_parts(system: HamiltonianSystem, parts: Any) -> ExactParts:
     from sympflow.hamiltonian.parts import exact_parts
 
     return exact_parts(system, parts)
-
-
-@kept
-def _two_copies(system: HamiltonianSystem, omega: float | None) -> ExactParts:
-    from sympflow.hamiltonian.copies import coupling_strength, two_copies
-
-    return two_copies(system, coupling_strength(system) if omega is None else float(omega))
-
-
-@kept
-def _frame(system: HamiltonianSystem) -> Frame | None:
-    from sympflow.hamiltonian.planets import frame_of
-
-    return frame_of(system.local, system.y0)
 
 
 class Composition(ABC, ArraySteps):
@@ -80,22 +59,19 @@ class Composition(ABC, ArraySteps):
     splitting, or the scheme with it, does not apply to the system.
     """
 
-    compensates: ClassVar[bool] = False
-    """True if there are compensated sums."""
+    compensates: ClassVar[bool] = False  # True if there are compensated sums
     keeps: ClassVar[str] = ""
     """Name of what a run keeps from step to step beside the state, where steps are made on an extended phase space."""
     counts_as_scheme: ClassVar[bool] = True
     """True if a step evaluates as many forces as the scheme says, whatever the system."""
     takes_values: ClassVar[bool] = False
     """True if compiled loops may take the values of parameters as numbers, other ones for each trajectory."""
-    takes_friction: ClassVar[bool] = False
-    """True if one of the parts holds the friction of a damped system."""
+    takes_friction: ClassVar[bool] = False  # True if one of the parts holds the friction of a damped system
     takes_driving: ClassVar[bool] = False
     """True if the time moves with one of the parts, of a system that depends on it."""
     breakdown: ClassVar[Failure | None] = None
     """The reason for which runs end that cannot go on; None for that of all methods."""
-    doubts: ClassVar[bool] = False
-    """True if there may be a warning of a step that is long for the system."""
+    doubts: ClassVar[bool] = False  # True if there may be a warning of a step that is long for the system
     takes_extended: ClassVar[bool] = False
     """True if the parts stay as they are with E, the momentum of the time, as one more momentum."""
 
@@ -275,7 +251,11 @@ class KineticPotential(Composition):
                     U = U + c * h[..., None] * _velocities(system, p, P)
                 q, p = system.drifted(q, p, at, c * h)
             else:
-                change = (c * h)[..., None] * _hessian_products(system, q, U, at)
+                if system.local is None:
+                    products = system.potential_hessian(q, at) @ U
+                else:  # without the matrix
+                    products = system.hessian_vector(q[..., None, :], U.swapaxes(-1, -2), at).swapaxes(-1, -2)
+                change = (c * h)[..., None] * products
                 if substep.three:
                     G = (substep.three * h**3)[..., None] * _force_gradient_jvp(system, q, U, at)
                     change = change + G
@@ -326,13 +306,6 @@ def _velocities(system: HamiltonianSystem, p: Array, P: np.ndarray) -> np.ndarra
     if not system.quadratic_kinetic:
         return system.kinetic_hessian(p) @ P
     return system.velocity(P.swapaxes(-1, -2)).swapaxes(-1, -2)
-
-
-def _hessian_products(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
-    """∇²V(q)·U of vectors (..., d, k), of a system by one piece without the matrix."""
-    if system.local is None:
-        return system.potential_hessian(q, t) @ U
-    return system.hessian_vector(q[..., None, :], U.swapaxes(-1, -2), t).swapaxes(-1, -2)
 
 
 def _force_gradient_jvp(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
@@ -431,9 +404,10 @@ class LinearRest(ExactMaps):
     label: ClassVar[str] = "linear"
 
     def __init__(self, method: str, scheme: Scheme, system: HamiltonianSystem) -> None:
-        super().__init__(method, scheme, system)
+        from sympflow.hamiltonian.parts import linear_and_rest
 
-        self.parts = _linear_and_rest(system)
+        super().__init__(method, scheme, system)
+        self.parts = linear_and_rest(system)
         if scheme.nystrom and any(part.turns for part in self.parts.rest):
             raise ValueError(
                 f"`method` {method!r} has a Nyström scheme, which needs a rest of H that is a potential U(q), and that "
@@ -565,7 +539,9 @@ class TwoCopies(SolvableParts):
         super().__init__(method, scheme, system)
 
     def _parts(self, system: HamiltonianSystem, parts: Any) -> ExactParts:
-        return _two_copies(system, self.omega)
+        from sympflow.hamiltonian.copies import two_copies
+
+        return two_copies(system, self.omega)
 
     def lift(self, y: Array) -> Array:
         from sympflow.hamiltonian.copies import both
@@ -604,7 +580,9 @@ class KeplerInteraction(Composition):
             )
         if system.friction:
             raise ValueError(f"`method` {method!r} does not take friction: use the splitting 'kinetic'.")
-        frame = _frame(system)
+        from sympflow.hamiltonian.planets import frame_of
+
+        frame = frame_of(system)
         if frame is None:
             raise ValueError(
                 f"`method` {method!r} is for planets about a star, which {system.name!r} is not: make it by "

@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from sympflow.arguments import MAX_ASKED_VALUES
-from sympflow.arrays import Array, as_tensor, is_tensor, jvp, to_numpy
+from sympflow.arrays import Array, as_tensor, is_tensor, jacobian, like, to_numpy
 from sympflow.compiler import NotCompiled
 from sympflow.events import EventSearch
 from sympflow.hamiltonian.system import HamiltonianSystem
@@ -380,16 +380,10 @@ def forward_tangent(
 
     Of given vectors W (..., n, k) their images, the product with the Jacobian.
     """
-    import torch
-
-    x = torch.as_tensor(to_numpy(y))
-    lengths = torch.as_tensor(h, dtype=x.dtype)
-    directions = torch.eye(x.shape[-1], dtype=x.dtype) if W is None else torch.as_tensor(W, dtype=x.dtype)
-    columns = []
-    for direction in directions.unbind(-1):
-        y_next, column = jvp(lambda z: step(z, lengths), x, direction.expand_as(x))
-        columns.append(column)
-    return to_numpy(y_next), to_numpy(torch.stack(columns, dim=-1))
+    x = as_tensor(to_numpy(y))
+    lengths, directions = (None if each is None else like(each, x) for each in (h, W))
+    y_next, J = jacobian(lambda z: step(z, lengths), x, directions)
+    return to_numpy(y_next), to_numpy(J)
 
 
 def differentiated(

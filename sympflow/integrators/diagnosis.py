@@ -43,8 +43,7 @@ H changes by more than a tenth of the kinetic energy within so many steps."""
 LOST_AROUND = 0.1
 
 
-TOO_LONG = 0.05
-"""Energy error, over the size of the energy, of a run whose step is too long."""
+TOO_LONG = 0.05  # energy error, over the size of the energy, of a run whose step is too long
 PHASES, PHASE_ERROR = np.geomspace(1e-3, 3.0, 400), 0.01
 """Where energy is not kept, a step is too long if an oscillation is off by so much of a radian, or beyond the last."""
 LARGE = 200  # degrees of freedom

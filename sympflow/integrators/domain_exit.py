@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 STATES_COMPARED, MOST_COMPARED = 16, 64
 """Outputs of a run, and states of a batch, at which H is compared with that of the flow."""
 
-MANY_TIMES = 1000.0
-"""Times the certified energy error of a flow beyond which an error outside its domain is warned of."""
+MANY_TIMES = 1000.0  # times the certified energy error of a flow beyond which an error outside its domain is warned of
 
 
 def _surely_within(flow: KnownFlow | None, system: HamiltonianSystem, y: np.ndarray, slack: float) -> bool:

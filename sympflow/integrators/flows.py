@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -31,8 +30,10 @@ from sympflow.integrators.clocks import (
 from sympflow.integrators.contract import Failure, Outcome, Problem, Steps
 from sympflow.integrators.domain_exit import check_start
 from sympflow.integrators.grid_runs import grid_run
+from sympflow.integrators.registry import is_flow
 from sympflow.integrators.steppers import ArraySteps, Stepper, compiled_loops, rollout
 from sympflow.kernels.protocol import RunCheckpoint
+from sympflow.lazy import kept
 
 if TYPE_CHECKING:  # and torch, which compiled runs of flows that ship do without
     from sympflow.flow.flow_map import FlowMap
@@ -56,23 +57,19 @@ def known(key: tuple[Any, ...], make: Callable[[], T]) -> T:
 
 
 _KINDS_OF_SYSTEM: dict[tuple[Any, ...], int] = {}
-_KIND_OF: WeakKeyDictionary[HamiltonianSystem, int] = WeakKeyDictionary()
-_FLOWS_OF: WeakKeyDictionary[HamiltonianSystem, dict[tuple[Any, ...], KnownFlow]] = WeakKeyDictionary()
 
 
+@kept
 def kind_of(system: HamiltonianSystem) -> int:
     """A number that systems with the same formula and the same flows share, by which flows that ship are kept."""
-    kind = _KIND_OF.get(system)
-    if kind is None:
-        found = system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
-        kind = _KIND_OF[system] = _KINDS_OF_SYSTEM.setdefault(found, len(_KINDS_OF_SYSTEM))
-    return kind
+    found = system.fingerprint, system.expression, tuple(f.name for f in shipped_flows(system))
+    return _KINDS_OF_SYSTEM.setdefault(found, len(_KINDS_OF_SYSTEM))
 
 
-def is_flow(flow: Any) -> bool:
-    """True for a trained flow: there is none unless its module has been imported, with torch."""
-    flows = sys.modules.get("sympflow.flow.flow_map")
-    return flows is not None and isinstance(flow, flows.FlowMap)
+@kept
+def _shipped(system: HamiltonianSystem, name: str, tolerance: float | None) -> KnownFlow:
+    """The flow of a kind that ships for a system."""
+    return known((name, kind_of(system), tolerance), lambda: choose(system, name, tolerance).known(system))
 
 
 def checked_flow(flow: Any, kind: str, what: str) -> Any:
@@ -132,16 +129,7 @@ class FlowIntegrator(FixedStep):
         return self.known_flow(system).thawed
 
     def known_flow(self, system: HamiltonianSystem) -> KnownFlow:
-        if self.flow is not None:
-            return self.flow.bound(system)
-        asked = name, tolerance = self.name, self.tolerance
-        flows = _FLOWS_OF.get(system)
-        if flows is None:
-            flows = _FLOWS_OF[system] = {}
-        if asked not in flows:
-            key = (name, kind_of(system), tolerance)
-            flows[asked] = known(key, lambda: choose(system, name, tolerance).known(system))
-        return flows[asked]
+        return _shipped(system, self.name, self.tolerance) if self.flow is None else self.flow.bound(system)
 
     def on_extended(self, system: HamiltonianSystem, extended: HamiltonianSystem) -> FlowIntegrator | None:
         flow = self.flow_for(system).on_extended(extended)

@@ -46,8 +46,7 @@ from sympflow.kernels.protocol import RunCheckpoint
 if TYPE_CHECKING:
     from sympflow.storage.runs import Place, RunStore
 
-SECONDS = 0.2
-"""The time that a window is to take."""
+SECONDS = 0.2  # the time that a window is to take
 GROWTH = 16  # of a window, over the one before
 FEW_STEPS = 512  # below which a run is never cut
 ARRAY_STEPS = 256  # of array operations, in the first window
@@ -56,8 +55,7 @@ ONE, MANY = 2**18, 2**22
 LEAST = 16  # steps of the first window of a batch, whose states are loaded and stored in each
 DENSE, LARGE = 16, 2**26
 """A run that saves one of so many steps or more is in one piece unless it has as many numbers: windows are copied."""
-MOST_SAVED = 2**21
-"""Numbers that a window saves, at most."""
+MOST_SAVED = 2**21  # numbers that a window saves, at most
 FIRST_CHUNK, LAST_CHUNK = 8, 1024  # steps between two looks at the events
 MOST_SAMPLES = 65536  # of the events, in a chunk
 COUNTED = ("force_evaluations", "hessian_evaluations", "curvature_evaluations", "newton_iterations")
@@ -109,14 +107,10 @@ class Run(ABC):
 
     def stats(self, n_told: int, n_steps: int, n_saved: int, n_extra: int) -> dict[str, Any]:
         """Return the statistics of n_steps steps, n_saved states and n_extra shorter steps."""
-        stepper = self.stepper
-        return {
-            "dt": self.dt,
-            "n_steps": n_told,
-            **stepper.evaluations(n_steps, n_saved, n_extra),
-            "backend": stepper.backend + stepper.why,
-            **stepper.more_stats(),
-        }
+        stepper, arrays = self.stepper, self.stepper.arrays
+        stats: dict[str, Any] = {"dt": self.dt, "n_steps": n_told, **stepper.evaluations(n_steps, n_saved, n_extra)}
+        stats["backend"] = stepper.backend + stepper.why
+        return stats | {"newton_iterations": arrays.iterations} if arrays.stages else stats
 
 
 class GridRun(Run):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -11,8 +12,7 @@ import numpy as np
 from sympflow.arguments import check_not_followed
 from sympflow.arrays import Array, beside, detached, last, like, moveaxis, stack
 
-Time = Any
-"""A number, or a tensor that carries a gradient."""
+Time = Any  # a number, or a tensor that carries a gradient
 
 
 class Interpolant:
@@ -70,6 +70,18 @@ class DenseOutput:
             raise ValueError(f"`t` must lie in [{self.t_min:g}, {self.t_max:g}], the interval that was solved.")
         y = last(self.states(times))
         return y[..., 0] if np.ndim(t) == 0 else y
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A dense output whose states (..., k) are mapped by a function."""
+
+    sol: Callable[[Any], Array]
+    of: Callable[[Array], Array]
+
+    def __call__(self, t: Any) -> Array:
+        y = self.sol(t)
+        return self.of(y) if np.ndim(t) == 0 else self.of(y.swapaxes(-1, -2)).swapaxes(-1, -2)
 
 
 class Piecewise(DenseOutput):

@@ -198,7 +198,7 @@ def build(method: Any, options: dict[str, Any]) -> Integrator:
                     "one."
                 )
             return method
-        if _is_flow(method):
+        if is_flow(method):
             if not options:
                 return get(method.kind)(flow=method)  # type: ignore[call-arg]
             options = {"flow": method, **options}
@@ -241,7 +241,7 @@ def _made(method: Any, make: Callable[[], T]) -> T:
         ) from error
 
 
-def _is_flow(method: Any) -> bool:
+def is_flow(method: Any) -> bool:
     """True for a trained flow: there is none unless its module has been imported, with torch."""
     flows = sys.modules.get("sympflow.flow.flow_map")
     return flows is not None and isinstance(method, flows.FlowMap)

@@ -18,8 +18,7 @@ from sympflow.hamiltonian.times import stage_time
 from sympflow.integrators.contract import ByVectorField
 from sympflow.integrators.grid import no_event
 
-HIDES = 0.01
-"""Errors of the default tolerance that are so large, in units of q or of p, hide what a run does."""
+HIDES = 0.01  # errors of the default tolerance that are so large, in units of q or of p, hide what a run does
 
 
 class ExplicitStep(ByVectorField):

@@ -42,11 +42,10 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import pieces_of
 from sympflow.integrators.interpolants import Batch, Interpolant, Piecewise, hermite, quartic
 from sympflow.integrators.runge_kutta import ExplicitStep, RungeKutta, hopeless, weighted
-from sympflow.integrators.steppers import Stepper, compiled_loops, followed_loops
+from sympflow.integrators.steppers import Stepper, stepper_of
 from sympflow.integrators.tableaux import ADAPTIVE, FIXED, MULTISTEP, Tableau
 
-Visit = Callable[[Interpolant], bool]
-"""Takes a step as soon as it is accepted; whether the run ends in it."""
+Visit = Callable[[Interpolant], bool]  # takes a step as soon as it is accepted; whether the run ends in it
 
 
 class Trace:
@@ -563,18 +562,8 @@ class FixedGrid(ExplicitStep, FixedStep):
     tableau: ClassVar[Tableau]
 
     def own_stepper(self, problem: Problem) -> Stepper:
-        told, arrays = list[str](), OwnSteps(self, problem)
         make = partial(self.compiled, problem.system, "explicit_kernel", self.tableau)
-        if problem.followed:
-            return Stepper(self, problem, arrays, followed_loops(make, problem))
-        kernel = compiled_loops(
-            make,
-            problem.y0,
-            problem.backend,
-            told=told,
-            system=problem.system,
-        )
-        return Stepper(self, problem, arrays, kernel, told)
+        return stepper_of(self, problem, OwnSteps(self, problem), make)
 
     def multiplier(self, z: np.ndarray) -> np.ndarray:
         K: list[np.ndarray] = []

@@ -34,31 +34,11 @@ _COMPARED: WeakKeyDictionary[HamiltonianSystem, dict[int, tuple[ref[Any], np.nda
 
 
 class Comparison:
-    """Compares the right-hand side that a peer was given with the velocity of the motion that a method computes.
-
-    That is J∇H of the system; of a flow that was given without one, ∂_tψ̄ at t = 0.
-
-    Parameters
-    ----------
-    argument : str
-        The peer's name of its right-hand side.
-    integrator : FixedStep
-    system : HamiltonianSystem or None
-        None for a flow that was given without a system.
-    remedy : str
-        The way to pass the same system twice.
-
-    Attributes
-    ----------
-    states_compared : int
-        States at which the method's own velocity was evaluated so far.
-    known : bool
-        True if an earlier run compared this very right-hand side, so that its start and end are enough.
-    """
+    """Compares a right-hand side that a peer was given with the velocity of the motion that a method computes."""
 
     def __init__(self, argument: str, integrator: FixedStep, system: HamiltonianSystem | None, remedy: str) -> None:
         self.argument, self.integrator, self.system, self.remedy = argument, integrator, system, remedy
-        self.flow = integrator.given_flow if system is None else integrator.flow_for(system)
+        self.flow: Any = integrator.given_flow if system is None else integrator.flow_for(system)
         self.states_compared, self.known = 0, False
         self._given: Any = None
         self._next, self._gap = FIRST_LOOK, FIRST_LOOK
@@ -66,13 +46,7 @@ class Comparison:
     # at the start ---------------------------------------------------------------------------------
 
     def with_system(self, other: HamiltonianSystem) -> None:
-        """Compare with a system that was passed as the right-hand side, by its fingerprint.
-
-        Raises
-        ------
-        ValueError
-            If it is another one.
-        """
+        """Raise a ValueError if a system that was passed as the right-hand side is another, by its fingerprint."""
         mine = self.system
         if mine is None or mine is other:
             return
@@ -83,13 +57,7 @@ class Comparison:
             )
 
     def with_flow(self, y: np.ndarray, t: float) -> None:
-        """Compare the velocity of a flow that knows no system with that of the system it shall solve.
-
-        Raises
-        ------
-        ValueError
-            If they differ at y (2d,) or in the domain of the flow; of a driven system at the time t.
-        """
+        """Raise a ValueError if a flow that knows no system does not move y (2d,) as the system it shall solve."""
         if self.flow is None or self.system is None or self.flow.fingerprint is not None:
             return
         states = np.concatenate([y[None], _drawn(self.flow.domain_for(self.system), y.size)])
@@ -99,15 +67,7 @@ class Comparison:
     def at_start(
         self, fun: RightHandSide, y0: np.ndarray, t_span: tuple[float, float], given: Callable[..., Any] | None = None
     ) -> None:
-        """Compare at several states and times: y0 (..., 2d), states around it, and states of the domain.
-
-        At y0 alone, if `given`, the function of the user, is remembered from a run with such states and times.
-
-        Raises
-        ------
-        ValueError
-            If the right-hand side is another system's, or depends on the time.
-        """
+        """Compare at y0 (..., 2d), at states around it, and in the domain; at y0 alone if `given` is remembered."""
         t0 = t_span[0]
         self.at(t0, y0, fun(t0, y0), fun)
         self.known = self._remembers(given, _bounds(t_span, [y0]))
@@ -156,10 +116,7 @@ class Comparison:
         return bool((known[0] <= bounds[0]).all() and (known[1] >= bounds[1]).all())
 
     def _probes(self, y0: np.ndarray) -> list[np.ndarray]:
-        """States like y0 (..., 2d): each of its rows moves to each distance, and to each state of the domain, in turn.
-
-        As few of them as a batch has rows enough, but three at least.
-        """
+        """States like y0 (..., 2d): its rows moved to each distance, and to each state of the domain, in turn."""
         rows = y0.reshape(-1, y0.shape[-1])
         d = rows.shape[-1] // 2
         size = np.repeat([np.abs(rows[:, part]).max() or 1.0 for part in (slice(0, d), slice(d, None))], d)
@@ -180,7 +137,6 @@ class Comparison:
         """States of the domain (n, 2d), n = 0 without one."""
         system = self.system
         if system is None:
-            assert self.flow is not None
             ground = self._ground()
             return _drawn(ground if ground is self.flow.domain else None, 2 * self.flow.ndof)
         if system not in _WITHIN:
@@ -189,7 +145,6 @@ class Comparison:
 
     def _ground(self) -> Domain | None:
         """The domain of a flow that was given alone, or a box about it, if its H is not known."""
-        assert self.flow is not None
         domain = self.flow.domain
         return domain.box if isinstance(domain, EnergySublevel) and domain.hamiltonian is None else domain
 
@@ -204,13 +159,7 @@ class Comparison:
         return True
 
     def at(self, t: Any, y: np.ndarray, slope: Any, fun: RightHandSide, t0: float | None = None) -> None:
-        """Compare at states y (..., 2d) of the run, where `fun` gives `slope`, at a time or a time for each.
-
-        Raises
-        ------
-        ValueError
-            If the right-hand side is another system's, or, where t0 is given, depends on the time.
-        """
+        """Compare at states y (..., 2d) of the run, where `fun` gives `slope`; a ValueError if they differ."""
         width = y.shape[-1]
         states, slope = y.reshape(-1, width)[:MOST_ROWS], np.asarray(slope).reshape(-1, width)[:MOST_ROWS]
         times = np.broadcast_to(t, y.shape[:-1]).reshape(-1)
@@ -225,18 +174,15 @@ class Comparison:
             return
         i = int(np.argmin(agree))
         looked = t0 is not None and t0 != times[i] and self.system.autonomous
-        before = _quietly(fun, t0, y) if looked and t0 is not None else None
-        if before is not None:
+        if looked and t0 is not None and (before := _quietly(fun, t0, y)) is not None:
             before = before.reshape(-1, width)[:MOST_ROWS]
             if _agree(before, velocity)[i]:
-                assert t0 is not None
                 self._refuse_time(t0, times[i], states[i], before[i], slope[i])
         self._refuse(times[i], states[i], slope[i], velocity[i])
 
     def _close_to_flow(self, times: np.ndarray, states: np.ndarray, slope: np.ndarray) -> None:
         import torch
 
-        assert self.flow is not None
         states = states.astype(float)
         if (ground := self._ground()) is not None:  # elsewhere it was trained for nothing
             inside = np.asarray(ground.contains(states))
@@ -322,14 +268,7 @@ def _drawn(domain: Domain | None, width: int) -> np.ndarray:
 
 
 def fixed_step(method: Any, options: dict[str, Any], peer: str) -> FixedStep:
-    """The fixed-step integrator that `method` and `options` mean.
-
-    Raises
-    ------
-    TypeError
-        If the method chooses its own steps: the peer has such methods itself; if its steps, or those of a flow, are not
-        on a grid; or if a run keeps more than the state.
-    """
+    """The fixed-step integrator that `method` and `options` mean; a TypeError where the peer cannot drive it."""
     from sympflow.integrators.registry import build
 
     integrator = build(method, options)

@@ -33,20 +33,7 @@ def numbers(t: Tensor) -> np.ndarray:
 
 
 class Path:
-    """The trajectory of an integrator from y0, on the grid k·dt of elapsed times, in one direction of time.
-
-    Parameters
-    ----------
-    integrator : FixedStep
-    system : HamiltonianSystem or None
-        None for a flow that needs none.
-    y0 : tensor of shape (..., 2d)
-    direction : 1 or -1
-    t0 : tensor of shape ()
-        The time of y0, on which the steps of a driven system depend.
-    before_step : callable, optional
-        Called before each step, which are then made one by one.
-    """
+    """The trajectory of an integrator from y0 (..., 2d), on the grid k·dt of elapsed times, in one direction."""
 
     def __init__(
         self,
@@ -63,13 +50,11 @@ class Path:
         self.driven = system is not None and not system.autonomous
         self.start = t0.to(torch.float64)
         self.t0: Any = 0.0 if not self.driven else self.start if differentiable(t0) else float(t0)
-        self.eager = self._learns() or differentiable(self.t0)
+        learns = system is not None and system.definition.learns(y0)  # True if torch follows numbers of H
+        self.eager = learns or differentiable(*self.weights(), self.t0)
 
     def __call__(self, s: Tensor) -> Tensor:
-        """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction.
-
-        Differentiable in s (where an s is a whole number of steps: in the step that begins or ends there).
-        """
+        """ψ_s(y0), (n, ..., 2d), for elapsed times s (n,), each 0 or with the sign of the direction."""
         count, r = self.located(s)
         saved = np.unique(numbers(count))
         states = self.rollout(saved)[_places(saved, count)]
@@ -84,11 +69,7 @@ class Path:
         return _each(self.t0 + count.to(torch.float64) * self.h, states) if self.driven else 0.0
 
     def located(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Counts k of whole steps and remainders r (n,), in float64, with s = k·h + r; gradients flow from s to r.
-
-        As `Grid.locate`: a quotient within a few ulp of an integer is that integer. Under `torch.func.vmap` each lane
-        has its own.
-        """
+        """Counts k of whole steps and remainders r (n,), with s = k·h + r; gradients flow from s to r."""
         elapsed = numbers(s)
         far = float(np.abs(elapsed).max(initial=0.0))
         if self.driven:
@@ -108,10 +89,7 @@ class Path:
         return count.to(torch.int64), torch.where(on_grid, r - r.detach(), r)
 
     def rollout(self, save: np.ndarray, start: Tensor | None = None, first: int = 0) -> Tensor:
-        """The states after the steps `save` (sorted counts): compiled if torch follows nothing.
-
-        From y0, or from `start`, the state after `first` steps.
-        """
+        """The states after the steps `save` (sorted counts) from y0, or from `start`, the state after `first` steps."""
         y: Any = self.y0 if start is None else start
         if self.before_step is not None:
             return self._one_by_one(save)
@@ -139,10 +117,7 @@ class Path:
         return torch.stack(states)
 
     def step(self, y: Tensor, h: float | Tensor, t: Any) -> Tensor:
-        """A step of length h from the time t, each a number or one for each state.
-
-        By NumPy where nothing is to be differentiated. The time is 0 where the system does not depend on it.
-        """
+        """A step of length h from t, each a number or one for each state; by NumPy where nothing is differentiated."""
         return self._stepped(self.integrator.step, y, h, t)
 
     def inverse(self, y: Tensor, t: Any) -> Tensor:
@@ -161,12 +136,6 @@ class Path:
         """True if NumPy may step y: on the CPU, and with nothing that torch follows, of the state or of weights."""
         return not (self.eager or differentiable(y)) and y.device.type == "cpu"
 
-    def _learns(self) -> bool:
-        """True if torch follows numbers of the map: the weights of the flow, or those of H."""
-        if differentiable(*self.weights()):
-            return True
-        return self.system is not None and self.system.definition.learns(self.y0)
-
     def weights(self) -> list[Tensor]:
         """The weights of the flow, if there is one."""
         flow = self.integrator.flow_for(self.system)
@@ -175,19 +144,7 @@ class Path:
     # events ------------------------------------------------------------------------------------------
 
     def first_zero(self, g: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes, and the state there.
-
-        g is tested at every step, and every `system.dt` within longer ones, such as those of a flow.
-
-        Their derivatives are those of the implicit function g(s, ψ_s) = 0, in both modes, the first and the second.
-
-        Raises
-        ------
-        RuntimeError
-            If there is none within a million steps, or the state became non-finite before.
-        TypeError
-            If the values of the states are hidden, by `torch.func.vmap` or `torch.compile`.
-        """
+        """The elapsed time s at which g(s, ψ_s(y0)), a number, first vanishes, and the state there; differentiable."""
         if not readable(self.y0) or (self.eager and not readable(self.step(self.y0, self.h, self.t0))):
             raise TypeError(
                 "`event_fn` is followed by the values of the states, which torch.func.vmap and torch.compile hide: "
@@ -281,15 +238,7 @@ class Path:
 
 
 class DensePath(Path):
-    """A path to a known end whose states on the grid are computed once.
-
-    Parameters
-    ----------
-    integrator, system, y0, direction
-        As for `Path`.
-    times : tensor of shape (2,)
-        Its beginning and end.
-    """
+    """A path between two `times` (2,) whose states on the grid are computed once."""
 
     def __init__(
         self, integrator: FixedStep, system: HamiltonianSystem | None, y0: Tensor, direction: int, times: Tensor
@@ -312,21 +261,7 @@ class DensePath(Path):
 
 
 class AdjointPath(Path):
-    """A path whose derivatives are pulled back step by step, along the states that the inverse of the map steps to.
-
-    Memory does not grow with the number of steps: only the states at the outputs are kept. They are those of
-    backpropagation to the rounding of the inverse, which an unstable orbit magnifies from output to output. A map
-    without an inverse is run again from its outputs, with √n states kept of n steps between two of them.
-
-    Reverse mode only, and once.
-
-    Parameters
-    ----------
-    integrator, system, y0, direction, before_step
-        As for `Path`.
-    parameters : sequence of tensors
-        Numbers of H that get gradients, beside the weights of a flow.
-    """
+    """A path whose derivatives are pulled back step by step, along states that the inverse of the map steps to."""
 
     def __init__(self, *arguments: Any, parameters: Sequence[Tensor] = (), **more: Any) -> None:
         super().__init__(*arguments, **more)
@@ -365,10 +300,7 @@ class AdjointPath(Path):
                     yield first + mark + j, state
 
     def pulled(self, y: Tensor, h: float | Tensor, t: Any, a: Tensor) -> tuple[Tensor, list[Any], list[Any]]:
-        """The cotangents of y, of h and t, and of the parameters in a step from y at t, where that of its end is a.
-
-        None for an h or t without a graph.
-        """
+        """The cotangents of y, of h and t, and of the parameters in a step, where that of its end is a."""
         with torch.enable_grad(), naming_plugin(self.integrator):
             y = y.detach().requires_grad_(True)
             inputs: list[Any] = [y, *self.parameters]
@@ -436,10 +368,7 @@ class _PulledBack(torch.autograd.Function):
                 of_start = of_start if of_t is None else of_start + of_t
                 if of_lengths is not None:
                     of_s[i] = of_lengths.sum()
-        times = (
-            of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None,
-            of_start if ctx.needs_input_grad[2] else None,
-        )
+        times = (of_s.to(ctx.dtype) if ctx.needs_input_grad[1] else None, of_start if ctx.needs_input_grad[2] else None)
         return None, *times, a, *of_parameters
 
 

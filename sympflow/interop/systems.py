@@ -193,10 +193,7 @@ def _probes(ndof: int, y0: ArrayLike | None) -> Tensor:
 
 
 def _mass(hessian: Tensor, gradient: Callable[[Tensor], Tensor], probes: Tensor) -> np.ndarray | None:
-    """M if H is ½ pᵀM⁻¹p + V(q) at all probes, judged by what does not depend on the units of q, p and H.
-
-    Entry (i, j) of ∂²H is small if it is small beside √(∂²H/∂y_i² · ∂²H/∂y_j²), the only product of such units.
-    """
+    """M if H is ½ pᵀM⁻¹p + V(q) at all probes, judged by what does not depend on the units of q, p and H."""
     d = probes.shape[-1] // 2
     A = hessian.detach().numpy()
     size = _size(A)

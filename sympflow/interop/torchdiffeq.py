@@ -30,14 +30,13 @@ from sympflow.interop.path import AdjointPath, BeforeStep, DensePath, Path, leav
 State = Tensor | tuple[Tensor, ...]
 _THEIRS = {*ADAPTIVE, *FIXED, "explicit_adams", "implicit_adams", "fixed_adams", "scipy_solver"}
 _RTOL, _ATOL = 1e-7, 1e-9
-_CALLBACKS = (
+_CALLBACKS = (  # callbacks of torchdiffeq for adaptive steps and its adjoint equation, which our methods have not
     "callback_accept_step",
     "callback_reject_step",
     "callback_step_adjoint",
     "callback_accept_step_adjoint",
     "callback_reject_step_adjoint",
 )
-"""Callbacks of torchdiffeq for adaptive steps and its adjoint equation, which our methods have not."""
 _LATE = 1000.0  # time after the start in which an event is expected
 _CHECKPOINTS = 5  # outputs of a run at which another right-hand side is compared
 _REMEDY = "Pass one system: odeint(system, ...), without options['system'] and without another function."
@@ -108,8 +107,7 @@ def _integrated(
     """`odeint` by one of our methods, along a path."""
     if (rtol, atol) != (_RTOL, _ATOL):
         warn(
-            f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.",
-            UserWarning,
+            f"`rtol` and `atol` have no effect on the fixed-step method {_name(method)!r}: leave them out.", UserWarning
         )
     direction = _direction(t)
     integrator, system = _build(func, method, options)

@@ -52,12 +52,8 @@ class OnInterval:
 def on_interval(functions: Sequence[sp.Expr], x: sp.Symbol, low: float, high: float) -> OnInterval | None:
     """Functions of x as polynomials on [low, high] whose errors are below rounding; None where there are none.
 
-    Each function is to enter with a factor at least `AMPLIFIED` times less than that before, as the terms of a kick do
-    (with g about (ω Δt)²/100 of b and c as much of g): its errors may be larger by that.
-
-    The coefficients are those of Chebyshev interpolants, cut where what follows is below rounding, in powers of x less
-    the middle (of an interval that is nearly symmetric about 0: in powers of x on a symmetric one). Where the powers
-    cancel so that rounding would be amplified, there is none either.
+    Each function is to enter with a factor at least `AMPLIFIED` times less than that before, as the terms of a kick do:
+    its errors may be larger by that. Coefficients are those of Chebyshev interpolants, in powers of x less the middle.
     """
     from mpmath import mp
 
@@ -91,10 +87,7 @@ def _cosines() -> list[list[Any]]:
 
 
 def _powers(values: Sequence[Any], cosines: Sequence[Sequence[Any]], half: float, less: float) -> list[float] | None:
-    """The coefficients in powers of x of a function by its values at the nodes; None of one that is too long.
-
-    `less` times its errors count.
-    """
+    """The coefficients in powers of x of a function by its values, whose errors count `less`; None if too long."""
     from mpmath import mp
 
     largest = max(abs(v) for v in values)

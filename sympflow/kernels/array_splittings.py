@@ -1,8 +1,4 @@
-"""Kicks and drifts of states in memory: of systems of many terms, and of those that are given by functions.
-
-The forces are a loop over the terms of each kind, whose coordinates and constants are arrays, so that code does not
-depend on the size of a system; or functions at an address.
-"""
+"""Kicks and drifts of states in memory: of many terms, by a loop over those of each kind, or by functions."""
 
 from __future__ import annotations
 
@@ -90,10 +86,7 @@ class TermForces(Forces):
 
 
 class Functions(Forces):
-    """Forces by a user's Numba functions, called at their addresses; one trajectory after the other.
-
-    Functions of a driven system take the time first.
-    """
+    """Forces by a user's Numba functions, called at their addresses, of a driven system with the time first."""
 
     def __init__(
         self, gradient: Any, hessian_vector: Any | None, inverse_mass: np.ndarray | None, driven: bool
@@ -166,10 +159,7 @@ class FunctionSplitting(Splitting):
 
 
 def addressed(function: Any, along: bool, timed: bool) -> Any:
-    """A Numba function of arrays as one that C can call, with t, places q, v, out and their length.
-
-    What the function raises makes its result NaN. `along` is true of one that takes v, `timed` of one that takes t.
-    """
+    """A Numba function, which may take v (`along`) and t (`timed`), as C calls it: with t, q, v, out and a length."""
     from numba import carray, cfunc, njit, types
 
     calls = {

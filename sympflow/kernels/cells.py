@@ -1,7 +1,4 @@
-"""Bodies sorted into cells, so that those within the cut-off of one are in the cells around its own: code of it.
-
-Cells have three axes, with one cell along those that bodies do not have.
-"""
+"""Code that sorts bodies into cells of three axes: those within the cut-off are in the cells around their own."""
 
 from __future__ import annotations
 

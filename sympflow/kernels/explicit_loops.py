@@ -32,10 +32,7 @@ class Tableau(Protocol):
 
 @kept
 def explicit_kernel(system: HamiltonianSystem, tableau: Tableau, names: tuple[str, ...] = ()) -> OneStepKernel:
-    """The compiled loops of a method on a symbolic system; a ValueError says why there are none.
-
-    With `names` these parameters are numbers of columns.
-    """
+    """The compiled loops of a method, with parameters of these names as numbers of columns, or a NotCompiled."""
     field = field_of(system, names)
     kind = _InMemory if field.large else _InRegisters
     A = tuple(tuple(map(float, row)) for row in tableau.A)
@@ -49,10 +46,7 @@ def compiled_field(system: HamiltonianSystem) -> CompiledField:
 
 
 class Field:
-    """J∇H of a symbolic system, less Γp, plus a force by symbols, as code.
-
-    Terms of a kind are looped over if it is `large`; its code reads arrays `data`: those of the terms, and Γ.
-    """
+    """J∇H less Γp plus a force by symbols, as code; if `large` by loops over terms, which read `data`, then Γ."""
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
         symbols, force = system.spelled, system.external_force

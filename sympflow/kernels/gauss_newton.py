@@ -1,8 +1,4 @@
-"""Compiled linear algebra of Gauss–Newton steps: small dense matrices, on one thread.
-
-The Jacobian comes by columns. It is factored in chunks of rows that stay in the cache: Householder reflections fold one
-chunk after the other into the triangle above it.
-"""
+"""Compiled linear algebra of Gauss–Newton steps: small dense matrices, on one thread, of Jacobians by columns."""
 
 from __future__ import annotations
 
@@ -115,10 +111,7 @@ def _add(y: Value, factor: Value, x: Value, n: Value) -> None:
 
 
 def _fold(R: Value, columns: Value, stride: Value, count: Value, length: Value, triangular: bool) -> None:
-    """Let R be the triangle of the QR factorization of [R; A] for the columns of A, which are lost.
-
-    A `triangular` A is an upper triangle.
-    """
+    """Let R be the triangle of the factors of [R; A] for the columns of A, which are lost; A may be `triangular`."""
     code = R.code
     with code.over(count) as k:
         end = code.apply("min", (length, k + 1)) if triangular else length

@@ -543,13 +543,7 @@ class KeplerLoops:
             self._found[n + group] = LANES * (groups + g) + lanes[: len(group)]
 
     def code(self, form: Form) -> KeplerCode:
-        """The compiled functions of a form, made once.
-
-        Raises
-        ------
-        ValueError
-            If there are none.
-        """
+        """The compiled functions of a form, made once; NotCompiled says why there are none."""
         if self._light and (form.vectors or form.gradients):
             raise NotCompiled(
                 "`system` has bodies without mass, and compiled deviation vectors and force gradients are for bodies "
@@ -609,16 +603,7 @@ def kepler_loops(frame: Frame) -> KeplerLoops:
 
 
 class KeplerKernel(Kernel):
-    """The compiled loops of a scheme of kicks by the interaction and Kepler's drifts, with or without a processor.
-
-    Parameters
-    ----------
-    loops : KeplerLoops
-    substeps : Substeps
-    before, after : Substeps
-        The processor and its inverse; empty for none.
-    compensated : bool
-    """
+    """The compiled loops of a scheme of kicks by the interaction and Kepler's drifts, with a processor or none."""
 
     def __init__(
         self,

@@ -43,10 +43,8 @@ Key = Any
 class Form:
     """All that the code of a lattice depends on: not its size, nor the values of parameters.
 
-    The terms are T ("kinetic"), U ("site") and V by their distances, each an expression and its letters. `directions`
-    are the letters of v and w, `c` those of parameters, `arrays` those of c with a value at each site. The boundary is
-    that of each axis, of the lanes last. With friction −γp (`damped`) a column has two more numbers. `even` slabs are
-    alike.
+    The terms are T ("kinetic"), U ("site") and V by their distances, with their letters; `directions` those of v and w,
+    `arrays` those of c with a value at each site. The boundary is that of each axis, of the lanes last.
     """
 
     terms: tuple[tuple[Any, tuple[Any, tuple[Any, ...]]], ...]
@@ -111,11 +109,7 @@ class Form:
 
 
 class Law:
-    """A calculation at one site or along one bond: from numbers by their keys to `outputs`, others by theirs.
-
-    Numbers of a column have the kind "column". `numbers` are those that depend on parameters alone, written out;
-    `operations` about how many instructions it takes.
-    """
+    """A calculation at a site or a bond, from numbers by keys to outputs by theirs; `numbers` are of parameters."""
 
     def __init__(self, form: Form, keys: Sequence[Key], outputs: Callable[..., dict[Key, Any]]) -> None:
         states = [(f"{kind}{i}", ALWAYS if kind == "column" else 0) for kind, i in keys]
@@ -188,10 +182,7 @@ KINDS = (KICK,), (OPEN, TURN), (OPEN, MIDDLE, LAST)
 
 
 class Pass:
-    """A pass over sites: what is computed along bonds, by their distance, and at a site of what these give.
-
-    A bond has ("flux", f), by which it acts on field f at both ends, and second derivatives to be kept.
-    """
+    """A pass over sites: laws of bonds, by their distance, with ("flux", f) and what is kept, and that of a site."""
 
     def __init__(self, form: Form, name: str, terms: dict[Any, Potential]) -> None:
         self.form, self.name, self._terms, self._fields = form, name, terms, range(form.fields)
@@ -447,8 +438,7 @@ INLINE = 100
 class _Scene:
     """The code of one stage: the numbers and arrays that it reads, and loops over sites.
 
-    `numbers` are those of the context, `vectors` addresses of the first site in vectors of the state and in arrays of
-    sites, `values` numbers that are the same at all sites.
+    `vectors` are addresses of the first site in vectors of the state and in arrays, `values` the same at all sites.
     """
 
     def __init__(self, stages: LatticeStages, state: Value, context: Value, column: Sequence[Value] = ()) -> None:
@@ -819,10 +809,7 @@ PAGE, NEAR = 512, 64  # numbers
 
 
 class Slabs:
-    """How the sites of a lattice lie in the memory of pieces, for so many threads; `order` has the axis of slabs last.
-
-    Pieces have so many planes each; of a lattice of one axis so many slabs.
-    """
+    """The memory of a lattice in pieces of some planes or slabs; `order` has the axis of slabs last."""
 
     def __init__(self, lattice: LatticeHamiltonian, stages: LatticeStages, order: Sequence[int], pieces: int) -> None:
         form, W, R, one_axis = stages.form, stages.form.width, stages.form.reach, len(order) == 1

@@ -32,12 +32,7 @@ AT_ONCE = 4  # sums that are made together, of one column
 
 
 class LayeredCode(SplittingRollouts):
-    """The compiled functions of splitting schemes on one potential with layers; a column's kind is where weights are.
-
-    Parameters
-    ----------
-    potential : LayeredPotential
-    """
+    """The compiled functions of splitting schemes on a potential with layers; a kind is where weights are."""
 
     lanes = 16
     size = 2

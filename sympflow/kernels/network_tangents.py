@@ -40,8 +40,8 @@ REGISTER = Type("double", LANES)
 class TrainedNetwork:
     """The network of a kick or a drift, V(t, x) = w · σ(… σ(K x + k t + b_1) …), as it is fitted.
 
-    Its `inputs` beside t are the d of x and constants of a step; `units` the derivatives of K (h_1, inputs), k (h_1,),
-    w (h_n,), b_1 … b_n, W_1 … W_{n−1}, one after another, by the parameters, each a multiple of its own.
+    Its `inputs` beside t are x and constants of a step; `units` the derivatives of K (h_1, inputs), k (h_1,), w (h_n,),
+    b_1 … b_n, W_1 … W_{n−1}, one after another, by the parameters, each a multiple of its own.
     """
 
     inputs: int
@@ -130,10 +130,7 @@ class NetworkTangents:
 
 
 class _Sizes(NamedTuple):
-    """The sizes of networks, whose layers are as wide as the widest one: weights that they have not are 0.
-
-    The weights of a network are K (h, inputs), k, w (h,), b (n, h), W (n − 1, h, h), one after another.
-    """
+    """Sizes of layers, all as wide as the widest: K (h, inputs), k, w (h,), b (n, h), W (n − 1, h, h) in turn."""
 
     ndof: int
     inputs: int
@@ -295,8 +292,7 @@ def _flat(x: Any) -> list[Value]:
 class _Points:
     """The code of blocks of points: their way through all layers, and back.
 
-    The function takes the addresses of weights, kinds of layers, times, states, constants, `more` others, then of
-    memory; the numbers of layers and of points, the first and the last block, then flags.
+    Arguments are addresses of weights, kinds, times, states, constants, `more`, memory; sizes, blocks and flags.
     """
 
     def __init__(self, code: Code, sizes: _Sizes, activation: str, velocity: bool, more: int) -> None:

@@ -43,8 +43,7 @@ STEP = 1000  # about how many nanoseconds one takes
 class NetworkLayer:
     """The weights of a kick or a drift, whose potential is V(t, x) = w · σ(… σ(K x + k t + b_1) …).
 
-    K is (h_1, d), k (h_1,), the biases (h_l,), the weights (h_{l+1}, h_l), w (h_n,). Where the loops do not know σ by
-    its name, `slopes` is a function of a number a that returns σ(a) and σ'(a).
+    K is (h_1, d), k (h_1,), the biases (h_l,), the weights (h_{l+1}, h_l), w (h_n,). `slopes` returns σ(a) and σ'(a).
     """
 
     is_kick: bool
@@ -58,10 +57,7 @@ class NetworkLayer:
 
 
 class MLPFlowKernel(Kernel):
-    """Compiled loops of one SympFlow with the weights given, a `Kernel`; a step h < 0 is the inverse of ψ̄_|h|.
-
-    Layers are in their order, with potentials of one depth and one activation, else there is a ValueError; |h| ≤ Δt.
-    """
+    """Compiled loops of one SympFlow, of layers of one depth and activation; a step h < 0 is the inverse of ψ̄_|h|."""
 
     saves_finite = False
 
@@ -99,10 +95,7 @@ class MLPFlowKernel(Kernel):
 
 
 class _Layout(NamedTuple):
-    """The sizes of the networks of a flow, and where the weights of one begin: all levels as wide as the widest one.
-
-    Weights are k, w (h,), b (n, h), K (d, h), W (n − 1, from, to) and Wᵀ; those that a network has not are 0.
-    """
+    """Sizes of levels, all as the widest: k, w (h,), b (n, h), K (d, h), W (n − 1, from, to) and Wᵀ, 0 elsewhere."""
 
     ndof: int
     depth: int

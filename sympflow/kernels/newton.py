@@ -2,8 +2,7 @@
 
 The unknowns are K_i = h scale_i f(y + Σ_j A_ij K_j), in which the coefficients are exact where it matters for the long
 run, and y + Σ B_i K_i needs no further evaluation of f. With friction they are those of q and P = e^{γτ}p, τ from the
-beginning of the step. A few unknowns are eliminated in registers, for trajectories in lanes too; more of them in
-memory, where gradient and Hessian stand in the code once, in a loop over the stages.
+beginning of the step. A few unknowns are eliminated in registers, more of them in memory.
 """
 
 from __future__ import annotations
@@ -48,10 +47,7 @@ Cells = Any
 def implicit_kernel(
     system: HamiltonianSystem, tableau: Tableau, compensated: bool = False, names: tuple[str, ...] = ()
 ) -> OneStepKernel:
-    """The compiled loops of a method on a symbolic system, built once; `compensated` sums are Kahan's, in runs.
-
-    With `names` these parameters are numbers of columns. NotCompiled says why there are none.
-    """
+    """The compiled loops of a method, with parameters of these names as numbers of columns, or a NotCompiled."""
     written = system.spelled
     if written is None:
         raise NotCompiled(
@@ -88,8 +84,7 @@ def newton_code(lettered: Lettered, tableau: Tableau, compensated: bool, damped:
 class NewtonCode(OneStep):
     """Steps of an implicit method on a symbolic system, whose count is of Newton's iterations.
 
-    With friction the last numbers of a column are e^{γτ} at the stages and at the end of a step, then their
-    reciprocals. What depends on t alone is computed once a step, for each stage, and follows them.
+    With friction the last numbers of a column are e^{γτ} at the stages and the end of a step, then their reciprocals.
     """
 
     counted = True
@@ -136,10 +131,7 @@ class NewtonCode(OneStep):
 
 
 class _Iteration:
-    """One of Newton's iterations: from y and the numbers of a column to a better K.
-
-    Numbers are in lists, and loops are written out; see `_Looped`. M has rows with the residual behind the unknowns.
-    """
+    """One of Newton's iterations, written out over lists; M has rows with the residual behind the unknowns."""
 
     def __init__(self, method: NewtonCode, wide: int, *numbers: Cells) -> None:
         self.method, self.wide = method, wide
@@ -217,10 +209,7 @@ class _Iteration:
                 self.M[row + unknown] = self.M[row + unknown] + 1.0
 
     def pulled(self, end: Sequence[Any], slopes: bool) -> list[Any]:
-        """The cotangents of y, and with `slopes` of the parameters, for those λ of the state after the step.
-
-        The transposed equations give μ; the cotangents of y are λ + Σ_i v_i, where Aᵀv = μ − Bλ.
-        """
+        """The cotangents λ + Σ_i v_i of y, where Aᵀv = μ − Bλ for μ of the transposed equations; of parameters."""
         n, d, N, wide, method = self.n, self.d, self.N, self.wide, self.method
         weights = method.tableau[1]
         if method.damped:
@@ -522,10 +511,7 @@ class _InMemory(NewtonCode):
 
 
 def _solve(M: Value, sizes: Value, N: int, wide: int) -> None:
-    """Eliminate the unknowns in place: the last column of M becomes the solution.
-
-    Pivots are the largest of their column in units of the sizes of the unknowns; their reciprocals are `sizes`.
-    """
+    """Eliminate the unknowns in place, pivots in units of their sizes: the last column of M becomes the solution."""
     code, type = M.code, Type("double", ABREAST)
     with code.over(N) as k:
         row = code.at(M, k * wide)

@@ -78,8 +78,7 @@ def check_size(form: TracedHamiltonian) -> None:
 class OneStep(Rollouts):
     """The stage of a method that is a whole step, about `work` nanoseconds.
 
-    The numbers of a column are h, the system's parameters, the time t0 of the run's beginning where H depends on it,
-    and what a method adds.
+    A column is h, the system's parameters, the time t0 where H depends on it, and what a method adds.
     """
 
     closing = False
@@ -133,10 +132,9 @@ class OneStep(Rollouts):
 
 
 class OneStepKernel(Kernel):
-    """Compiled loops of a method of one stage a step on one system: the code of runs, and that of single steps.
+    """Compiled loops of a method of one stage a step: the code of runs, and that of single steps.
 
-    ``more(h)`` is what the method adds to the numbers of steps of lengths h (n,): (n, k). Each trajectory may have its
-    `own` values of the parameters (N, m).
+    ``more(h)`` (n, k) are numbers that a method adds to steps h (n,); trajectories may have `own` parameters (N, m).
     """
 
     def __init__(

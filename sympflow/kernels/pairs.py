@@ -50,10 +50,7 @@ threads wait for each other after each sum."""
 
 
 def slopes_of(local: PairsHamiltonian, kinds: Sequence[int]) -> Arranged:
-    """The derivatives of V by s, those of `kinds` with factors 2ᵏ: a program of s, columns of both bodies, constants.
-
-    A number that is known for a body is multiplied before those of its partners.
-    """
+    """The derivatives of V by s, with factors 2ᵏ: a program of s, columns of both bodies, constants."""
     states = [(local.s.name, 0), *((a.name, -40) for a in local.first), *((b.name, -20) for b in local.second)]
     made = Arrangement(states, [c.name for c in local.c])
     letters = (local.s, *local.first, *local.second, *local.c)
@@ -337,10 +334,7 @@ class BodiesInMemory(SharedMemory):
 
 
 class PairSums(Forces):
-    """The code of sums over all pairs, of velocities, and of stages, which are those of states in memory.
-
-    A state is a `Room` as wide as the bodies that one meets at a time. `sites` has a row of 1/m and one of each column.
-    """
+    """The code of sums over all pairs, of velocities, of stages: a `Room` is as wide as the bodies that one meets."""
 
     def __init__(self, local: PairsHamiltonian, level: int, compensated: bool, damped: bool) -> None:
         super().__init__(None)
@@ -421,10 +415,7 @@ class PairSums(Forces):
         return summed_up
 
     def _rows(self, kind: str, context: Value, state: Value, along: Value) -> list[Value]:
-        """Rows of what a pair depends on: coordinates, velocities along which a sum is taken, columns.
-
-        With cells they are in the order of these: that of coordinates and columns is made with the first sum of a kick.
-        """
+        """Coordinates, velocities along which a sum is taken, columns; in the order of cells, if there are some."""
         code, dim = state.code, self.dim
         size, sites = field(context, "size"), place(context, "sites")
         x, v, c = (
@@ -571,10 +562,7 @@ DIRECTIONS = 16
 
 
 class PairForces:
-    """F = −∇V and G = ∇²V M⁻¹∇V of bodies at many states, and their derivatives, for the fits of tables.
-
-    States q are (d, P), side by side in registers, directions (K, d, P). No curvature terms.
-    """
+    """F = −∇V and G = ∇²V M⁻¹∇V at states q (d, P), and their derivatives along (K, d, P), for the fits of tables."""
 
     def __init__(self, local: PairsHamiltonian, level: int) -> None:
         assert level < CURVATURE

@@ -1,7 +1,7 @@
 """Compiled loops of splittings into exactly solvable parts, in the normal modes of the linear one.
 
-A step is a list of maps. A column has the numbers of one: six that turn each frequency; or a weight, a force gradient
-and the filters of the modes, and what is made of these and of no state; then of a driven system when the map acts.
+A column has the numbers of one map: six that turn each frequency; or a weight, a force gradient, the filters of the
+modes and what is made of these alone; then of a driven system when the map acts.
 """
 
 from __future__ import annotations
@@ -212,10 +212,9 @@ def parts_loops(parts: ExactParts) -> PartsLoops:
 class PartsLoops:
     """Compiled loops over the maps of any splitting of one symbolic system; states are [q, p], float64.
 
-    The linear part's modes rotate by three shears, each with determinant 1 whatever its number, by at most an eighth of
-    a turn, after exact quarter turns; the run stays in the modes. So rounding is none at whole quarter turns, and a
-    random walk elsewhere, but at some simple fractions of a turn, such as a sixth: the state comes back to nearly
-    the same numbers, whose rounding repeats, and the energy drifts by up to 5e-17 of it with each step.
+    The linear part's modes rotate by three shears of determinant 1, by at most an eighth of a turn, after exact quarter
+    turns. So rounding is none at whole quarter turns, and a random walk elsewhere, but at some simple fractions of a
+    turn, where the state comes back to nearly the same numbers and the energy drifts by up to 5e-17 of it a step.
     """
 
     def __init__(self, parts: ExactParts) -> None:
@@ -245,8 +244,8 @@ class PartsLoops:
     def step_by_coefficients(self, sequence: Sequence[SubFlow], dt: float, t: np.ndarray, y: np.ndarray) -> np.ndarray:
         """One step from each row of y (N, 2d), each of its own length t (N,) > 0, by maps that are functions of t.
 
-        Maps have coefficients (K, …) in place of numbers: of 1 and τ² T_k(2τ² − 1), k = 0 … K−2, where τ = t/dt and T_k
-        are Chebyshev's polynomials; lengths are t and force gradients t³ times these sums.
+        Numbers are coefficients (K, …) of 1 and τ² T_k(2τ² − 1), τ = t/dt, lengths t and force gradients t³ times the
+        sums.
         """
         square = (t / dt) ** 2
         terms = max(len(sequence[0].length), 3)

@@ -22,19 +22,10 @@ NOTHING: Any = np.empty(0)
 class RunCheckpoint:
     """The place where a run is cut: with it, pieces of a run give the same bits as the run in one piece.
 
-    The states that a run saves are not enough for that: consecutive steps share a kick or a drift, so that the running
-    state is another one, and compensated sums have errors. A run that is given a carry goes on from it, and leaves in
-    it where it ends; one that is interrupted leaves it as it was.
-
-    Attributes
-    ----------
-    steps : int
-        The steps made so far; 0 before a run.
-    running : ndarray of shape (K,), or (N, K) of a batch; or None
-        The kernel's own; None before a run. NaN where a trajectory has ended. Of array operations the states (..., K),
-        an array or a tensor.
-    spare : ndarray, optional
-        An array that the next running state of a batch may be written into, where it fits: that before the last one.
+    Consecutive steps share a kick or a drift, and compensated sums have errors, so that the running state is no output.
+    A run goes on from a carry and leaves its end there; one that is interrupted leaves it as it was. `steps` are those
+    made so far, `running` (K,), or (N, K) of a batch, the kernel's own: None before a run, NaN where a trajectory has
+    ended. The next running state of a batch may be written into `spare`.
     """
 
     steps: int = 0
@@ -79,10 +70,9 @@ class Run(NamedTuple):
 class Batch(NamedTuple):
     """Rows of a run for compiled code: what it is given and what it fills.
 
-    `y0` is (N, 2d), or (N, 2d + n) with values of its own behind each state. The run goes on from `running` (N, K), (N,
-    0) where its end is not needed, after `first` steps, and ends soon once ``stop[0]`` is not 0. It fills `out` (N, n,
-    2d), `n_finite` (N,) and `counts` (N,), (0,) of stages that count nothing. `kept` is room for the states before all
-    stages: see `sympflow.kernels.runs.run_function`.
+    `y0` is (N, 2d), or (N, 2d + n) with own values behind each state. The run goes on from `running` (N, K), (N, 0)
+    where its end is not needed, after `first` steps, and ends once ``stop[0]`` is not 0. It fills `out` (N, n, 2d),
+    `n_finite` (N,) and `counts` (N,) or (0,); `kept` is room for the states before all stages: see `run_function`.
     """
 
     y0: np.ndarray
@@ -129,8 +119,7 @@ def run_states(
 ) -> Run:
     """A run of every row of a task by `rollout(batch)`, which is compiled, on as many threads as pay.
 
-    The running state has `width` numbers, a step takes about `work` nanoseconds; `start` has the states with values of
-    their own behind them; `counts` if stages count iterations.
+    The running state has `width` numbers, a step takes about `work` nanoseconds; `start` has states with own values.
     """
     y0, save, carry, first = given(task.y0), given(task.save, np.int64), task.carry, 0
     N, before = len(y0), None
@@ -189,16 +178,8 @@ def both_ways(step: Callable[[Any, bool], np.ndarray], h: np.ndarray, y: np.ndar
 class Kernel(ABC):
     """Compiled loops of a method on one system; states are [q, p], float64. A subclass says `runs` and `step`.
 
-    Attributes
-    ----------
-    saves_finite : bool
-        True if all states that a run saves up to its last finite step are finite numbers.
-    backend : str
-        The name of what runs, of `stats["backend"]`.
-    tensors : sequence of Tensor
-        Weights in H that torch follows, whose numbers are read in each run.
-    remark : str
-        A sentence on the end of the last run of a single state that could not go on.
+    `saves_finite` is true if all states that are saved up to the last finite step are finite; `backend` a name for
+    `stats`, `tensors` weights in H that torch follows, `remark` a sentence on the end of a run that could not go on.
     """
 
     saves_finite = True
@@ -216,24 +197,11 @@ class Kernel(ABC):
         t0: float = 0.0,
         threads: int | None = None,
     ) -> Run:
-        """`n_steps` steps from one state, or from every row.
+        """`n_steps` steps h, negative to go back, from one state (2d,), or from every row (N, 2d), at the time t0.
 
-        Parameters
-        ----------
-        h : float
-            Step, negative to go back.
-        y0 : ndarray of shape (2d,) or (N, 2d)
-        n_steps : int
-        save : ndarray of int64, sorted, in 0 … n_steps
-            The steps whose states are kept.
-        carry : RunCheckpoint, optional
-            Where the run goes on, and leaves its end: of `n_steps` steps those after ``carry.steps`` are made. All
-            counts, those of `save` and of the result too, are from `y0`, which is the state that the first piece began
-            with; `save` begins after ``carry.steps``.
-        t0 : float
-            The time of the states `y0`, of a driven system.
-        threads : int, optional
-            As many as pay by default.
+        The states after the steps of `save`, sorted int64, are kept. A `carry` says where the run goes on, and is left
+        with its end: all counts are from `y0`, with which the first piece began, and `save` begins after
+        ``carry.steps``.
         """
         if y0.ndim > 1:
             return self.runs(Task(h, y0, n_steps, save, carry, t0, threads))

@@ -23,8 +23,7 @@ ROWS = 256  # that run together, whatever the threads
 class Recorded:
     """A run of rows y0 (N, 2d), or with own values behind each, whose cotangents can be pulled back.
 
-    A step of a row takes about `work` nanoseconds. The results are `states` (N, len(save), 2d), and `n_finite` (N,),
-    the last step of each row that ends in a finite state.
+    The results are `states` (N, len(save), 2d), and `n_finite` (N,), the last step of each that ends in a finite state.
     """
 
     def __init__(self, code: Any, table: Any, y0: np.ndarray, n_steps: int, save: np.ndarray, work: float) -> None:

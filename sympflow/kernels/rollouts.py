@@ -56,35 +56,20 @@ class Rollouts(ABC):
 
     Attributes
     ----------
-    n_out : int
-        Numbers of a state.
-    n_values : int
-        Numbers that a stage changes: those of the state, and others behind them, which begin as 0.
-    size : int
-        Numbers of a column.
-    lanes : int
-        Trajectories of a batch that run side by side: of two registers or four, so that one need not wait for the
-        other.
-    fewest : int
-        Trajectories that run in lanes rather than one after the other.
+    n_out, n_values, size : int
+        Numbers of a state; numbers that a stage changes, those behind the state begin as 0; numbers of a column.
+    lanes, fewest : int
+        Trajectories of a batch that run side by side, of two registers or four, and the fewest that do.
     room : int, optional
-        Where states are in memory, how many numbers more stages need there; None where they are in registers.
-    memory : callable
-        How they are there: `sympflow.kernels.runs.Memory`, or such a class.
+        Where states are in memory, as the class `memory` has them, how many numbers more stages need there; else None.
     data : sequence of ndarray
         Arrays that stages of states in memory read: see `sympflow.kernels.runs.Room`.
-    chunked : bool
-        True if many trajectories of a batch are in memory, and pass through registers in each stage.
-    timed : bool
-        True if stages depend on the step.
-    every : int, optional
-        Steps after which `look` changes the running state.
-    block : int
-        Steps between two looks for a state that is not finite, or a stop, where nothing is saved.
-    counted : bool
-        True if the last of `n_values` is a count, which is no part of the running state.
-    closing : bool
-        False if outputs are never closed, so that the code need not hold a stage for that.
+    chunked, timed : bool
+        True if many trajectories are in memory and pass through registers in each stage; if stages depend on the step.
+    every, block : int
+        Steps after which `look` changes the running state, if given; steps between two looks for the end of a run.
+    counted, closing : bool
+        True if the last of `n_values` is a count, which is no part of the running state; False if none closes outputs.
     given, own : int
         Numbers of which a column is made, and how many of them, the last ones, each trajectory may have of its own.
     """
@@ -266,10 +251,7 @@ class Rollouts(ABC):
                 out[i, row:], n_finite[i] = np.nan, save[row] - 1
 
     def mapped(self, table: Any, y: np.ndarray, out: np.ndarray, steps: np.ndarray = START) -> None:
-        """All columns of a table, applied to rows `y` (N, 2d) after steps (n,), one row after the other and again.
-
-        `out` may be `y`.
-        """
+        """All columns of a table, applied to rows `y` (N, 2d) after steps (n,), in turn; `out` may be `y`."""
         if not len(y):
             return
         entries, kinds = self.prepared(table)

@@ -74,43 +74,18 @@ def run_function(
 ) -> Callable[..., None]:
     """Compile the runs of trajectories, `width` of them side by side, and of these as many as the fast memory holds.
 
-    Parameters
-    ----------
-    n_values, n_out : int
-        Numbers of a state, and how many of them, the first ones, are the output.
-    size : int
-        Numbers of a column.
-    stage
-    width : int
-    own : bool
-        True if each trajectory has a table of its own.
-    memory : callable, optional
-        How states are in memory: then their sizes are arguments of the function, not `n_values` and `n_out`.
-    look : callable, optional
-        ``look(values)``, the values of the running state after each `every` steps of the run, changed so that the
-        outputs are the same but for what it knows of; of states in memory ``look(room)`` in place.
-    every : int
-        Steps between two looks, for a state that is not finite too.
-    closing : bool
-        False if `closes` is always 0.
-    over : callable, optional
-        The stage of many states, where these are to be in memory: as pays where a stage is long.
-    kept : bool
-        True to keep the state before each stage, and the last one, for `reverse_function`: a further argument is the
-        address of ((n_steps − first)·link + 1) states of all trajectories side by side, group by group.
+    A state has `n_values` numbers, of which the first `n_out` are the output; with `memory` their sizes are arguments.
+    Each trajectory may have its `own` table; `closing` is False if `closes` is always 0. After each `every` steps
+    ``look(values)`` changes the running state, or ``look(room)`` in place. `over` is the stage of many states in
+    memory, where it is long. With `kept` a further argument is the address of ((n_steps − first)·link + 1) states of
+    all trajectories side by side, group by group: those before each stage and the last one, for `reverse_function`.
 
-    Returns
-    -------
-    callable
-        Of addresses and integers (table, kinds, link, closes, rows, n_rows, first, n_steps, save, n_saved, out, finite,
-        running, keeps, stop), of states in memory then `MEMORY`.
-
-        The table holds columns, in each of these `size` numbers or, for tables of their own, `size` times `width`, a
-        table for every `width` trajectories. `rows` (n_rows, n_values) are the states to begin with, those of the run
-        where it goes on after `first` steps. Outputs are made after ``save[i]`` steps, later than `first`, with the
-        closing column where `closes` is 1. `finite[i]` becomes the last step of row i that ends in a finite state; of
-        trajectories side by side only whether it is `n_steps`, else −1. Where `keeps` is 1, `running` is left with the
-        state of the run. Ends soon if ``stop[0]`` becomes 1.
+    Returns a function of addresses and integers (table, kinds, link, closes, rows, n_rows, first, n_steps, save,
+    n_saved, out, finite, running, keeps, stop), then `MEMORY`. The table holds columns of `size` numbers or, of their
+    own, `size` times `width`, a table for every `width` trajectories. `rows` (n_rows, n_values) are the states after
+    `first` steps. Outputs are made after ``save[i]`` steps, later than `first`. `finite[i]` becomes the last step of
+    row i that ends in a finite state; side by side only whether it is `n_steps`, else −1. Where `keeps` is 1, `running`
+    is left with the state of the run. Ends soon if ``stop[0]`` becomes 1.
     """
     types = [POINTER, POINTER, INT, INT, POINTER, INT, INT, INT, POINTER, INT, POINTER, POINTER, POINTER, INT, POINTER]
     types += [POINTER] * kept + (MEMORY if memory else [])
@@ -205,12 +180,10 @@ def reverse_function(
     """Compile the reverse of runs whose states were kept: cotangents of the outputs are pulled back to the beginning.
 
     Returns a function of addresses and integers (table, kinds, link, kept, rows, n_rows, first, n_steps, save, n_saved,
-    out, slopes, columns, starts, values): `rows` (n_rows, n_values) are the cotangents of the running states after
-    `n_steps` steps, and become those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs, later than
-    `first`. With `slopes`, what a table of its own for every `width` trajectories would hold is added to that array, in
-    the same order. The numbers of columns are made of others, `columns` (n_given, link + 2), of which the last ones
-    follow each state in `starts` (n_rows, n_out + n_own): `values` (n_rows, n_own) are the cotangents of these, by
-    `of_values`. Where states were in `memory`, `MEMORY` follows, and `adjoint` is given the room too.
+    out, slopes, columns, starts, values), then `MEMORY`: `rows` (n_rows, n_values) are the cotangents of the running
+    states after `n_steps` steps, and become those after `first`; `out` (n_rows, n_saved, n_out) those of the outputs.
+    With `slopes`, what own tables would hold is added to that array. Columns are made of `columns` (n_given, link + 2),
+    of which the last ones follow each state in `starts`: `values` (n_rows, n_own) are the cotangents of these.
     """
     types = [POINTER, POINTER, INT, POINTER, POINTER, INT, INT, INT, POINTER, INT, *[POINTER] * 5]
     types += MEMORY if memory else []
@@ -288,8 +261,8 @@ def map_function(
 ) -> Callable[..., None]:
     """Compile a map of rows: all columns of one table. If `timed`, stages are given the steps of each lane.
 
-    Returns a function of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out), of states in memory then
-    `MEMORY`: row i is mapped after ``steps[i % n_steps]`` whole steps; `out` may be `rows`.
+    Returns a function of (table, kinds, n_columns, steps, n_steps, rows, n_rows, out), then `MEMORY`: row i is mapped
+    after ``steps[i % n_steps]`` whole steps.
     """
     types = [POINTER, POINTER, INT, POINTER, INT, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = begun("map", types)
@@ -328,10 +301,9 @@ def step_function(
 ) -> Callable[..., None]:
     """Compile single steps from rows, each of its own length.
 
-    The given numbers of a column grow with `powers` of the length; the last `own` ones follow each state in its row;
-    ``numbers(time, *given)`` are those that a stage reads. Returns a function of (coefficients, n_columns, n_powers, x,
-    h, t, rows, n_rows, out), of states in memory then `MEMORY`: the given numbers of a column of row i are polynomials
-    Σ_k coefficients[:, column, k] x[i]^k for a step of length 1.
+    Returns a function of (coefficients, n_columns, n_powers, x, h, t, rows, n_rows, out), then `MEMORY`: the given
+    numbers of a column of row i are polynomials Σ_k coefficients[:, column, k] x[i]^k times a power of the length, of
+    which the last `own` ones follow each state; ``numbers(time, *given)`` are those that a stage reads.
     """
     types = [POINTER, INT, INT, POINTER, POINTER, POINTER, POINTER, INT, POINTER, *(MEMORY if memory else [])]
     code = begun("steps", types)
@@ -365,10 +337,9 @@ three states, and after these for what stages need, times the width; an array of
 
 
 class Room:
-    """A state in memory, of any size: its number i of all trajectories side by side lies at i times the width.
+    """A state of any `size` in memory: its number i of all trajectories side by side lies at i times the width.
 
-    `state` and `work` are the addresses of its numbers, so many as `size`, and of room for others; `places` that of the
-    array of addresses.
+    `work` is the address of room for other numbers, `places` that of an array of addresses.
     """
 
     def __init__(self, code: Code, width: int, state: Value, work: Value, size: Value, data: Value) -> None:
@@ -475,11 +446,7 @@ class _History:
 
 
 class Memory:
-    """The same in memory: the state, its end, and the state before a block of steps.
-
-    A subclass may order numbers in another way than rows do: see `open`, `store` and `keep`. Numbers are copied
-    `at_once`; there are `count` trajectories at most.
-    """
+    """The same in memory: the state, its end, and the state before a block of steps; at most `count` trajectories."""
 
     at_once = 1
 
@@ -563,10 +530,7 @@ class Memory:
 
 
 class _Chunks(Memory):
-    """Many trajectories in memory, from which a stage takes one chunk after the other into registers.
-
-    A chunk need not wait for the one before, whose chain of operations goes on meanwhile.
-    """
+    """Many trajectories in memory, in chunks that pass through registers without waiting for the one before."""
 
     def __init__(self, code: Code, n_values: int, n_out: int, width: int, own: bool, over: Over) -> None:
         self.code, self.width, self.type, self._n, self._over = code, width, Type("double", width), n_values, over

@@ -34,10 +34,7 @@ if TYPE_CHECKING:
 
 @kept
 def splitting_loops(system: HamiltonianSystem, names: tuple[str, ...] = ()) -> SplittingLoops:
-    """The compiled loops of splitting schemes on a separable system, made once per system.
-
-    With `names` the values of `SplittingLoops` are those of these parameters. NotCompiled says why there are none.
-    """
+    """The compiled loops on a separable system, whose `values` may be those of `names`; NotCompiled says why not."""
     return SplittingLoops(system, names)
 
 
@@ -46,13 +43,11 @@ LANES_OF_SUMS, LANES = 16.0, 2.0
 
 
 class SplittingLoops:
-    """Compiled loops that run any `Scheme` on one system; states are [q, p], float64.
+    """Compiled loops that run any `Scheme` on one separable system; states are [q, p], float64.
 
-    The system is separable, and symbolic or given by functions that are traced or Numba's. Of what depends on
-    parameters of H alone `values` are arguments of the loops, so that systems which differ in them share these; with
-    friction, and in kicks with force gradients, they are part of the code, unless H depends on t or each trajectory of
-    a batch has its own. A kick takes about `work` nanoseconds, by `abreast` less in a batch, whose lanes run side by
-    side.
+    Of what depends on parameters of H alone `values` are arguments of the loops, so that systems which differ in them
+    share these; with friction and force gradients they are part of the code, unless H depends on t or trajectories have
+    their own. A kick takes about `work` nanoseconds, by `abreast` less in a batch, whose lanes run side by side.
     """
 
     def __init__(self, system: HamiltonianSystem, names: tuple[str, ...] = ()) -> None:
@@ -177,10 +172,7 @@ class SplittingLoops:
         varied: bool = False,
         ranges: Ranges | None = None,
     ) -> SplittingRollouts:
-        """The compiled functions for kicks of a level, see `Scheme`; `varied` where trajectories have own values.
-
-        Where `ranges` of positions are given, which may be none, kicks are faster in these: equal but for rounding.
-        """
+        """The compiled functions for kicks of a level, `varied` with own values, in `ranges` by polynomials."""
         variant = (level, compensated, monomials, varied, ranges)
         if variant not in self._variants:
             if level in (FORCE_GRADIENT, CURVATURE) and not self._has_force_gradient:
@@ -264,11 +256,7 @@ class SplittingLoops:
         varied: bool = False,
         ranges: Ranges | None = None,
     ) -> np.ndarray:
-        """The numbers of a table that the loops read, with the values of the system's parameters where they take these.
-
-        With friction the maps of the drifts are among them, of numbers for one h. Those of a driven system read the
-        time too, that of a step h that begins at t0. Those of `varied` loops have room for the values of any kicks.
-        """
+        """The numbers of a table that the loops read, with values, maps of friction, the times of a driven system."""
         if self.friction:
             table = _damped(table, self.friction)
         if self.driven:
@@ -287,11 +275,10 @@ class SplittingLoops:
         ranges: Ranges | None = None,
         rows: np.ndarray | None = None,
     ) -> np.ndarray:
-        """One step from each row of `y` (N, 2d), each of its own length `h` (N,) and by its own numbers.
+        """One step from each row of `y` (N, 2d), each of its own length `h` (N,), at times t, and by its own numbers.
 
-        These are, for h = 1, polynomials Σ_k table[:, k] x[i]^k; in a batch K is 1 or at least 3. The steps of a driven
-        system begin at t. If `varied`, the values of its parameters follow each state in its row. `rows` are those of
-        the table, where the caller keeps them.
+        These are, for h = 1, polynomials Σ_k table[:, k] x[i]^k; in a batch K is 1 or at least 3. If `varied`, values
+        of parameters follow each state in its row. `rows` are those of the table, where the caller keeps them.
         """
         y, x, h = given(y), given(x), given(h)
         functions = self.functions(table.level, False, monomials, varied, ranges)
@@ -348,10 +335,8 @@ def _layered_code(layered: LayeredPotential, level: int, compensated: bool, mono
 class SplittingKernel(Kernel):
     """The compiled loops of one scheme on one system, a `Kernel`: see `SplittingLoops.kernel`.
 
-    With `values` (k, N) the loops of batches of N trajectories, each with its own values of `SplittingLoops.values`. It
-    takes the steps of a system with its values; with compensated sums, force gradients, friction and driving up to
-    rounding: products of values, which are part of the code there, or taken out of loops, may be fused with sums here.
-    Several such batches may be given as one, one after the other.
+    With `values` (k, N) the loops of batches of N trajectories with own values, or of several such batches in turn: the
+    steps of a system with these, up to rounding where products of values are part of the code there.
     """
 
     def __init__(

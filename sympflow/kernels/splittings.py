@@ -1,8 +1,6 @@
 """Kicks and drifts of a symbolic system as stages over traced numbers, and the compiled functions of any scheme.
 
-A kick is p − b∇V + g∇²V v − c∇(½ v·∇²V v) with v = M⁻¹∇V, or p − b∇V − Σ_m e_m ∇q^m; the drift after it q + a∇T. What
-they are made of is recorded once, arranged, and stands in every function that is compiled: runs of one trajectory and
-of many in lanes, maps, single steps.
+A kick is p − b∇V + g∇²V v − c∇(½ v·∇²V v) with v = M⁻¹∇V, or p − b∇V − Σ_m e_m ∇q^m; the drift after it q + a∇T.
 """
 
 from __future__ import annotations
@@ -44,9 +42,9 @@ EARLY = -4  # when momenta are known before the positions, in cycles
 class Splitting:
     """The kicks and drifts of one separable system, of a level, with what else they have.
 
-    States may have the errors of compensated sums; `friction` are the dimensions of Γ; of a driven system `symbols`
-    have letters for what depends on the time. In `ranges` of one position kicks are polynomials, equal but for
-    rounding; the values of parameters are then in V, else numbers of a table.
+    `friction` are the dimensions of Γ; of a driven system `symbols` have letters for what depends on the time. In
+    `ranges` of one position kicks are polynomials, equal but for rounding; parameters are then in V, else numbers of a
+    table.
     """
 
     symbols: SymbolicHamiltonian | TracedHamiltonian
@@ -159,10 +157,7 @@ class Splitting:
 
 
 class Stage(NamedTuple):
-    """A kick and a drift as programs: see `Arranged`.
-
-    In `plain`, which is the same up to rounding, results may be made of one another: it is the one to differentiate.
-    """
+    """A kick and a drift as programs: see `Arranged`; `plain`, equal up to rounding, is the one to differentiate."""
 
     table: Program
     body: Program
@@ -508,10 +503,7 @@ class SplittingCode(SplittingRollouts):
         return [Program(each.inputs, each.outputs[len(each.outputs) - self.own :]) for each in programs]
 
     def stepped(self, numbers: np.ndarray, y: Any, h: Any, t: Any, values: Sequence[Any]) -> Any:
-        """A step of length h at t from tensors (..., 2d), by tensor operations.
-
-        `numbers` (n, m) are those of the columns of a step of length 1, `values` those of the parameters.
-        """
+        """A step h at t from tensors (..., 2d), by columns `numbers` (n, m) for h = 1 and values of parameters."""
         import torch
 
         state = [*y.unbind(-1), *[torch.zeros_like(y[..., 0])] * (self.n_values - self.n_out)]

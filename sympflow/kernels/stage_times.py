@@ -36,9 +36,8 @@ UNIFORM = 1e-9
 class Driving:
     """A system whose H depends on t, written with parameters that change from stage to stage.
 
-    The parameters of `form` are those that stay, then `letters`, which are functions of t and of these, then `means`
-    over the time of a drift: a function of t, and its integral over a `DURATION` from t on. `samples` are by their
-    names.
+    The parameters of `form` are those that stay, then `letters`, functions of t and of these, then `means` over a
+    drift: a function of t and its integral over a `DURATION`. `samples` are by their names.
     """
 
     form: SymbolicHamiltonian
@@ -71,10 +70,7 @@ class Driving:
 
 
 def driven_form(symbols: SymbolicHamiltonian) -> Driving:
-    """The driven form of a separable H that depends on t, with the parameters that it has.
-
-    A ValueError if T is no sum of products of functions of t and of p, of which those of t have elementary integrals.
-    """
+    """The driven form of a separable H; NotCompiled if T is no sum of f(t) g(p) with elementary integrals of f."""
     t = symbols.time
     assert t is not None
     assert symbols.T is not None
@@ -105,11 +101,7 @@ def _kinetic(symbols: SymbolicHamiltonian, T: sp.Expr) -> tuple[sp.Expr, dict[sp
 
 
 class SymbolicLetters:
-    """Expressions of a symbolic system with letters for what depends on the time and on parameters alone.
-
-    The `expressions` are in q, p, the parameters and the letters: the `given` symbols. A ValueError names a function in
-    them that has no compiled form.
-    """
+    """Expressions in q, p and `given`: the parameters, and letters for what depends on these and the time alone."""
 
     def __init__(self, symbols: SymbolicHamiltonian, expressions: Sequence[sp.Expr]) -> None:
         _check(expressions, symbols.samples)

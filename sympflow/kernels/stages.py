@@ -33,9 +33,8 @@ class StageTable:
     """The numbers of m stages, for fixed steps (m,) or as coefficients of polynomials in a variable (m, K).
 
     `numbers` (n, m) or (n, m, K) are a of the drifts, then of the kicks b and e of each monomial, or b, g and c; `more`
-    are further rows, those of friction. `times` are those of the kicks, counted from the beginning of the step; the
-    default is the sum of the drifts before. The time moves on by `direction` steps with a step of the table: −1 of an
-    inverse.
+    are rows of friction. `times` are those of the kicks, by default the sum of the drifts before. The time moves on by
+    `direction` steps with a step of the table: −1 of an inverse.
     """
 
     level: int
@@ -180,10 +179,7 @@ def with_last_stage(run: StageTable, after: StageTable) -> StageTable:
 
 @dataclass(frozen=True)
 class Kick:
-    """A kind of kick: its `numbers`, the rows 1, 2, … of a table, and the `powers` of the step with which they grow.
-
-    A kick applies where the last one is not 0, else one with fewer.
-    """
+    """A kick, its `numbers`, rows 1, 2, … of a table, and the `powers` of the step with which they grow."""
 
     numbers: tuple[str, ...]
     powers: tuple[int, ...]

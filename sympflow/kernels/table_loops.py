@@ -1,10 +1,8 @@
 """Compiled errors of a splitting step at labels, and their derivatives by the numbers of its table.
 
-Labels go through the step side by side, as the lanes of registers. On the way a tape keeps the forces of each kick and
-their slope, and the velocities of each drift; on the way back each error has a cotangent, whose product with the tape
-is its derivative by the numbers of the stage. So the derivatives cost one way back for each of the few errors of a
-label, however many numbers there are. Forces and slopes are derivatives of the recorded potential; a driven system has
-the time as one more position, with the work of the drive as its momentum.
+Labels are the lanes of registers. On the way a tape keeps the forces of each kick, their slope, and the velocities of
+each drift; on the way back the cotangent of an error times the tape is its derivative by the numbers of a stage, one
+way back for each error of a label. A driven system has the time as one more position, with its work as momentum.
 """
 
 from __future__ import annotations
@@ -42,10 +40,9 @@ BLOCKS = 2048  # of lanes, some milliseconds, between two looks at the clock
 
 
 class TableLoops:
-    """The compiled errors of labels for one system, a sequence of `kicks` (True) and drifts, and one kind of kicks.
+    """The compiled errors of labels for a system with T = ½ pᵀM⁻¹p, a sequence of `kicks` (True) and drifts.
 
-    The system is separable, with T = ½ pᵀM⁻¹p. `drifts` tells where their numbers stand among those of all stages. A
-    ValueError if a function in H has no counterpart in compiled code, or the code would be too long.
+    `drifts` tells where their numbers stand among those of all stages. NotCompiled says why there are none.
     """
 
     def __init__(
@@ -106,12 +103,10 @@ class TableLoops:
 class LabelErrors:
     """Weighted errors of labels after a step, and their derivatives by parameters on which its numbers depend affinely.
 
-    States x (2d, N) start, of a driven system at times t0 (N,), and go to y (R, J N), times first: of a driven system
-    with its work, or without. `scale` (R, J N) are weights of the errors of the first components, `slope` (R', J N)
-    those of one more error, a sum over the components; `design` (J, n, f) the derivatives of the numbers, in the order
-    of the stages, by the parameters. Errors are in the order of the label times, of the components, of the states.
-    `matrices` (J, k, f) are the derivatives by the parameters, at each time, of k numbers to which all others are in
-    proportion.
+    States x (2d, N) start, of a driven system at times t0 (N,), and go to y (R, J N), times first. `scale` (R, J N) are
+    weights of the errors of the components, `slope` (R', J N) those of one more error, their sum; `design` (J, n, f)
+    the derivatives of the numbers by the parameters. `matrices` (J, k, f) are those of k numbers to which all others
+    are in proportion.
     """
 
     def __init__(
@@ -145,12 +140,7 @@ class LabelErrors:
     def __call__(
         self, c: np.ndarray, check: Callable[[], None] = lambda: None, linearized: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The errors (m,) for numbers c (J, n), and if they are asked for their derivatives by the k numbers, (k, m).
-
-        Those by the parameters are these, of each time, times its matrix.
-
-        `check` is called now and then, and may raise.
-        """
+        """The errors (m,) for numbers c (J, n), and their derivatives (k, m); `check` is called now and then."""
         loops, (times, _, n) = self._loops, self._shape
         r, J = np.empty(self._shape), np.empty((self.matrices.shape[1] if linearized else 0, *self._shape))
         maps = loops.maps
@@ -165,10 +155,7 @@ class LabelErrors:
 
 
 def _in_proportion(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows (k,) such that each of all rows (n,) is a factor (n,) times the one of a place (n,) among them.
-
-    Factors of rows of zeros are 0.
-    """
+    """Rows (k,) to one of which, at a place (n,), each of all rows is in proportion by a factor (n,), 0 of zeros."""
     leaders: list[int] = []
     leader, factors = np.zeros(len(rows), dtype=np.int64), np.zeros(len(rows))
     for i, row in enumerate(rows):
@@ -282,17 +269,9 @@ def _product(A: Sequence[Sequence[Any]], x: Sequence[Any]) -> list[Any]:
 class _Errors:
     """The function of the errors r of labels, and of their derivatives J.
 
-    Its arguments are the addresses of
-
-    - a plan: the addresses of the kinds of stages (S,), 1 for a kick, and of the values of parameters; of the states X
-      (2D, N) at the start, of a driven system with t and a work of 0; of the labels Y and the weights of their errors
-      (R, J N), and those of one more (R', J N), a sum over components; of the derivatives of numbers by parameters that
-      are not 0 where those of each parameter begin (k + 1,), then the numbers (m,), and of their values (m,); then S,
-      the number of drifts, J, N, n, R, R', k;
-    - the numbers c (J, n) at each time, and with friction the motions (J, drifts, 2 d²) of drifts;
-    - r (J, errors, N), J (k, J, errors, N), and memory;
-
-    then the first and the last block of labels.
+    Its arguments are the addresses of a plan, with those of the arrays and the sizes that `__init__` reads; of the
+    numbers c (J, n) at each time and the motions (J, drifts, 2 d²) of drifts with friction; of r (J, errors, N), J (k,
+    J, errors, N), and memory; then the first and the last block of labels.
     """
 
     def __init__(self, maps: _Maps, linearized: bool) -> None:

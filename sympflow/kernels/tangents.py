@@ -43,10 +43,10 @@ LOG_2 = float(np.log(2.0))
 class TangentRun(NamedTuple):
     """Deviation vectors along N orbits.
 
-    `growth` (N, k, n + 1) are logarithms of the lengths of the vectors, 0 at the start, after the n counts of steps
-    that were to be saved and at the end, NaN where the orbit has ended before; `spread` (N, n + 1) is what the function
-    that was given tells of them; `n_steps` (N,) are the steps of each orbit. `whole` (N,) is False where something was
-    not finite any more; then `n_steps` is the last step after which all was.
+    `growth` (N, k, n + 1) are logarithms of lengths after the n counts of steps that were to be saved and at the end,
+    NaN where the orbit has ended before; `spread` (N, n + 1) what a function tells of them; `n_steps` (N,) the steps
+    made. `whole` (N,) is False where something was not finite any more; then `n_steps` is the last step after which all
+    was.
     """
 
     growth: np.ndarray
@@ -58,8 +58,7 @@ class TangentRun(NamedTuple):
 class Linearised(Shape):
     """A stage with its derivatives, which move vectors.
 
-    The outputs are q' and p', then ∇k, row by row to the diagonal, the derivative of q' by the momenta after the kick,
-    and, with friction, that of p' by these.
+    Outputs are q', p', ∇k row by row to the diagonal, ∂q'/∂p after the kick and, with friction, ∂p'/∂p of these.
     """
 
     def linearised(self) -> Arranged:
@@ -131,10 +130,7 @@ def _place(i: int, j: int) -> int:
 
 
 class TangentCode(SplittingCode):
-    """The compiled functions of a splitting with k vectors: states are [q, p, w₁ …], then exponents of the vectors.
-
-    These are there if it `grows`: vectors are rescaled, by powers of two.
-    """
+    """The compiled functions with k vectors: states are [q, p, w₁ …], then the exponents of vectors if it `grows`."""
 
     def __init__(self, splitting: Splitting, vectors: int, grows: bool) -> None:
         super().__init__(splitting, chunked=False)
@@ -252,9 +248,7 @@ class TangentKernel:
     ) -> TangentRun:
         """`n_steps` steps of length h of every row of `y0` (N, 2d), with vectors `w0` (k, 2d) at the start of each.
 
-        Growth and spread are kept after the steps of `save`, 1 … n_steps. ``spread(W)`` is of vectors (M, 2d, k),
-        multiplied by `scale` (2d,), as are lengths; an orbit ends where it is below the `limit`, which is looked at
-        every 256 steps.
+        ``spread(W)`` is of vectors (M, 2d, k), times `scale` (2d,); an orbit ends where it is below the `limit`.
         """
         N, k, n = len(y0), self.vectors, self._code.n_out
         start, (rollout, work) = self._begun(y0, w0), self._rollout(h)
@@ -353,10 +347,7 @@ def tangent_kernel(system: HamiltonianSystem, scheme: Scheme, vectors: int) -> T
 def step_tangents(
     system: HamiltonianSystem, table: StageTable, x: np.ndarray, h: np.ndarray, y: np.ndarray, monomials: Monomials = ()
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The steps from rows of `y` (N, 2d) and their Jacobians (N, 2d, 2d), as `SplittingLoops.step_rows` makes them.
-
-    None where they are not compiled.
-    """
+    """The steps from rows of `y` (N, 2d) and their Jacobians (N, 2d, 2d); None where they are not compiled."""
     if system.friction:
         return None
     n = y.shape[1]

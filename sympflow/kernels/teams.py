@@ -1,7 +1,6 @@
 """Teams: threads that make one run together, and meet where one needs what others have made.
 
-A pool's threads need a tenth of a millisecond to begin and to end a piece of work, as long as the forces of some
-hundred bodies. Those of a team run the same compiled code from the first step to the last, and meet in it.
+A pool's threads need as long to begin as the forces of some hundred bodies take: those of a team run on to the end.
 """
 
 from __future__ import annotations
@@ -94,17 +93,7 @@ def _waited(meeting: Value, members: Value, stop: Value) -> None:
 
 @dataclass(frozen=True)
 class Member:
-    """The view that one thread has of its team.
-
-    Attributes
-    ----------
-    room : ndarray
-        For three states.
-    context : ndarray of int64
-        Numbers and addresses that stages read.
-    others : tuple
-        What is kept for these addresses.
-    """
+    """A thread in its team: room for three states, what stages read, and what is kept for the addresses in that."""
 
     room: np.ndarray
     context: np.ndarray
@@ -137,10 +126,7 @@ class SharedMemory(Memory, ABC):
 
 
 class SharedRollouts(SplittingRollouts):
-    """Rollouts of systems of any size, whose states are in memory and which threads may share.
-
-    A stage takes about `work` nanoseconds, it is worth `pieces` threads at most, a kick has so many `terms`.
-    """
+    """Rollouts of states in memory, which `pieces` threads may share; a stage takes about `work` nanoseconds."""
 
     lanes = 1
     room = 0

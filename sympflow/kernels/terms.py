@@ -1,8 +1,6 @@
 """Functions of many terms as code: a loop over the terms of each kind, in place of code for every one.
 
-Pairs of bodies and springs of a chain differ in their coordinates and constants only. Written out, their derivatives
-take minutes to compile; as tables of coordinates and constants, and one formula for each kind of term, the same time
-however many there are.
+Pairs of bodies and springs of a chain differ in their coordinates and constants only, which stand in tables.
 """
 
 from __future__ import annotations
@@ -128,10 +126,7 @@ def _together(terms: Sequence[sp.Expr], variables: Sequence[sp.Symbol]) -> Famil
 
 
 class _Tree(NamedTuple):
-    """A term without the names of its coordinates and the values of its constants, which are the leaves in order.
-
-    Sums and products are in an order that depends on neither.
-    """
+    """A term in an order without names of coordinates and values of constants, which are its leaves."""
 
     text: str
     head: sp.Basic
@@ -170,10 +165,9 @@ def _constant(f: sp.Basic) -> _Tree | None:
 
 
 class Terms:
-    """A function as the terms of each kind, whose derivatives are added up by loops over these.
+    """A function as the terms of each kind, whose derivatives are added up by loops over these; `letters` are numbers.
 
-    The `letters` are what else is in f, numbers of a stage. `data` has how many terms each kind has, then the
-    coordinates and the constants of each kind.
+    `data` has how many terms each kind has, then the coordinates and the constants of each kind.
     """
 
     def __init__(self, f: sp.Expr, variables: Sequence[sp.Symbol], letters: Sequence[sp.Symbol] = ()) -> None:
@@ -231,10 +225,7 @@ class Terms:
         letters: Sequence[Any],
         targets: Callable[[list[Value]], list[tuple[Rows, Value]]],
     ) -> None:
-        """Add derivatives of the terms of each kind to numbers in memory: from the addresses of the arrays in `data`.
-
-        The coordinates of a term are numbers of `given`; ``targets(places)`` are where its derivatives go.
-        """
+        """Add derivatives of the terms of each kind, at numbers of `given`, to ``targets(places)``."""
         code, type = given[0].code, given[0].type
         for k, (family, program) in enumerate(zip(self._families, derivatives, strict=True)):
             (coordinates, constants), n, m = data[1 + 2 * k :][:2], len(family.x), len(family.c)

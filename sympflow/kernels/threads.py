@@ -45,11 +45,7 @@ def at_most(threads: int) -> Iterator[None]:
 
 
 def run_one(call: Callable[[np.ndarray], T], work: float) -> T:
-    """``call(stop)``, whose work takes about so many nanoseconds or more; it must end soon once ``stop[0]`` is set.
-
-    Compiled code in the main thread holds Ctrl-C off until it returns. So what takes long runs in another thread, and
-    this one waits.
-    """
+    """``call(stop)`` of so much work, which ends soon once ``stop[0]`` is set; a long one in a thread, for Ctrl-C."""
     if work < LONG:
         return call(NEVER)
     return run_in_threads([call])[0]
@@ -65,10 +61,7 @@ def threads_for(n_pieces: int, work: float, threads: int | None) -> int:
 
 
 def run_rows(rows: Callable[[slice, np.ndarray], None], n_rows: int, work_per_row: float, threads: int | None) -> None:
-    """Call ``rows(slice, stop)`` over 0 … n_rows, on several threads if the work is worth it.
-
-    `rows` releases the GIL; for `stop` see `run_one`.
-    """
+    """Call ``rows(slice, stop)`` without the GIL over 0 … n_rows, on threads if the work is worth it; see `run_one`."""
     n_blocks = -(-n_rows // BLOCK)
     threads = threads_for(n_blocks, n_rows * work_per_row, threads) if n_blocks > 1 else 1
     if threads == 1:

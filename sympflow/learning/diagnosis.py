@@ -21,7 +21,7 @@ from typing import Self
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from sympflow.learning.lagrangian import lagrangian_start
+from sympflow.learning.lagrangian import lagrangian_start, least
 from sympflow.learning.library import Library, library_for, polynomials
 from sympflow.learning.models import Force, FreeField, Model, drags, frictions, turns
 from sympflow.learning.orbits import Field
@@ -43,8 +43,7 @@ PER_NUMBER = 3.0  # Values that there are at least for a number of a model
 MOST_NUMBERS = 400
 LIKELY = 8  # Models beside which forces are tried
 BETTER = 0.5  # Share of the misfit that another reading of the data must leave at most, to be worth a word
-MUCH_BETTER = 0.1
-"""The same of a vector field that is not Hamiltonian: a sum that has more terms leaves less by itself."""
+MUCH_BETTER = 0.1  # the same of a vector field that is not Hamiltonian: a sum that has more terms leaves less by itself
 ALIKE = 1.2  # Factor by which a reading may leave more than the best, and is named if it stands before it
 FRICTION = (
     "Friction p' = -γp with γ = {} would leave much less: the data are dissipative, areas of phase space shrink as "
@@ -64,8 +63,7 @@ NOT_HAMILTONIAN = (
     "A vector field of cubic polynomials that is not Hamiltonian fits much better: the data are not a motion of a "
     "Hamiltonian in these coordinates, or these are not canonical."
 )
-FREQUENCIES = 1000
-"""Halves of the angular frequency π over the longest time, up to which that of a drive is looked for."""
+FREQUENCIES = 1000  # halves of the angular frequency π over the longest time, up to which that of a drive is looked for
 MOST_SLOPES = 3000  # Points by which reasons are looked for
 MOST_DRIVES, SWEEPS = 2, 2
 """Drives that are looked for, and how often the frequency of each is refined beside the others."""
@@ -75,10 +73,7 @@ MOST_DRIVES, SWEEPS = 2, 2
 
 
 class Cause(Enum):
-    """Reasons why no H(q, p) explains data, each in words and with advice that has a place for the factors of forces.
-
-    The plainest come first.
-    """
+    """Reasons why no H(q, p) explains data, in words and with advice, the plainest first."""
 
     FRICTION = (
         "the best H with friction p' = -γp",
@@ -136,7 +131,6 @@ class Reading:
     def test(self, theta: np.ndarray, states: np.ndarray, scales: np.ndarray) -> tuple[float, float]:
         """LᵀJ + JL over twice JL, 0 for any H, at states (2d, n) in the order of the reading; the rate of volumes."""
         slopes = self.field.field(theta, states, True, False).slope
-        assert slopes is not None
         back = np.argsort(self.rows)
         slopes = slopes[np.ix_(back, back)]
         d = len(scales) // 2
@@ -149,10 +143,7 @@ class Reading:
 
 
 def forced(model: Model, drives: Sequence[Drive] = ()) -> list[Reading]:
-    """The model with forces that no H(q, p) gives: friction, what turns p, quadratic drag, drives; from plain to rich.
-
-    Of a model that has a force only a drive is of interest.
-    """
+    """The model with forces that no H(q, p) gives, from plain to rich; of one that has a force only with a drive."""
     rows = tuple(range(2 * model.ndof))
     forces = [(frictions, Cause.FRICTION), (turns, Cause.TURNED), (drags, Cause.DRAG)]
     made = []
@@ -173,16 +164,9 @@ def free_reading(scales: np.ndarray, degree: int) -> Reading:
 
 
 def best_by_increments(
-    data: Trajectories,
-    held: Trajectories,
-    models: Sequence[Model],
-    drives: Sequence[Drive] = (),
-    stop: Stop = never,
+    data: Trajectories, held: Trajectories, models: Sequence[Model], drives: Sequence[Drive] = (), stop: Stop = never
 ) -> tuple[int, Reading | None, dict[int, float]] | None:
-    """The place of the model that explains held-out increments best, a doubt, if any, and the squares by places.
-
-    The doubt is a reading of the data that leaves much less than all models. None in place of all for too few points.
-    """
+    """The place of the model that explains held-out increments best, a doubt, and the squares by places; or None."""
     scales, d = data.scales, data.ndof
     fitted, others = data.sample, held.sample
     affordable = [k for k, model in enumerate(models) if affords(fitted, model)]
@@ -235,16 +219,9 @@ def _left(model: Field, data: Trajectories, held: Trajectories, scales: np.ndarr
 
 
 def hint(
-    library: Library,
-    smooth: Smooth,
-    data: Trajectories,
-    force: Force | None = None,
-    drives: Sequence[Drive] = (),
+    library: Library, smooth: Smooth, data: Trajectories, force: Force | None = None, drives: Sequence[Drive] = ()
 ) -> str | None:
-    """The likeliest reason why the terms do not explain the data, with the remedy; None for none.
-
-    A force and drives that the model already has are not reasons; beside any force, friction is not one either.
-    """
+    """The likeliest reason, none that the model has, why terms do not explain the data, with the remedy; or None."""
     d, scales = data.ndof, data.scales
     smooth = smooth.some(MOST_SLOPES)
     x, v = smooth.points, smooth.slopes
@@ -271,13 +248,8 @@ def hint(
             left = Rest.of(other, v[:, pairs], scales[pairs]).squares
             found.append((left, 'The columns look like q1, p1, q2, p2, …: pass order="pairs".'))
         left, masses = _masses(library, x, v, scales, d)
-        said = " : ".join(f"{m:.3g}" for m in masses)
-        found.append(
-            (
-                left,
-                f"The second half looks like velocities, of masses {said}: pass velocity_mass=[…], by which p = M v.",
-            )
-        )
+        said = f"velocities, of masses {' : '.join(f'{m:.3g}' for m in masses)}"
+        found.append((left, f"The second half looks like {said}: pass velocity_mass=[…], by which p = M v."))
     share, frequencies = driven(X, smooth, scales, Drive(Polynomial.up_to(2, "q", scales[:d]), 1.0), drives)
     found.append((share * rest.squares, driven_by([*(drive.frequency for drive in drives), *frequencies])))
     least = min(found)[0]
@@ -309,7 +281,6 @@ def fields_of_drive(drive: Drive, smooth: Smooth) -> np.ndarray:
     """The fields (n, 2d, k) of the terms of a drive at the points of curves."""
     d = smooth.points.shape[1] // 2
     by = drive.at(smooth.times).gradient(np.zeros(drive.n), smooth.points.T[:d], False, True).by_parameters
-    assert by is not None
     forces = np.moveaxis(-by[:, :-1], -1, 0)
     return np.concatenate([np.zeros_like(forces), forces], axis=1)
 
@@ -354,17 +325,15 @@ def _columns(X: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def drive_frequency(X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive) -> float:
-    """The angular frequency at which a drive explains most of what the fields X (n, 2d, K) leave of slopes.
-
-    The peaks of the periodograms with each of its terms are compared by a fit of all, and the best is refined.
-    """
+    """The ω at which a drive explains most of what the fields X (n, 2d, K) leave of slopes."""
     d = X.shape[1] // 2
     most = min(int(2 * smooth.longest / smooth.step), FREQUENCIES)
     frequencies = np.pi / smooth.longest * np.arange(0.5, max(most, 2) / 2, 0.25)
     beside = Rest.of(X, smooth.slopes, scales)
-    pushes = drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
-    assert pushes is not None
-    pushes = pushes / scales[d:, None, None]
+    pushes = (
+        drive.base.gradient(np.zeros(drive.base.n), smooth.points.T[:d], False, True).by_parameters
+        / scales[d:, None, None]
+    )
     terms = np.einsum("ikn,ni->nk", pushes, beside.left.reshape(len(X), -1)[:, d:])
     power = np.abs(np.exp(-1j * frequencies[:, None] * smooth.times) @ terms) ** 2 / (pushes**2).sum(axis=(0, 2))
 
@@ -389,15 +358,11 @@ def _refined(
 def driven(
     X: np.ndarray, smooth: Smooth, scales: np.ndarray, drive: Drive, known: Sequence[Drive] = ()
 ) -> tuple[float, list[float]]:
-    """The share of squares that drives leave, and their ω; of other trajectories than those that they were fitted to.
-
-    One trajectory cannot tell a drive from its own motion: infinite.
-    """
+    """The share of other trajectories' squares that drives leave, infinite of a single trajectory, and their ω."""
     first, v, near = smooth.owner % 2 == 0, smooth.slopes, 0.5 * np.pi / smooth.longest
 
     def theirs(A: np.ndarray) -> float:
-        columns, lengths = _columns(A[first], scales)
-        c = np.linalg.lstsq(columns, (v[first] / scales).ravel(), rcond=1e-10)[0] / lengths
+        c = least((A[first] / scales[:, None]).reshape(-1, A.shape[2]), (v[first] / scales).ravel())
         return float(((((v - A @ c) / scales)[~first]) ** 2).sum())
 
     def beside(frequencies: Sequence[float]) -> np.ndarray:
@@ -432,9 +397,7 @@ def _masses(library: Library, x: np.ndarray, v: np.ndarray, scales: np.ndarray, 
     A = (np.concatenate([-V, -extra], 2) / scales[d:, None]).reshape(len(x) * d, -1)
     target = np.zeros((len(x), d))
     target[:, 0] = v[:, d]
-    lengths = np.linalg.norm(A, axis=0)
-    lengths[lengths == 0] = 1.0
-    theta = np.linalg.lstsq(A / lengths, (target / scales[d:]).ravel(), rcond=1e-10)[0] / lengths
+    theta = least(A, (target / scales[d:]).ravel())
     masses = np.concatenate([[1.0], theta[len(of_q) :]])
     force = -(V @ theta[: len(of_q)])
     with np.errstate(all="ignore"):

@@ -30,8 +30,7 @@ POWERS = ((-1,), (-2, -1, 0, 1, 2))  # Powers of distances, 0 for the logarithm
 CHANGING = 0.5
 """Variance of the total momentum along a trajectory, over the sum of those of its parts, where it is not constant."""
 MOST_TERMS = 400
-ASSUMED = {"radians": 2 * np.pi, "degrees": 360.0}
-"""Periods of angles that are tried where none is known."""
+ASSUMED = {"radians": 2 * np.pi, "degrees": 360.0}  # periods of angles that are tried where none is known
 FLAT = 0.02  # Spread of an angle, over its period, from which its cosine is told from a parabola
 
 
@@ -207,10 +206,8 @@ def _central(constraints: Constraints) -> Iterator[Candidate]:
         return
     bodies = np.arange(d)[None]
     for powers in POWERS:
-        yield Candidate(
-            f"{T}, V of the distance from the origin, {_of_powers(powers)}",
-            constraints.separated(Distances.between(bodies, powers, size, central=True)),
-        )
+        name = f"{T}, V of the distance from the origin, {_of_powers(powers)}"
+        yield Candidate(name, constraints.separated(Distances.between(bodies, powers, size, central=True)))
 
 
 def _of_powers(powers: Sequence[int]) -> str:
@@ -238,14 +235,8 @@ def _pairs(constraints: Constraints) -> Iterator[Candidate]:
 
 def _flows(constraints: Constraints) -> Iterator[Candidate]:
     scaling = constraints.flow_scaling
-    told = (
-        constraints.force
-        or constraints.frequencies
-        or constraints.known
-        or constraints.inverse_mass is not None
-        or constraints.angles
-    )
-    if scaling is None or told:
+    told = constraints.force or constraints.frequencies or constraints.known or constraints.angles
+    if scaling is None or told or constraints.inverse_mass is not None:
         return
     for pairs, width, palindromic in FLOW_SIZES:
         kind, all_pairs = ("palindromic SympFlow", 2 * pairs) if palindromic else ("SympFlow", pairs)
@@ -300,13 +291,7 @@ neural potentials, which are fitted to the data themselves, and no H is learned.
 
 
 def families(constraints: Constraints, name: str | None) -> list[str]:
-    """The names of the families that fit what is known, or of the one that is asked for.
-
-    Raises
-    ------
-    ValueError
-        If there is no such family, or it contradicts what is known.
-    """
+    """The names of the families that fit what is known; a ValueError if the one asked for does not."""
     if name is not None and name not in FAMILIES:
         raise ValueError(f"`family` {name!r} is unknown: choose from {', '.join(FAMILIES)}, or leave it out.")
     if name is not None and constraints.separable and not FAMILIES[name].separable:
@@ -358,15 +343,7 @@ def with_unit_mass(candidate: Candidate, constraints: Constraints) -> Candidate 
 
 
 def pruned(candidate: Candidate, theta: np.ndarray, precision: np.ndarray, values: int) -> Candidate | None:
-    """The same model without the terms of sums that the data do not ask for; None if they ask for all.
-
-    Terms are left out one by one, that one first which, by the quadratic approximation of χ² at its minimum, raises it
-    least, as long as Schwarz's criterion gains: by less than the logarithm of the number of values.
-
-    References
-    ----------
-    .. [1] G. Schwarz, Estimating the dimension of a model, Ann. Statist. 6 (1978) 461–464.
-    """
+    """The same model without the terms that Schwarz's criterion does not ask for; None if it asks for all."""
     model = candidate.model
     droppable = np.zeros(model.n, dtype=bool)
     for part, place in zip(model.parts, model.places, strict=True):

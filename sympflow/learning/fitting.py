@@ -44,13 +44,7 @@ FEWEST_PAIRS = 30  # of residuals that count as independent, to tell such noise 
 
 
 def limit_of(loss: str) -> float | None:
-    """The size of residuals, in σ, from which a loss is no square; None if there is none.
-
-    Raises
-    ------
-    ValueError
-        If there is no such loss.
-    """
+    """The size of residuals, in σ, from which a loss is no square; None if there is none."""
     if loss not in LOSSES:
         raise ValueError(f"`loss` must be one of {', '.join(LOSSES)}; got {loss!r}.")
     return LOSSES[loss]
@@ -129,10 +123,7 @@ class Fitted:
 def fitted(
     model: Field, data: Trajectories, setting: Setting, theta: np.ndarray | None = None, seed: int = 0
 ) -> Fitted:
-    """Fit a model: to increments, to orbits of a few points, and to orbits as long as their errors stay small.
-
-    `theta` is a start.
-    """
+    """Fit a model from θ: to increments, to orbits of a few points, to orbits as long as their errors stay small."""
     scales = data.scales
     if theta is None:
         theta, moved = model.start(np.random.default_rng(seed)), data

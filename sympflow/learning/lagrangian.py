@@ -7,14 +7,14 @@ observed they are the p of both equations. Where velocities are, L is known but 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
 
 from sympflow.learning.models import Model
 from sympflow.learning.orbits import integrals
-from sympflow.learning.parts import Network, Part, Polynomial
+from sympflow.learning.parts import Network, Polynomial
 from sympflow.learning.reading import Run
 from sympflow.learning.trajectories import Trajectories
 
@@ -36,7 +36,9 @@ def lagrangian_start(model: Model, data: Trajectories, theta: np.ndarray) -> tup
 
     if data.velocities and all(part.of == "q" or not part.n for part in model.parts):  # the masses are known
         return theta, with_momenta([model.states(theta, run.y) for run in runs])
-    equations = Equations.of(replace(model, parts=tuple(map(_linear, model.parts))), data)
+    polynomial = partial(Polynomial.up_to, DEGREE)  # in place of a network
+    parts = (polynomial(part.of, part.scales) if isinstance(part, Network) else part for part in model.parts)
+    equations = Equations.of(replace(model, parts=tuple(parts)), data)
     found, *_ = equations.solved()
     if not data.velocities:
         return found, data
@@ -53,11 +55,6 @@ def told(model: Model, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
     theta, left, J = Equations.of(model, data).solved()
     variance = CORRELATED * (left @ left) / max(len(left) - len(theta), 1)
     return theta, J.T @ J / max(float(variance), np.finfo(float).tiny)
-
-
-def _linear(part: Part) -> Part:
-    """A polynomial in place of a network."""
-    return Polynomial.up_to(DEGREE, part.of, part.scales) if isinstance(part, Network) else part
 
 
 class Equations:
@@ -101,14 +98,14 @@ class Equations:
             rows, rest = self._stacked(rows / self.scales[..., None]), (rest / self.scales).ravel()
             wide = np.concatenate([likely, np.zeros((len(likely), self.model.forces))], axis=1)
             J, right = np.concatenate([wide, rows]), np.concatenate([right, -rest])
-            theta = _least(J, right)
+            theta = least(J, right)
             return theta, right - J @ theta, J
-        theta[: self.n] = _least(likely, right)  # p = v
+        theta[: self.n] = least(likely, right)  # p = v
         left, J = self._left(theta)
         forces = np.arange(self.model.n) >= self.n  # first those alone
         forces[: self.n] = ~self.by_mass[1].any(axis=(0, 1, 3))
         for attempt in range(STEPS):
-            step = _least(J if attempt else J * forces, -left)
+            step = least(J if attempt else J * forces, -left)
             for _ in range(HALVINGS):
                 after, K = self._left(theta + step)
                 if after @ after < left @ left:
@@ -176,7 +173,7 @@ class Equations:
         return whole[:, 0], np.concatenate([whole[:, 1:], self._along(np.zeros_like(pushes), pushes)], axis=1)
 
 
-def _least(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
+def least(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The solution of least squares, its columns in their lengths; the shortest where there are many."""
     lengths = np.linalg.norm(rows, axis=0)
     lengths[lengths == 0] = 1.0

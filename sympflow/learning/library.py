@@ -21,8 +21,7 @@ COLLINEAR = 1e-7
 MOST_PRODUCTS = 2
 """Degrees of freedom up to which all products of powers are in the library; beyond, those of one and of pairs."""
 
-KINDS = "qpy"
-"""Kinds of terms: of q alone, of p alone, of both."""
+KINDS = "qpy"  # kinds of terms: of q alone, of p alone, of both
 
 Coordinates = tuple[sp.Symbol, ...]
 
@@ -39,10 +38,7 @@ def coordinates_of(part: str, ndof: int) -> Coordinates:
 
 
 def polynomials(ndof: int, degree: int = 4) -> list[sp.Expr]:
-    """All products of powers up to a degree; of three or more degrees of freedom those of one, and pairs.
-
-    Pairs (i, j) have p_i p_j, q_i p_j and powers of q_i − q_j, by which q_i q_j can be written.
-    """
+    """All products of powers up to a degree; of three or more degrees of freedom those of one, and of pairs."""
     q, p = coordinates(ndof)
     sets = [(*q, *p)] if ndof <= MOST_PRODUCTS else list(zip(q, p, strict=True))
     terms = [

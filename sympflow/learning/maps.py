@@ -53,10 +53,7 @@ class OwnSteps(Stepper):
 
 
 class NetworkFlow(VectorField):
-    """A SympFlow with neural potentials, its weights θ the numbers of a model.
-
-    Palindromic, ψ_t = φ_{t/2} ∘ φ_{−t/2}⁻¹, so that ψ_{−t} = ψ_t⁻¹, it has twice the layers of φ and the weights of φ.
-    """
+    """A SympFlow whose weights are θ; palindromic, ψ_t = φ_{t/2} ∘ φ_{−t/2}⁻¹, it has twice the layers of φ."""
 
     separable = nystrom = lagrangian = linear = False
     forces = 0

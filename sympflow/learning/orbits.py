@@ -18,8 +18,7 @@ from sympflow.learning.reading import Run
 from sympflow.learning.trajectories import Trajectories
 from sympflow.schemes import Scheme, scheme_named
 
-Field = Model | FreeField
-"""A vector field with numbers θ."""
+Field = Model | FreeField  # a vector field with numbers θ
 
 MOST_NUMBERS = 2**20  # of the derivatives of a batch, which then stay in the cache
 SLOPE_POINTS = 10  # of a piece, that give a velocity which was not observed
@@ -38,10 +37,8 @@ Over = Callable[[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray], Any]
 class Stepper(ABC):
     """One step of a scheme, with the derivatives of its end by the initial state and by θ."""
 
-    cost: float
-    """Cost of a step, in evaluations of the force with its derivatives."""
-    longest: float | None = None
-    """Δt of a map that is fitted itself, whose steps have no error; None of a scheme."""
+    cost: float  # cost of a step, in evaluations of the force with its derivatives
+    longest: float | None = None  # Δt of a map that is fitted itself, whose steps have no error; None of a scheme
 
     def within(self, tolerance: np.ndarray) -> Stepper:
         """The same scheme, whose equations are solved no better than is needed for an error (2d,) of a step."""
@@ -51,10 +48,7 @@ class Stepper(ABC):
     def step(
         self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
     ) -> Any:
-        """The states (2d, N) and derivatives (2d, c, N) a time h (N,) after x and X at t, which may be overwritten.
-
-        The first 2d columns of X are those by the initial state, the others those by θ, if there are any.
-        """
+        """The states (2d, N) and derivatives (2d, c, N), by the start, then by θ, a time h (N,) after x and X at t."""
 
     def orbit(self, over: Over, x: np.ndarray, X: np.ndarray | None, gaps: np.ndarray, t: np.ndarray) -> Orbit:
         """States and derivatives after each of the gaps (k, N) between points; the first gap follows t (N,)."""
@@ -78,7 +72,6 @@ class Splitting(Stepper):
     def step(
         self, model: Field, theta: np.ndarray, x: np.ndarray, X: np.ndarray | None, h: np.ndarray, t: np.ndarray
     ) -> Any:
-        assert isinstance(model, Model)
         d = model.ndof
         q, p = slice(0, d), slice(d, 2 * d)
         wanted = X is not None, X is not None and X.shape[1] > 2 * d
@@ -146,11 +139,8 @@ class Gauss(Stepper):
             moved = np.abs(h * (new - K))
             change = float(moved.max(initial=0.0))
             K = new
-            if (
-                not math.isfinite(change)
-                or (moved <= near).all()
-                or (change >= before and change < 1e-9 * np.abs(x).max())
-            ):
+            rounding = change >= before and change < 1e-9 * np.abs(x).max()
+            if rounding or not math.isfinite(change) or (moved <= near).all():
                 break
             before = change
         end = x + h * np.einsum("j,mjn->mn", b, K)
@@ -159,7 +149,6 @@ class Gauss(Stepper):
         inner = x[:, None] + h * np.einsum("ij,mjn->min", A, K)
         c = X.shape[1]
         f = model.field(theta, inner.reshape(m, s * N), True, c > m)
-        assert f.slope is not None
         S = np.broadcast_to(f.slope, (m, m, s * N)).reshape(m, m, s, N)
         rhs = np.einsum("klin,lcn->nikc", S, X, optimize=True)
         if f.by_parameters is not None:
@@ -263,10 +252,7 @@ def batches(runs: Sequence[Run], columns: int) -> list[Batch]:
 
 
 def first_states(data: Trajectories, model: VectorField | None = None, theta: Any = None) -> np.ndarray:
-    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing.
-
-    Momenta are those of a model where velocities are observed.
-    """
+    """A guess of the initial states (N, 2d): what was observed first, interpolated where a value is missing."""
     values = np.concatenate([run.y for run in data.runs], axis=1)
     middle = np.nanmean(np.where(np.isnan(values).all(axis=1, keepdims=True), 0.0, values), axis=1)
     states = np.empty((len(data.runs), 2 * data.ndof))

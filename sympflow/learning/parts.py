@@ -16,11 +16,11 @@ STEEP = 5.0
 
 
 class Linear(NamedTuple):
-    """A function f(θ, x) of columns x (m, N) with its derivatives; None for those that were not asked for."""
+    """A function f(θ, x) of columns x (m, N) with its derivatives, None for those that were not asked for."""
 
     value: np.ndarray  # (m, N)
-    slope: np.ndarray | None = None  # (m, m, N): ∂f/∂x
-    by_parameters: np.ndarray | None = None  # (m, n, N): ∂f/∂θ
+    slope: Any = None  # (m, m, N): ∂f/∂x
+    by_parameters: Any = None  # (m, n, N): ∂f/∂θ
 
 
 Curvature = Iterable[tuple[tuple[int, int], Any, np.ndarray]]
@@ -83,13 +83,9 @@ class Part(ABC):
         return False
 
     def momenta(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """p = ∂L/∂v and p' = ∂L/∂q of a Lagrangian at q and v (d, N), for θ = 0; and their derivatives by θ (2d, n, N).
-
-        L has −V of what depends on q alone. Other parts stand in it with v in place of p, and numbers of their own.
-        """
+        """p = ∂L/∂v and p' = ∂L/∂q at q and v (d, N) for θ = 0, and their derivatives by θ (2d, n, N)."""
         x = {"q": q, "p": v, "y": np.concatenate([q, v])}[self.of]
         f = self.gradient(np.zeros(self.n), x, False, True)
-        assert f.by_parameters is not None
         return self._mechanics(f.value), self._mechanics(f.by_parameters)
 
     def _mechanics(self, slopes: np.ndarray) -> np.ndarray:
@@ -254,9 +250,7 @@ class Fixed(Part):
     @property
     def inverse_mass(self) -> np.ndarray:
         """M⁻¹ of a kinetic energy ½ pᵀM⁻¹p."""
-        slopes = self.part.gradient(self.theta, np.ones((self.part.width, 1)), True, False).slope
-        assert slopes is not None
-        return slopes[..., 0]
+        return self.part.gradient(self.theta, np.ones((self.part.width, 1)), True, False).slope[..., 0]
 
     def value(self, theta: np.ndarray, x: np.ndarray) -> np.ndarray:
         return self.part.value(self.theta, x)
@@ -273,10 +267,7 @@ def known_kinetic(inverse_mass: np.ndarray) -> Fixed:
 
 
 class Waves(Sum):
-    """Σ_m θ_m Π_i (x_i/s_i)^m_i cos(k_m·x + φ_m): Fourier series in angles, with powers of the other coordinates.
-
-    Exponents m and wave vectors k are (n, m), phases φ (n,): 0 for cosines, −π/2 for sines.
-    """
+    """Σ_m θ_m Π_i (x_i/s_i)^m_i cos(k_m·x + φ_m), exponents and k (n, m), φ (n,) 0 for cosines, −π/2 for sines."""
 
     def __init__(self, of: str, exponents: Any, waves: Any, phases: Any, scales: Any) -> None:
         self.of, self.waves, self.phases = of, np.asarray(waves, dtype=float), np.asarray(phases, dtype=float)
@@ -293,10 +284,7 @@ class Waves(Sum):
     def up_to(
         cls, harmonics: int, degree: int, of: str, scales: Any, periods: np.ndarray, constant: bool = False
     ) -> Waves:
-        """Harmonics to this order of the angles, which have a period, times powers of the others to this degree.
-
-        The constant, which moves nothing as a term of H, is the first term if it is asked for.
-        """
+        """Harmonics of the angles to this order, times powers of the others; the constant first if asked for."""
         angles = np.isfinite(periods)
         span = [range(-harmonics, harmonics + 1) if angle else (0,) for angle in angles]
         reach = [(0,) if angle else range(degree + 1) for angle in angles]
@@ -451,10 +439,7 @@ class Network(Part):
 
 
 class Distances(Part):
-    """Σ_k θ_k (r_k/s)^e_k, of distances r between two bodies, or of one from the origin; log(r/s) where e is 0.
-
-    `bodies` (n_bodies, dim) are places in q, `terms` two bodies, or one and None for the origin, and e.
-    """
+    """Σ_k θ_k (r_k/s)^e_k, or log(r/s) where e is 0, of distances between bodies (n_bodies, dim) or from 0."""
 
     of = "q"
 
@@ -571,9 +556,8 @@ class Drive(Part):
     def gradient(self, theta: np.ndarray, x: np.ndarray, slope: bool, by_parameters: bool) -> Linear:
         cos, sin = self._waves(theta)
         a, b = (self.base.gradient(part, x, slope, by_parameters) for part in np.split(theta[:-1], 2))
-        slopes = by = None
-        if a.slope is not None and b.slope is not None:
-            slopes = a.slope * cos + b.slope * sin
+        slopes = a.slope * cos + b.slope * sin if slope else None
+        by = None
         if a.by_parameters is not None:
             turned = self.times * (b.value * cos - a.value * sin)
             by = np.concatenate([a.by_parameters * cos, a.by_parameters * sin, turned[:, None]], axis=1)

@@ -18,18 +18,16 @@ from sympflow.arguments import MAX_ASKED_VALUES, floats, is_number_word
 from sympflow.arrays import without_torch
 from sympflow.storage.layout import DOF, ORBIT, TIME, imported
 
-UNITS = {
+UNITS = {  # units in those of the SI, angles in radians
     "1": 1.0, "rad": 1.0, "deg": np.pi / 180, "rev": 2 * np.pi,
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0,
     "m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9,
     "kg": 1.0, "g": 1e-3, "mg": 1e-6, "N": 1.0, "J": 1.0,
 }  # fmt: skip
-"""Units in those of the SI, angles in radians."""
 TIMES = ("t", "time")
 RUNS = (ORBIT, "run", "run_id", "trajectory", "trajectory_id", "traj", "id")
 """Names of the columns of times and of trajectories that are recognized, in lower case."""
-BESIDE = ("energy", "status")
-"""Columns of tables of sympflow that are no states."""
+BESIDE = ("energy", "status")  # columns of tables of sympflow that are no states
 VELOCITY = r"v_?(\d*)|dq_?(\d*)(?:_?dt)?|q_?(\d*)_?dot_?(\d*)"
 """Names of the columns of velocities: v1, dq1, dq1_dt, q1_dot, qdot1."""
 ORDERS = ("halves", "pairs")

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,33 +20,10 @@ from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.domain import Box, Domain, EnergySublevel, Tube
 from sympflow.hamiltonian.doubling import DoubledSystem, doubled
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.learning.diagnosis import (
-    DAMPED,
-    MOST_SLOPES,
-    Reading,
-    affords,
-    best_by_increments,
-    drive_frequency,
-    driven,
-    fields_of,
-    forced,
-    free_reading,
-    hint,
-)
+from sympflow.learning import diagnosis, fitting
+from sympflow.learning.diagnosis import Reading
 from sympflow.learning.families import MOST_TERMS, Candidate, Constraints, Group, pruned, with_unit_mass
-from sympflow.learning.fitting import (
-    SILENT,
-    Fitted,
-    Held,
-    Setting,
-    fitted,
-    gains,
-    judged,
-    kept,
-    left_out,
-    refitted,
-    restored,
-)
+from sympflow.learning.fitting import Fitted, Held, Setting
 from sympflow.learning.lagrangian import told
 from sympflow.learning.library import library_for
 from sympflow.learning.models import FreeField, Model, drags, frictions
@@ -84,15 +61,15 @@ OVER_TIMES = 5  # between 0 and Δt, at which 𝓗 is averaged
 
 def frequencies_of(constraints: Constraints, smooth: Smooth) -> tuple[float, ...]:
     """The angular frequencies of one drive or two, by slopes beside those of a library of terms and friction."""
-    smooth = smooth.some(MOST_SLOPES)
+    smooth = smooth.some(diagnosis.MOST_SLOPES)
     d, x = constraints.ndof, smooth.points
     if not len(x):
         raise ValueError("`drive` cannot be found without successive points that have all values: give its frequency.")
     fields = library_for(None, d, 4, x)[0].fields(x)
-    X = np.concatenate([fields, fields_of(constraints.force or frictions, x)], axis=2)
+    X = np.concatenate([fields, diagnosis.fields_of(constraints.force or frictions, x)], axis=2)
     base = constraints.driven(1.0)
-    found = driven(X, smooth, constraints.scales, base)[1]
-    return tuple(found or [drive_frequency(X, smooth, constraints.scales, base)])
+    found = diagnosis.driven(X, smooth, constraints.scales, base)[1]
+    return tuple(found or [diagnosis.drive_frequency(X, smooth, constraints.scales, base)])
 
 
 @dataclass(frozen=True)
@@ -147,14 +124,11 @@ def replica(common: tuple[Model, Trajectories, Setting, np.ndarray, int], number
     """The numbers of a model that is fitted to trajectories drawn with repetition: a piece of work."""
     model, data, setting, theta, seed = common
     drawn = np.random.default_rng([seed, number]).integers(0, len(data.runs), len(data.runs))
-    return fitted(model, data.subset(drawn), setting, theta).theta
+    return fitting.fitted(model, data.subset(drawn), setting, theta).theta
 
 
 def without_growth(found: Fitted) -> Fitted:
-    """The fit with rates of friction that are not negative: those below 0 are 0, and other numbers the best beside.
-
-    Of data without friction chance makes half of the rates negative. One that is more than chance is told.
-    """
+    """The fit with rates of friction that are not negative; one that is more than chance is told."""
     model, theta = found.model, found.theta
     first = model.n - model.forces
     growing = np.arange(model.n) >= np.where(theta < 0, first, model.n)
@@ -286,19 +260,14 @@ class Search:
         candidate, self.final, _ = self.winner
         if not deadline.over():
             smooth = replace(setting, seen=None) if self.winner[2].lag else setting
-            found = refitted(self.final, self.whole or self.all, smooth, longer=True)
+            found = fitting.refitted(self.final, self.whole or self.all, smooth, longer=True)
             shorter = found.span < self.final.span or not math.isfinite(found.fit.cost)
             self.final = self.final if setting.stop() and shorter else found
         self.final = without_growth(self.final)
         self.cut = deadline.over()
 
     def _ask(self, groups: list[Group], setting: Setting, session: Session) -> list[tuple[bool, list[Candidate]]]:
-        """Keep the best of the simple models if no H explains the data, which is known before any other is fitted.
-
-        Where increments say so, orbits of that model are compared with those of another reading. The models of the
-        families are returned in the order in which they are to be tried, with True for those that are linear: those
-        that leave much more of increments than the best of all are the last.
-        """
+        """Keep the best of the simple models if no H explains the data; else return those to try, in their order."""
         smooth = self.folds[0][0].sample
         queue = [(g.family.linear, [c for one in g.models for c in self._sparse(one, smooth)]) for g in groups]
         linear = [c for _, candidates in queue for c in candidates if c.model.linear or c.model.lagrangian]
@@ -306,7 +275,7 @@ class Search:
         if not (self.constraints.frequencies or self.data.velocities or self.late()):
             drives = self._drives()
         models = [candidate.model for candidate in linear]
-        found = best_by_increments(*self.folds[0], models, drives, setting.stop)
+        found = diagnosis.best_by_increments(*self.folds[0], models, drives, setting.stop)
         if found is None:
             return queue
         place, self.reading, squares = found
@@ -340,44 +309,40 @@ class Search:
         data, held = self.folds[0]
         if self.best is not None and self.best[0].model is model and (len(self.folds) == 1 or self.reading is not None):
             return self.best[1], self.best[2]
-        found = fitted(model, data, setting, seed=self.seed)
-        return found, judged(found, held, self.setting)
+        found = fitting.fitted(model, data, setting, seed=self.seed)
+        return found, fitting.judged(found, held, self.setting)
 
     def _climb(self, candidates: list[Candidate], setting: Setting, session: Session) -> None:
         """Fit the models of a family, until two that follow each other are no better than one of it before."""
         worse, best = 0, None
         for candidate in candidates:
             over = self.best is not None and (self.best[2].exact or setting.stop())
-            if over or worse == 2 or not self._affords(candidate):
+            if over or worse == 2 or self.numbers <= candidate.model.n:
                 return
             made = self._try(candidate, setting, session)
-            better = best is None or gains(best[2], made[2])
+            better = best is None or fitting.gains(best[2], made[2])
             worse, best = (0, made) if better else (worse + 1, best)
 
     def _sparse(self, candidate: Candidate, data: Trajectories) -> list[Candidate]:
         """A model by Lagrange's equations, before it the same without the terms that smooth curves do not ask for."""
         found = candidate
-        for _ in range(PRUNINGS if candidate.model.lagrangian and affords(data, candidate.model) else 0):
+        for _ in range(PRUNINGS if candidate.model.lagrangian and diagnosis.affords(data, candidate.model) else 0):
             fewer = None if self.late() else pruned(found, *told(found.model, data), data.n_values)
             if fewer is None:
                 break
             found = fewer
         return [candidate] if found is candidate else [found, candidate]
 
-    def _affords(self, candidate: Candidate) -> bool:
-        """True if there are more numbers than the model and the initial states have."""
-        return self.numbers > candidate.model.n
-
     def _fit(self, candidate: Candidate, setting: Setting, session: Session) -> Chosen:
         numbers = self.done.get(candidate.name)
         if numbers is None:
-            found = fitted(candidate.model, self.data, setting, seed=self.seed)
+            found = fitting.fitted(candidate.model, self.data, setting, seed=self.seed)
             if not setting.stop():
-                self.done[candidate.name] = kept(found)
+                self.done[candidate.name] = fitting.kept(found)
                 self.save(session)
         else:
-            found = restored(candidate.model, self.data, numbers, setting)
-        chosen = candidate, found, left_out(found, self.folds, replace(self.setting, stop=self.late))
+            found = fitting.restored(candidate.model, self.data, numbers, setting)
+        chosen = candidate, found, fitting.left_out(found, self.folds, replace(self.setting, stop=self.late))
         self._note(chosen, session)
         return chosen
 
@@ -400,7 +365,7 @@ class Search:
         """Fit a model, and keep it if it is the best so far, and was judged before the time was up."""
         rival = None if self.best is None else self.best[1].sigma
         made = self._fit(candidate, replace(setting, rival=rival), session)
-        if self.best is None or (not self.late() and gains(self.best[2], made[2])):
+        if self.best is None or (not self.late() and fitting.gains(self.best[2], made[2])):
             self.best = made
         return made
 
@@ -427,13 +392,7 @@ class Search:
             checkpoints.write(session.checkpoint, self.identity | state)
 
     def resume(self, path: Path) -> None:
-        """Take over the models that were fitted before a run was ended.
-
-        Raises
-        ------
-        ValueError
-            If the file is not a checkpoint, or one of other trajectories or options.
-        """
+        """Take over the models of a checkpoint; a ValueError if it is one of other trajectories or options."""
         self.done = checkpoints.read_same(path, self.identity)["optimizer"]
 
     def diagnose(self, session: Session) -> None:
@@ -441,7 +400,7 @@ class Search:
         candidate, _, held = self.winner
         if held.explained:
             share = float(np.min(self.winner[1].sigma / self.data.scales))
-            if share > SILENT:
+            if share > fitting.SILENT:
                 warn(
                     f"The best model, {candidate.name}, explains next to nothing: the noise that it leaves is "
                     f"{share:.0%} of the spread of every coordinate or more. Points may be in no order, of other "
@@ -463,14 +422,11 @@ class Search:
         deadline = session.deadline
         free = None if deadline.over() else self.freedom(replace(self.setting, stop=deadline.over))
         if free is not None:
-            if free.defect < SYMPLECTIC:
+            what = "H without the time" if free.defect < SYMPLECTIC else "symplectic map"
+            said += f" No {what} explains these data: {free.said} leaves {free.share:.1e} of the squares."
+            if free.defect >= SYMPLECTIC:
                 said += (
-                    f" No H without the time explains these data: {free.said} leaves {free.share:.1e} of the squares."
-                )
-            else:
-                said += (
-                    f" No symplectic map explains these data: {free.said} leaves {free.share:.1e} of the squares. Its "
-                    f"Jacobian L fails the test of symplecticity: LᵀJ + JL, which is 0 for a Hamiltonian, is "
+                    f" Its Jacobian L fails the test of symplecticity: LᵀJ + JL, which is 0 for a Hamiltonian, is "
                     f"{free.defect:.2g} of L; volumes change at a rate of {free.rate:.3g}."
                 )
             if free.remedy:
@@ -482,15 +438,11 @@ class Search:
             otherwise = f"The time budget ended the search: give it more. {otherwise}"
         library = library_for(None, self.data.ndof, 4, smooth.points)[0]
         drives = [self.constraints.driven(w) for w in candidate.model.frequencies(self.winner[1].theta)]
-        found = hint(library, smooth, self.data, self.constraints.force, drives)
+        found = diagnosis.hint(library, smooth, self.data, self.constraints.force, drives)
         warn(f"{said} {found or otherwise}")
 
     def freedom(self, setting: Setting) -> Freedom | None:
-        """The comparison with a field that need not be Hamiltonian, where it explains much more than any H; else None.
-
-        A field of polynomials has those of all H(q, p) one degree higher, which must leave as much as the best model:
-        so that not only functions are missing.
-        """
+        """The comparison with a field of polynomials, or a reading, that explains much more than any H; else None."""
         if not self.tested:
             self.tested.append(self._freedom(setting))
         return self.tested[0]
@@ -500,9 +452,9 @@ class Search:
         if self.reading is not None:
             return self._beside(self.reading, setting)
         best, scales = self.winner[0].model, self.data.scales
-        damped = [] if best.forces or not isinstance(best, Model) else forced(best)[:1]
-        free = next((r for r in map(partial(free_reading, scales), (3, 2)) if self._affords_field(r.field)), None)
-        found = (self._beside(r, setting) for r in (*damped, free) if r is not None and self._affords_field(r.field))
+        damped = [] if best.forces or not isinstance(best, Model) else diagnosis.forced(best)[:1]
+        free = [r for r in (diagnosis.free_reading(scales, k) for k in (3, 2)) if self._affords_field(r.field)][:1]
+        found = (self._beside(r, setting) for r in (*damped, *free) if self._affords_field(r.field))
         return next((one for one in found if one is not None), None)
 
     def _beside(self, reading: Reading, setting: Setting) -> Freedom | None:
@@ -511,15 +463,15 @@ class Search:
         scales, rivals = data.scales, [self.winner[0].model]
         if isinstance(reading.field, FreeField):
             rivals.append(self.constraints.whole(Polynomial.up_to(reading.field.degree + 1, "y", scales)))
-        fit = fitted(reading.field, reading.of(data), setting.turned(reading.rows))
-        theirs = judged(fit, reading.of(others), self.setting.turned(reading.rows))
+        fit = fitting.fitted(reading.field, reading.of(data), setting.turned(reading.rows))
+        theirs = fitting.judged(fit, reading.of(others), self.setting.turned(reading.rows))
         left, share = theirs.squares(scales[[*reading.rows]]), 0.0
         if reading.numbers and not (_certain(reading.numbers, fit, theirs) and reading.possible(fit.theta)):
             return None
         for model in rivals:
             _, held = self._first_fold(model, setting)
             share = max(share, left / held.squares(scales))
-            if not gains(held, theirs) or not share < (DAMPED if reading.numbers else FREER):
+            if not fitting.gains(held, theirs) or not share < (diagnosis.DAMPED if reading.numbers else FREER):
                 return None
         return Freedom(
             reading.cause.said, reading.remedy(fit.theta), share, *reading.test(fit.theta, fit.states.T, scales)
@@ -548,7 +500,7 @@ class Search:
     def unseen(self) -> list[Any]:
         """Functions that are the same along all orbits, and that the chosen model could depend on in any way."""
         model, d, states = self.winner[0].model, self.data.ndof, self.final.states
-        if not np.isfinite(states).all() or (self.final.sigma > SILENT * self.data.scales).any():
+        if not np.isfinite(states).all() or (self.final.sigma > fitting.SILENT * self.data.scales).any():
             return []
         q, p = range(d), range(d, 2 * d)
         groups: list[tuple[range, Part | None]] = []
@@ -612,16 +564,11 @@ class Search:
             top = float(energies.max())
             domain = EnergySublevel(top + MARGIN * (top - float(energies.min())), domain)
         rates, drag = found.theta[model.n - model.forces :], model.force is drags
-        system = HamiltonianSystem.from_sympy(
-            model.expression(found.theta),
-            damping=None if drag or not model.forces else float(rates[0]) if len(rates) == 1 else rates,
-            name=name,
-            domain=domain,
-            y0=states[0],
-            t_span=(start, start + max(run.span for run in self.data.runs)),
-            dt=self.data.time_scale,
-            **options,
-        )
+        if model.forces and not drag:
+            options["damping"] = float(rates[0]) if len(rates) == 1 else rates
+        t_span = start, start + max(run.span for run in self.data.runs)
+        options |= {"name": name, "domain": domain, "y0": states[0], "t_span": t_span, "dt": self.data.time_scale}
+        system = HamiltonianSystem.from_sympy(model.expression(found.theta), **options)
         return doubled(system, self._drag, name=name) if drag else system
 
     @property

@@ -380,11 +380,7 @@ class _Arrow(LinearModel):
 def chosen_method(
     model: Field, theta: np.ndarray, data: Trajectories, tolerance: np.ndarray, halvings: int = 12, stop: Stop = never
 ) -> Method:
-    """The cheapest scheme and step whose error over the gaps between points is below a tolerance (2d,).
-
-    The error is that over single gaps, from observed states, against half the step. The step is the widest gap, halved
-    so many times at most.
-    """
+    """The cheapest scheme and step whose error over single gaps, against half the step, is below a tolerance (2d,)."""
     if model.stepper is not None:
         return Method(model.stepper, model.stepper.longest)
     starts, gaps, times = _gaps(data)
@@ -422,15 +418,11 @@ def _gaps(data: Trajectories) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if np.isfinite(run.y[:, k]).all()
     ]
     if not found:  # never a whole state
-        found = [
-            (x, float(np.diff(run.t).max()), run.t[0]) for x, run in zip(first_states(data), data.runs, strict=True)
-        ]
+        firsts = zip(first_states(data), data.runs, strict=True)
+        found = [(x, float(np.diff(run.t).max()), run.t[0]) for x, run in firsts]
     gaps, times = np.array([one[1:] for one in found]).T
-    chosen = np.unique(
-        np.concatenate(
-            [np.argsort(gaps)[-STATES // 4 :], np.linspace(0, len(gaps) - 1, min(STATES, len(gaps))).astype(int)]
-        )
-    )
+    spread = np.linspace(0, len(gaps) - 1, min(STATES, len(gaps))).astype(int)
+    chosen = np.unique(np.concatenate([np.argsort(gaps)[-STATES // 4 :], spread]))
     return np.stack([found[i][0] for i in chosen], axis=1), gaps[chosen], times[chosen]
 
 
@@ -444,11 +436,7 @@ def _ends(
 def matched(
     model: Field, theta: np.ndarray, data: Trajectories, weights: np.ndarray, steps: int = 1, stop: Stop = never
 ) -> np.ndarray:
-    """θ by which the observed increments are the integrals of the field along the observed states, by least squares.
-
-    No orbit is computed: y(t) − ∫ f_θ(y) dt is compared with a constant for each piece. That is linear where f is
-    linear in θ, and one step solves it.
-    """
+    """θ by least squares of y(t) − ∫ f_θ(y) dt along the observed states, less a constant for each piece."""
     pieces = [run for run in map(_whole, data.runs) if run.n_points > 1]
     if not pieces:
         return theta
@@ -501,7 +489,6 @@ def _increments(
     """The increments less the integrals of the field, and minus their derivative by θ."""
     here = model.at(np.concatenate([run.t for run in pieces]))
     f = here.field(theta, np.concatenate([run.y for run in pieces], axis=1), False, True)
-    assert f.by_parameters is not None
     at, rests, columns = 0, [], []
     for run in pieces:
         here = slice(at, at + run.n_points)

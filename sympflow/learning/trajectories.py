@@ -15,21 +15,8 @@ from numpy.typing import ArrayLike
 
 from sympflow.arguments import MAX_ASKED_VALUES, checked_count, floats, plain, warn
 from sympflow.flow.scaling import Scaling
-from sympflow.learning.reading import (
-    OBSERVED,
-    Found,
-    Run,
-    checked,
-    factors_of,
-    momenta_of,
-    of_arrays,
-    of_dataset,
-    of_mapping,
-    of_table,
-    opened,
-    rows_of,
-    width_of,
-)
+from sympflow.learning import reading
+from sympflow.learning.reading import OBSERVED, Run
 from sympflow.learning.smoothing import Smooth, smoothed
 from sympflow.show.cards import Card, Shown
 from sympflow.show.pictures import MOST_LINES, trajectory_figure
@@ -49,8 +36,7 @@ FAR, LARGEST = 1e3, 1e60
 POINTS, LONG = 24, 10
 """Points of a piece by which models are compared, and such pieces in a part of a trajectory that is smoothed."""
 COMPARED = 2000  # Points in all such pieces
-ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}
-"""Periods of angles that are looked for."""
+ANGLES = {"2*np.pi": 2 * np.pi, "360": 360.0}  # periods of angles that are looked for
 
 
 @dataclass(frozen=True, repr=False)
@@ -151,19 +137,23 @@ class Trajectories(Shown):
         given: dict[str, Any] = {"order": order, "time": time, "run": run, "q": q, "p": p, "observed": observed}
         converted: dict[str, Any] = {"units": units, "velocity_mass": velocity_mass, "period": period}
         if isinstance(data, Trajectories):
-            found, names = list(_labelled(data.runs)), data.names
+            found, names = [(f"trajectory {i}", run.t, run.y) for i, run in enumerate(data.runs)], data.names
             observed = "qv" if data.velocities else observed
         elif isinstance(data, Mapping) and not _is_a("xarray", "Dataset", data):
-            return cls.read(of_mapping(data, ndof, time, q, p, observed), ndof, **given, **converted)
+            return cls.read(reading.of_mapping(data, ndof, time, q, p, observed), ndof, **given, **converted)
         elif _is_a("pandas", "DataFrame", data):
-            found, names = of_table(data, ndof, order, time, run, q, p, velocity_mass is not None, observed)
+            found, names = reading.of_table(data, ndof, order, time, run, q, p, velocity_mass is not None, observed)
             order = "halves"
         elif _is_a("xarray", "Dataset", data):
-            found, names = of_dataset(data), ()
+            found, names = reading.of_dataset(data), ()
             order = "halves"
         elif isinstance(data, str | Path):
-            return cls.read(opened(Path(data)), ndof, **given, **converted)
-        elif isinstance(data, list | tuple) and data and all(map(_is_named, data)):
+            return cls.read(reading.opened(Path(data)), ndof, **given, **converted)
+        elif (
+            isinstance(data, list | tuple)
+            and data
+            and all(isinstance(one, Mapping) or _is_a("pandas", "DataFrame", one) for one in data)
+        ):
             if not any(np.ndim(value) for one in data for value in dict(one).values()):  # a row each
                 return cls.read(imported("pandas", "Reading rows").DataFrame(data), ndof, **given, **converted)
             parts = [cls.read(one, ndof, **given, **converted) for one in data]
@@ -172,23 +162,23 @@ class Trajectories(Shown):
                 raise ValueError(f"`data` has parts with different coordinates, {said}: give all the same names.")
             return replace(parts[0], runs=tuple(run for part in parts for run in part.runs))
         else:
-            found, names = list(of_arrays(data)), ()
+            found, names = list(reading.of_arrays(data)), ()
         if not found:
             raise ValueError("`data` has no trajectories: give at least one, (t, y).")
         if observed == "q":
             found = [(label, t, np.concatenate([y, np.full_like(y, np.nan)])) for label, t, y in found]
-        width = width_of(found, ndof)
-        rows = rows_of(order, width)
+        width = reading.width_of(found, ndof)
+        rows = reading.rows_of(order, width)
         plainly = tuple(f"{letter}{i + 1}" for letter in f"q{OBSERVED[observed]}" for i in range(width // 2))
         names = (*names, *plainly[len(names) :])  # of velocities that are missing
         names = plainly if names == plainly else tuple(names[i] for i in rows)
-        factors, of_time = factors_of(units, names)
+        factors, of_time = reading.factors_of(units, names)
         runs = []
         for label, times, states in found:
-            t, y = checked(label, times, states)
+            t, y = reading.checked(label, times, states)
             y = y[rows] * factors[:, None]
             if velocity_mass is not None:
-                y = np.concatenate([y[: width // 2], momenta_of(velocity_mass, y[width // 2 :])])
+                y = np.concatenate([y[: width // 2], reading.momenta_of(velocity_mass, y[width // 2 :])])
             runs.append(Run(np.ascontiguousarray(t) * of_time, np.ascontiguousarray(y)))
         for i, name in enumerate(names if observed == "qp" else names[: width // 2]):
             if all(np.isnan(one.y[i]).all() for one in runs):
@@ -398,13 +388,7 @@ class Trajectories(Shown):
 
 
 def periods_of(period: Any, ndof: int) -> np.ndarray:
-    """The period of each q (d,), infinite where there is none.
-
-    Raises
-    ------
-    ValueError
-        If it is not positive, or of another shape.
-    """
+    """The period of each q (d,), infinite where there is none; a ValueError if it is not positive."""
     given = floats("period", period)
     if given.shape not in ((), (ndof,)) or (given <= 0).any():
         raise ValueError(f"`period` must be positive, one for all q or one for each of {ndof}; got {period!r}.")
@@ -430,16 +414,6 @@ def _cut(run: Run, points: int, span: float) -> Iterator[Run]:
             stop = n
         yield run.part(start, stop)
         start = stop
-
-
-def _labelled(runs: Sequence[Run]) -> Iterator[Found]:
-    for i, run in enumerate(runs):
-        yield f"trajectory {i}", run.t, run.y
-
-
-def _is_named(data: Any) -> bool:
-    """True of a dictionary, a table or a Dataset."""
-    return isinstance(data, Mapping) or _is_a("pandas", "DataFrame", data)
 
 
 def _is_a(library: str, kind: str, data: Any) -> bool:

@@ -22,10 +22,7 @@ RADIUS = 0.1  # Radius of a domain around a trajectory, in the spread of each co
 
 
 def unseen(states: np.ndarray, errors: np.ndarray, columns: Sequence[int], part: Part | None = None) -> list[sp.Expr]:
-    """Functions of some coordinates that are the same at all states: linear ones, or else quadratic ones.
-
-    Of q and p together only linear ones: of few orbits some sum of the integrals of motion always has one value.
-    """
+    """Functions of some coordinates that are the same at all states: linear ones, or else quadratic ones."""
     d = states.shape[1] // 2
     x = states[:, [*columns]].T
     names = [sp.Symbol(f"{'qp'[i // d]}{i % d + 1}", real=True) for i in columns]
@@ -52,9 +49,7 @@ def _same(
         values = np.stack([part.value(unit, at - middle[:, None]) for unit in units])
         return np.cov(values).reshape(part.n, part.n)
 
-    slopes = part.gradient(np.zeros(part.n), x - middle[:, None], False, True).by_parameters
-    assert slopes is not None
-    slopes = slopes * errors[:, None, None]
+    slopes = part.gradient(np.zeros(part.n), x - middle[:, None], False, True).by_parameters * errors[:, None, None]
     chance = CHANCE * np.einsum("ikn,iln->kl", slopes, slopes, optimize=True) / x.shape[1]
     shares, vectors = scipy.linalg.eigh(covariance(x) - chance, covariance(box))
     same = vectors[:, shares < SAME].T

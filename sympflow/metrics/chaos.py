@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +26,6 @@ from sympflow.integrators.impulses import landings
 from sympflow.integrators.registry import naming_plugin
 from sympflow.integrators.steppers import compiled_loops
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
-from sympflow.show.cards import Card, numbers
 from sympflow.show.pictures import curves_figure
 from sympflow.systems.given import GivenSystem, given_system
 
@@ -63,6 +62,8 @@ class Indicator(OfOrbits):
         The indicator after the last step that ends at or before each of them; NaN after the end of an orbit.
     """
 
+    caption: ClassVar[str] = "Indicator of chaos"
+    facts: ClassVar[tuple[str, ...]] = ("value", "t_end", "status")
     value: Any
     t_end: Any
     status: Any
@@ -70,14 +71,10 @@ class Indicator(OfOrbits):
     t: np.ndarray = field(repr=False)
     history: np.ndarray = field(repr=False)
 
-    def card(self) -> Card:
-        facts = {"value": numbers(self.value), "t_end": numbers(self.t_end), "status": numbers(self.status)}
-        return Card("Indicator of chaos", facts, self.message)
-
     def drawn(self) -> Figure:
         if len(self.t):
             curves = self.history.reshape(-1, len(self.t))
-            return curves_figure(self.t, curves, ("t", "indicator"), "Indicator of chaos")
+            return curves_figure(self.t, curves, ("t", "indicator"), self.caption)
         return of_many("indicator", self.value, "give `t_eval` to see it over time")
 
 
@@ -328,12 +325,11 @@ def indicator(
         if grid.n_steps == 0:
             raise ValueError(f"`t_span` is shorter than one step of {abs(grid.h):g}: end it later, or reduce `dt`.")
         orbits = orbits._replace(t_span=(t0, grid.time(grid.n_steps)))
-        kernel = None
         if not jumps:
             kernel = compiled_loops(lambda: integrator.tangent_kernel(system, vectors), orbits.y0, backend)
-        if kernel is not None:
-            run = _compiled(kernel, grid, orbits, w0, scale, times, kind, below)
-            return _reported(run, orbits, times, kind, below)
+            if kernel is not None:
+                run = _compiled(kernel, grid, orbits, w0, scale, times, kind, below)
+                return _reported(run, orbits, times, kind, below)
     elif backend == "compiled":
         raise ValueError(f"`backend` 'compiled' does not apply to method {integrator.name!r}: use 'auto'.")
     with naming_plugin(integrator):
@@ -487,11 +483,5 @@ def _reported(run: _Run, orbits: Orbits, times: np.ndarray, kind: int, below: fl
         return x.reshape(orbits.batch + x.shape[1:])[()]
 
     t_end = orbits.t_span[0] + run.elapsed[:, -1]
-    return Indicator(
-        shaped(values[:, -1]),
-        shaped(t_end),
-        shaped(run.status),
-        message,
-        times,
-        np.asarray(shaped(values[:, :-1])),
-    )
+    value, end, status, history = map(shaped, (values[:, -1], t_end, run.status, values[:, :-1]))
+    return Indicator(value, end, status, message, times, np.asarray(history))

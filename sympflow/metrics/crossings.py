@@ -61,11 +61,7 @@ def crossings(
 def stroboscopic(
     integrator: Integrator, system: HamiltonianSystem, t_span: tuple[float, float], rows: np.ndarray, period: float
 ) -> Crossings:
-    """The states (n, 2d) at t0 + k·T of the trajectories from `rows` (N, 2d), those at t0 among them.
-
-    Fixed steps are shortened to T/m with a whole m, so that all these times are ends of steps; trained flows, which are
-    other maps at other steps, and methods that choose theirs are asked for them as outputs.
-    """
+    """The states (n, 2d) at t0 + k·T of trajectories from `rows` (N, 2d), ends of fixed steps T/m, else outputs."""
     t0, t1 = t_span
     n = whole_periods(t_span, period)
     turn = float(np.copysign(period, t1 - t0))

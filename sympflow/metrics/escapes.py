@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,6 @@ from sympflow.integrators.grid import Grid
 from sympflow.integrators.impulses import landings, pieces_of
 from sympflow.integrators.registry import naming_plugin
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits, of_many
-from sympflow.show.cards import Card, numbers
 from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
@@ -47,14 +46,12 @@ class Escapes(OfOrbits):
     message : str
     """
 
+    caption: ClassVar[str] = "Escapes"
+    facts: ClassVar[tuple[str, ...]] = ("time", "state", "status")
     time: Any
     state: np.ndarray = field(repr=False)
     status: Any
     message: str
-
-    def card(self) -> Card:
-        facts = {"time": numbers(self.time), "state": numbers(self.state), "status": numbers(self.status)}
-        return Card("Escapes", facts, self.message)
 
     def drawn(self) -> Figure:
         return of_many("time of escape", self.time, "it is `time`")
@@ -113,8 +110,7 @@ def escape_times(
     region = region_of(outside, system)
     rows = orbits.rows
     _inside(region, rows[:1])
-    found = escapes(orbits, region, backend)
-    time, state, status = found
+    time, state, status = escapes(orbits, region, backend)
     message = FINISHED
     if (status < 0).any():
         message = (
@@ -126,13 +122,7 @@ def escape_times(
 
 
 def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
-    """The function of states that `outside` means.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If it is none.
-    """
+    """The function of states that `outside` means; a ValueError or TypeError if it is none."""
     if outside is None:
         if system.domain is None:
             raise ValueError(
@@ -142,36 +132,15 @@ def region_of(outside: Any, system: HamiltonianSystem) -> Outside:
     if real_number(outside):
         if not 0 < outside < np.inf:
             raise ValueError(f"`outside` must be a positive radius; got {outside!r}.")
-        return _Beyond(float(outside), system.ndof)
+        return lambda y: np.square(y[..., : system.ndof]).sum(-1) > outside**2
     contains = getattr(outside, "contains", None)
     if contains is not None:
-        return _NotIn(contains)
+        return lambda y: ~contains(y)
     if not callable(outside):
         raise TypeError(
             f"`outside` must be a radius, a domain, or a function of states (..., 2d); got {type(outside).__name__}."
         )
     return outside
-
-
-@dataclass(frozen=True)
-class _Beyond:
-    """|q| > radius."""
-
-    radius: float
-    ndof: int
-
-    def __call__(self, y: np.ndarray) -> np.ndarray:
-        return np.square(y[..., : self.ndof]).sum(-1) > self.radius**2
-
-
-@dataclass(frozen=True)
-class _NotIn:
-    """Not in a domain."""
-
-    contains: Callable[[np.ndarray], np.ndarray]
-
-    def __call__(self, y: np.ndarray) -> np.ndarray:
-        return ~self.contains(y)
 
 
 def _inside(region: Outside, y: np.ndarray) -> np.ndarray:
@@ -186,13 +155,7 @@ def _inside(region: Outside, y: np.ndarray) -> np.ndarray:
 
 
 def escapes(orbits: Orbits, region: Outside, backend: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The times (N,), states (N, 2d) and statuses (N,), some rows after others.
-
-    Raises
-    ------
-    ValueError
-        If the method has no fixed steps.
-    """
+    """The times (N,), states (N, 2d) and statuses (N,), some rows after others; a ValueError without fixed steps."""
     integrator = orbits.integrator
     if not (isinstance(integrator, FixedStep) and integrator.on_grid):
         raise ValueError(

@@ -28,10 +28,8 @@ from sympflow.metrics.crossings import dividing_step
 from sympflow.solver import solve
 from sympflow.systems.given import GivenSystem, given_system
 
-GROWS = 1e-5
-"""Excess of a multiplier over 1 that is more than the rounding of a double eigenvalue, √ε."""
-UNPAIRED = 1e-3
-"""A worse pairing of the multipliers than this is warned of."""
+GROWS = 1e-5  # excess of a multiplier over 1 that is more than the rounding of a double eigenvalue, √ε
+UNPAIRED = 1e-3  # a worse pairing of the multipliers than this is warned of
 CLOSED = 1e-6
 """Distance of the end of a period from its start, over the size of y0, up to which an orbit is periodic.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +15,6 @@ from sympflow.hamiltonian.scales import natural_scale
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.grid import Grid
 from sympflow.metrics.orbits import OfOrbits, Orbits, checked_orbits
-from sympflow.show.cards import Card, numbers
 from sympflow.show.pictures import curves_figure
 from sympflow.solver import solve
 from sympflow.systems.given import GivenSystem, given_system
@@ -23,8 +22,7 @@ from sympflow.systems.given import GivenSystem, given_system
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOST_SAMPLES = 1 << 16
-"""Samples of an orbit, unless more are asked for: at every step, or at every few of a longer run."""
+MOST_SAMPLES = 1 << 16  # samples of an orbit, unless more are asked for: at every step, or at every few of a longer run
 FEWEST_SAMPLES = 16
 OF_OTHER_METHODS = 4096  # samples, where steps are of no fixed length
 MOST_VALUES = 1 << 21  # numbers that are held at a time
@@ -52,21 +50,19 @@ class Frequencies(OfOrbits):
     message : str
     """
 
+    caption: ClassVar[str] = "Frequencies"
+    facts: ClassVar[tuple[str, ...]] = ("frequencies", "amplitudes", "status")
     frequencies: np.ndarray
     amplitudes: np.ndarray = field(repr=False)
     status: Any
     message: str
-
-    def card(self) -> Card:
-        facts = {"frequencies": numbers(self.frequencies), "amplitudes": numbers(np.abs(self.amplitudes))}
-        return Card("Frequencies", {**facts, "status": numbers(self.status)}, self.message)
 
     def drawn(self) -> Figure:
         n = self.frequencies.shape[-1]
         lines, sizes = self.frequencies.reshape(-1, n), np.abs(self.amplitudes).reshape(-1, n)
         if not np.isfinite(lines).any():
             raise ValueError("`plot` has nothing to draw, for no line was found: `message` says why.")
-        return curves_figure(lines, sizes, ("angular frequency", "amplitude"), "Frequencies", bars=True)
+        return curves_figure(lines, sizes, ("angular frequency", "amplitude"), self.caption, bars=True)
 
 
 def frequencies(
@@ -147,15 +143,9 @@ def frequencies(
     rows, parts, status, message = orbits.rows, [], [], ""
     most = max(1, MOST_VALUES // (len(times) * (2 * system.ndof + 4 * n)))
     for start in range(0, len(rows), most):
-        sol = solve(
-            orbits.system,
-            orbits.integrator,
-            (orbits.t_span[0], float(times[-1])),
-            rows[start : start + most],
-            t_eval=times,
-            backend=backend,
-            on_domain_exit="ignore",
-        )
+        span, some = (orbits.t_span[0], float(times[-1])), rows[start : start + most]
+        run: dict[str, Any] = {"t_eval": times, "backend": backend, "on_domain_exit": "ignore"}
+        sol = solve(orbits.system, orbits.integrator, span, some, **run)
         if signal is None and (growing := _growing(sol.y[:, : system.ndof], times)):
             warn(
                 f"`signal`: {growing} grows with the time, as an angle that turns over, and its strongest lines are "
@@ -214,13 +204,7 @@ def _growing(q: np.ndarray, times: np.ndarray) -> str:
 
 
 def signals(signal: Signal, y: np.ndarray, m: int) -> np.ndarray:
-    """The signals (N, c, m) of states (N, 2d, m).
-
-    Raises
-    ------
-    ValueError, TypeError
-        If the function returns something else.
-    """
+    """The signals (N, c, m) of states (N, 2d, m); a ValueError or TypeError if the function returns something else."""
     z = np.asarray(signal(y))
     if z.dtype.kind not in "biufc":
         raise TypeError(f"`signal` must return real or complex numbers; got dtype {z.dtype}.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,7 @@ from sympflow.integrators.choosing import integrator_for, with_start
 from sympflow.integrators.contract import Integrator
 from sympflow.integrators.problems import check_y0
 from sympflow.integrators.registry import check_applies
-from sympflow.show.cards import Shown
+from sympflow.show.cards import Card, Shown, numbers
 from sympflow.show.pictures import histogram_figure
 from sympflow.show.style import saved
 from sympflow.systems.given import GivenSystem, given_system
@@ -26,14 +26,22 @@ if TYPE_CHECKING:
 
 
 class OfOrbits(Shown):
-    """Results of orbits, with a `status`, negative for orbits that failed, and a figure."""
+    """Results of orbits, with a `status`, negative for orbits that failed, a `message`, and a figure."""
 
+    caption: ClassVar[str]
+    facts: ClassVar[tuple[str, ...]]  # names of what a card shows
     status: Any
+    message: str
 
     @property
     def success(self) -> bool:
         """True if no orbit failed."""
         return bool(np.all(np.asarray(self.status) >= 0))
+
+    def card(self) -> Card:
+        values = ((name, getattr(self, name)) for name in self.facts)
+        shown = {name: numbers(np.abs(x) if np.iscomplexobj(x) else x) for name, x in values}
+        return Card(self.caption, shown, self.message)
 
     @abstractmethod
     def drawn(self) -> Figure:
@@ -91,13 +99,7 @@ def checked_orbits(
     options: Mapping[str, Any],
     purpose: str,
 ) -> Orbits:
-    """Orbits, the arguments as those of `solve`; `purpose` is what NumPy arrays are needed for, as a clause.
-
-    Raises
-    ------
-    ValueError, TypeError
-        For bad arguments, and where the method does not apply to the system.
-    """
+    """Orbits, the arguments checked as those of `solve`; `purpose` is what NumPy arrays are needed for, as a clause."""
     system = given_system(system)
     span = check_t_span(system.t_span if t_span is None else t_span)
     check_array(y0, f"{purpose} NumPy arrays")

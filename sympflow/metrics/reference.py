@@ -132,10 +132,7 @@ def _linear_part(system: HamiltonianSystem) -> np.ndarray:
 
 
 def _linear_flow(system: HamiltonianSystem, t: np.ndarray, y0: np.ndarray) -> np.ndarray | None:
-    """The exact solution for H = ½ xᵀSx with S positive definite, which symbols tell; else None.
-
-    With S = LLᵀ the variables z = Lᵀx rotate, z' = LᵀJL z, so the error is that of the phase alone: ε·ω·t.
-    """
+    """The exact solution for H = ½ xᵀSx, S = LLᵀ: z = Lᵀx rotates, z' = LᵀJL z; None for another H."""
     if system.written is None:
         return None
     import sympy

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 ORBIT, DOF, TIME = "orbit", "dof", "time"
 RESERVED = ("q", "p", "q0", "p0", "status", ORBIT, DOF, TIME)
 """Names of the arrays and dimensions that each Dataset has, or may have."""
-NAMED = {
+NAMED = {  # the attributes of arrays, by their names
     "q": {"long_name": "positions"},
     "p": {"long_name": "momenta"},
     "q0": {"long_name": "initial positions"},
@@ -31,9 +31,7 @@ NAMED = {
     "status": {"long_name": "0: the end was reached, 1: an event ended it, 2: not run yet, -1: failed"},
     DOF: {"long_name": "i of q_i and p_i"},
 }
-"""The attributes of arrays, by their names."""
-UNITS = "those of the system's definition"
-"""The units of all numbers, which no system states."""
+UNITS = "those of the system's definition"  # the units of all numbers, which no system states
 
 
 def halves(ndof: int) -> tuple[tuple[str, slice], tuple[str, slice]]:
@@ -73,12 +71,7 @@ def imported(library: str, what: str) -> Any:
 
 
 def table(data: xarray.Dataset, rows: Iterable[str]) -> pandas.DataFrame:
-    """Return the arrays of a Dataset as columns, with a row for each index along some dimensions.
-
-    The columns are these dimensions, what is known along them, and of arrays with more dimensions one for each entry:
-    q1 … qd along `dof`, else name_0, name_1, name_0_1. Arrays without any of the `rows` are left out, and where these
-    are times the initial states. `attrs` are those of the Dataset.
-    """
+    """The arrays of a Dataset as columns, q1 … qd along `dof`, else name_0, …, a row for each index along `rows`."""
     pd = imported("pandas", "to_dataframe()")
     dims = [dim for dim in rows if dim in data.sizes]
     shape = tuple(data.sizes[dim] for dim in dims)

@@ -22,7 +22,6 @@ import json
 import os
 import re
 import shutil
-import tempfile
 import uuid
 import zipfile
 import zlib
@@ -36,19 +35,18 @@ from typing import Any
 
 import numpy as np
 
+from sympflow.arguments import put_file
 from sympflow.storage.identity import Known
 
 __all__ = ["Appender", "Field", "Store", "StoreError"]
 
 METADATA, ATTRIBUTES, ARRAY = ".zmetadata", ".zattrs", ".zarray"
-KEPT = "sympflow_state"
-"""The attribute that names the file of the state which was kept at the last commit."""
+KEPT = "sympflow_state"  # the attribute that names the file of the state which was kept at the last commit
 TOLD = 90  # characters of what differs between two calls
 STATE = re.compile(r"\.state-([1-9]\d{0,17})\.npz")
 MOST_METADATA = 2**26  # bytes
 MOST_STATES = 64  # bytes that are kept to go on, over those of a chunk of each array
-STORABLE = "biufc"
-"""Kinds of dtypes that a store takes: truth values and numbers."""
+STORABLE = "biufc"  # kinds of dtypes that a store takes: truth values and numbers
 
 
 class StoreError(OSError):
@@ -57,16 +55,12 @@ class StoreError(OSError):
 
 @dataclass(frozen=True)
 class Field:
-    """An array of a store, of numbers or truth values; fields that share a dimension have the same length along it.
-
-    `chunks` is by default the whole array. `missing` is the number where nothing has been written, which a reader of
-    zarr may show as NaN; the default is NaN, or 0 of other numbers than floats.
-    """
+    """An array of a store; `chunks` is by default all of it, `missing` the number where nothing was written."""
 
     dims: tuple[str, ...]
     shape: tuple[int, ...]
     dtype: Any = float
-    chunks: tuple[int, ...] | None = None
+    chunks: Any = None  # of int, one for each dimension; None for the whole array
     attributes: Mapping[str, Any] = field(default_factory=dict)
     missing: int | None = None
 
@@ -84,12 +78,10 @@ class Field:
     @property
     def grid(self) -> tuple[int, ...]:
         """The number of chunks along each dimension."""
-        assert self.chunks is not None
         return tuple(-(-n // size) for n, size in zip(self.shape, self.chunks, strict=True))
 
     def region(self, index: tuple[int, ...]) -> tuple[slice, ...]:
         """Return where in the array a chunk lies."""
-        assert self.chunks is not None
         ends = zip(index, self.chunks, self.shape, strict=True)
         return tuple(slice(i * size, min((i + 1) * size, n)) for i, size, n in ends)
 
@@ -148,10 +140,7 @@ class Store:
         attributes: Mapping[str, Any],
         values: Mapping[str, np.ndarray] | None = None,
     ) -> Store:
-        """Make a store, with the values of some arrays of one chunk; the others have none.
-
-        It is made beside its place, and moved there: it is whole, or it is not there.
-        """
+        """Make a store beside its place, and move it there, with the values of some arrays of one chunk."""
         place = Path(path)
         for name in fields:
             if not is_name(name):
@@ -166,7 +155,7 @@ class Store:
                 unfinished.mkdir(parents=True)
                 for name in fields:
                     (unfinished / name).mkdir()
-                _replace(unfinished / ".zgroup", b'{"zarr_format": 2}')
+                put_file(unfinished / ".zgroup", b'{"zarr_format": 2}')
                 for name, array in (values or {}).items():
                     store.write(name, (0,) * np.ndim(array), array)
                 store.commit(attributes=attributes)
@@ -251,17 +240,8 @@ class Store:
         return self._file(name, index).exists()
 
     def write(self, name: str, index: tuple[int, ...], values: np.ndarray) -> None:
-        """Write one chunk; at the edge of the array, or of one that is to grow, `values` may be smaller than a chunk.
-
-        Raises
-        ------
-        ValueError
-            If the values do not fit into the chunk.
-        StoreError
-            If they cannot be written, as on a full disk.
-        """
+        """Write one chunk, into which `values` must fit; at the edge of the array they may be smaller."""
         known = self.fields[name]
-        assert known.chunks is not None
         values = np.asarray(values)
         if values.ndim != len(known.chunks) or (np.array(values.shape) > known.chunks).any():
             raise ValueError(f"`values` of shape {values.shape} are not a chunk of {name!r}, of shape {known.chunks}.")
@@ -271,12 +251,12 @@ class Store:
             chunk = np.full(known.chunks, known.filled, dtype=known.dtype)
             chunk[tuple(map(slice, values.shape))] = values
         with _told(self.path):
-            _replace(self._file(name, index), zlib.compress(chunk.data, 0))
+            put_file(self._file(name, index), zlib.compress(chunk.data, 0))
 
     def write_text(self, name: str, text: str) -> None:
         """Write a file beside the arrays, whole or not at all."""
         with _told(self.path):
-            _replace(self.path / name, text.encode())
+            put_file(self.path / name, text.encode())
 
     def read(self, name: str, index: tuple[int, ...] | None = None) -> np.ndarray:
         """Return a chunk, or the whole array; `Field.filled` where nothing has been written."""
@@ -286,7 +266,6 @@ class Store:
             for i in product(*map(range, known.grid)):
                 whole[known.region(i)] = self.read(name, i)
             return whole
-        assert known.chunks is not None
         shape = tuple(part.stop - part.start for part in known.region(index))
         size = prod(known.chunks) * known.dtype.itemsize
         try:
@@ -324,15 +303,15 @@ class Store:
                 changed[KEPT] = f".state-{1 + int(last[1]) if last else 1}.npz"
                 buffer = io.BytesIO()
                 np.savez(buffer, **dict(state))  # type: ignore[arg-type]
-                _replace(self.path / changed[KEPT], buffer.getvalue())
+                put_file(self.path / changed[KEPT], buffer.getvalue())
             described: dict[str, Any] = {".zgroup": {"zarr_format": 2}, ATTRIBUTES: changed}
             for name, known in fields.items():
                 described[f"{name}/{ARRAY}"] = known.metadata()
                 described[f"{name}/{ATTRIBUTES}"] = {"_ARRAY_DIMENSIONS": list(known.dims), **known.attributes}
-            _replace(self.path / METADATA, _json({"metadata": described, "zarr_consolidated_format": 1}))
+            put_file(self.path / METADATA, _json({"metadata": described, "zarr_consolidated_format": 1}))
             self.fields, self.attributes = fields, changed
             for key, value in described.items():  # for readers that do not take consolidated metadata
-                _replace(self.path / key, _json(value), durable=False)
+                put_file(self.path / key, _json(value), durable=False)
             if state is not None and before:
                 (self.path / before).unlink(missing_ok=True)
 
@@ -389,7 +368,6 @@ class Appender:
         self.axes = {name: known.dims.index(dim) for name, known in store.fields.items() if dim in known.dims}
         name, axis = next(iter(self.axes.items()))
         known = store.fields[name]
-        assert known.chunks is not None
         self.size, self.length = known.chunks[axis], known.shape[axis]
         self.tails: dict[str, list[np.ndarray]] = {name: [] for name in self.axes}
         self.held = self.length % self.size
@@ -494,22 +472,6 @@ def _read(path: Path, most: int) -> bytes:
     if len(content) > most:
         raise ValueError(f"more than {most:,} bytes")
     return content
-
-
-def _replace(path: Path, data: bytes, durable: bool = True) -> None:
-    """Write a file beside its place and move it there; `durable` once the disk has it."""
-    handle, unfinished = tempfile.mkstemp(dir=path.parent, prefix=".new-")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            if durable:
-                os.fsync(file.fileno())
-        os.chmod(unfinished, 0o644)
-        os.replace(unfinished, path)
-    except BaseException:
-        Path(unfinished).unlink(missing_ok=True)
-        raise
 
 
 def _is_taken(place: Path) -> bool:

@@ -12,7 +12,8 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from sympflow.metrics.energy_balance import energy_balance_error
 from sympflow.metrics.reference import Reference
 from sympflow.metrics.symplectic import conformal_defect, symplecticity_defect, volume_error
 from sympflow.solution import Solution
-from sympflow.studies.reports import seconds
+from sympflow.studies.reports import Column, number, plain, seconds
 
 REFUSALS = (ValueError, TypeError, ImportError, NotImplementedError)
 """Errors by which a method says that it does not apply; any other is a failure."""
@@ -50,20 +51,7 @@ class Candidate:
 
 
 def candidates(methods: Sequence[Any], dt: float | None = None) -> list[Candidate]:
-    """Make the candidates that a list of methods means; their labels are distinct.
-
-    Parameters
-    ----------
-    methods : sequence
-        Names, integrators, trained flows, or pairs (label, any of these).
-    dt : float, optional
-        Step of the fixed-step classical methods that are given by name.
-
-    Raises
-    ------
-    ValueError, TypeError
-        For an unknown name, or no methods at all. A plug-in that cannot be loaded is a candidate with a problem.
-    """
+    """Candidates with distinct labels, of names, integrators, flows, or pairs (label, any of these)."""
     if isinstance(methods, str) or not isinstance(methods, Sequence):
         raise TypeError(f"`methods` must be a list of methods; got {methods!r}. Put it in brackets.")
     if not methods:
@@ -112,12 +100,7 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 def instants(t0: float, t1: float, n: int, dt: float) -> np.ndarray:
-    """The times (n,) at which methods are compared: one in each n-th of the interval, the last at its end.
-
-    Their places within these parts go on by the golden section, so that they meet all phases of an oscillation even
-    where its period divides the parts. They are ends of steps dt where a part holds two of these or more, so that a
-    method makes no other steps for them.
-    """
+    """The times (n,) of a comparison: one in each n-th of the interval, by the golden section, the last at its end."""
     k = np.arange(1, n)
     elapsed = (k - 1 + (GOLDEN * k) % 1) * (abs(t1 - t0) / n)
     if 2 * dt * n <= abs(t1 - t0):
@@ -245,6 +228,46 @@ class Row:
         return f"Row({', '.join(filled)})"
 
 
+NEGLIGIBLE = 0.1  # seconds of compilation that tables leave out
+CELLS: dict[str, Callable[[Any], str]] = {  # the cells of tables of rows, by the titles of their columns
+    "method": lambda row: row.label,
+    "batch": lambda row: f"{row.trajectories:,}",
+    "step": lambda row: plain(row.dt),
+    "rtol": lambda row: "" if row.tolerance is None else f"{row.tolerance:.0e}",
+    "backend": lambda row: row.backend or "",
+    "run time": lambda row: seconds(row.run_time),
+    "±": lambda row: seconds(row.run_time_spread),
+    "steps": lambda row: counted(row.n_steps),
+    "forces": lambda row: counted(row.force_evaluations),
+    "Hessians": lambda row: counted(row.hessian_evaluations),
+    "error": lambda row: number(row.error),
+    "energy error": lambda row: number(row.energy_error),
+    "energy balance": lambda row: number(row.balance_error),
+    "drift per unit t": lambda row: f"{number(row.energy_drift)} ± {number(row.energy_drift_error, 1)}".strip(" ±"),
+    "leaves domain at t": lambda row: plain(row.domain_exit),
+    "volume error": lambda row: number(row.volume_error),
+    "sympl. defect": lambda row: number(row.symplecticity_defect),
+    "conf. defect": lambda row: number(row.conformal_defect),
+    "reversal": lambda row: number(row.time_reversal_error),
+    "training": lambda row: seconds(row.training_time),
+    "compiled in": lambda row: seconds(row.compile_time) if (row.compile_time or 0.0) >= NEGLIGIBLE else "",
+    "status": lambda row: "" if row.status == "ok" else row.status,
+}
+
+
+def counted(x: float | None) -> str:
+    """A count: 12,000; empty for none."""
+    return f"{x:,.0f}" if x else ""
+
+
+def columns(
+    rows: Sequence[Any], titles: Sequence[str], own: Mapping[str, Callable[[Any], str]] | None = None
+) -> list[Column]:
+    """Columns of these titles, with cells of `CELLS` or of their own."""
+    cells, left = CELLS | dict(own or {}), ("method", "backend", "status")
+    return [Column(title, [cells[title](row) for row in rows], title in left) for title in titles]
+
+
 @contextmanager
 def any_step() -> Iterator[None]:
     """Run without warnings of steps that are too long: studies sweep these, and a row has its energy error."""
@@ -258,18 +281,7 @@ def any_step() -> Iterator[None]:
 
 @dataclass
 class Attempt:
-    """A candidate on its way to a row: its solutions, and the figures over time that are drawn.
-
-    Attributes
-    ----------
-    candidate : Candidate
-    row : Row
-    sols : tuple of Solution
-        The runs, of one method under one set of conditions; empty if it does not apply or broke.
-    energy, volume : ndarray or None
-        |energy error| (..., n), of a driven system that of the balance, and volume error (..., n) at the times of the
-        solution, where these were measured.
-    """
+    """A candidate on its way to a row: its solutions, and energy and volume errors (..., n) over time, if measured."""
 
     candidate: Candidate
     row: Row
@@ -332,10 +344,7 @@ class Attempt:
     def warm_up(
         self, run: Callable[[Any, tuple[float, float], np.ndarray], object], t: np.ndarray, t0: float, dt: float
     ) -> None:
-        """Compile what the candidate's runs need, and enter the time that it took; a run that fails is left to `run`.
-
-        `dt` is a step of the system, for methods that choose theirs.
-        """
+        """Compile what the candidate's runs need, and enter the time that it took; `dt` is a step of the system."""
         integrator = self.candidate.integrator
         if integrator is None:
             return
@@ -378,8 +387,7 @@ def largest(series: np.ndarray, sol: Solution) -> np.ndarray:
 
 # metrics ----------------------------------------------------------------------------------------------------------
 
-Metric = Callable[[Attempt], None]
-"""A function that measures an attempt which has run, and fills in its row."""
+Metric = Callable[[Attempt], None]  # a function that measures an attempt which has run, and fills in its row
 
 
 def accuracy(attempt: Attempt, truth: Reference) -> None:
@@ -426,18 +434,13 @@ def volume(attempt: Attempt) -> None:
     attempt.fill(volume_error=float(last[np.argmax(np.abs(last))]))
 
 
-def symplecticity(attempt: Attempt) -> None:
-    """The largest defect of a step, relative to the step's norm."""
+def defect(attempt: Attempt, of: Callable[..., Any]) -> None:
+    """The largest defect of a step, relative to the step's norm: of `symplecticity_defect` or `conformal_defect`."""
     (sol,) = attempt.sols
-    lost = attempt.lost
-    attempt.fill(symplecticity_defect=np.inf if lost else float(np.max(symplecticity_defect(sol, relative=True))))
+    attempt.fill(**{of.__name__: np.inf if attempt.lost else float(np.max(of(sol, relative=True)))})
 
 
-def conformality(attempt: Attempt) -> None:
-    """The largest defect of a step of a damped system, relative to the step's norm."""
-    (sol,) = attempt.sols
-    lost = attempt.lost
-    attempt.fill(conformal_defect=np.inf if lost else float(np.max(conformal_defect(sol, relative=True))))
+symplecticity, conformality = (partial(defect, of=of) for of in (symplecticity_defect, conformal_defect))
 
 
 def reversal(attempt: Attempt) -> None:
@@ -452,8 +455,7 @@ def reversal(attempt: Attempt) -> None:
 # run times --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class RunTime:
+class RunTime(NamedTuple):
     """Median and interquartile range of the repeats, in seconds."""
 
     median: float
@@ -461,10 +463,7 @@ class RunTime:
 
 
 def interleaved(calls: Sequence[Callable[[], object]], repeats: int) -> list[RunTime]:
-    """Time every call `repeats` times, going round over all of them, so that a slow spell of the machine hits each.
-
-    The calls should have run before, or been warmed up: see `warm_up`.
-    """
+    """Time every call `repeats` times, going round over all of them, so that a slow spell of the machine hits each."""
     if not calls:
         return []
     passed = np.empty((repeats, len(calls)))
@@ -478,37 +477,11 @@ def interleaved(calls: Sequence[Callable[[], object]], repeats: int) -> list[Run
     return [RunTime(float(m), float(h - lo)) for lo, m, h in zip(low, median, high, strict=True)]
 
 
-NEGLIGIBLE = 0.1  # seconds of compilation that tables leave out
-
-
-def shown_compile_time(row: Row) -> str:
-    """The compile time as tables show it: empty where it is negligible."""
-    return seconds(row.compile_time) if (row.compile_time or 0.0) >= NEGLIGIBLE else ""
-
-
-WARM_STEPS = 3.5
-"""Steps of a run that compiles: whole ones, and the shorter ones of the outputs between them."""
+WARM_STEPS = 3.5  # steps of a run that compiles: whole ones, and the shorter ones of the outputs between them
 
 
 def warm_up(run: Callable[[tuple[float, float], np.ndarray], object], step: float, t: np.ndarray, t0: float) -> float:
-    """Make a run twice over a few steps, so that all that a long one needs is compiled; the seconds of doing so.
-
-    Parameters
-    ----------
-    run : callable
-        Solves over an interval with outputs at some instants.
-    step : float
-        Length of a step, about.
-    t : ndarray (n,)
-        The instants of the long run, up to its end: the short one has as many.
-    t0 : float
-        Its start.
-
-    Returns
-    -------
-    float
-        The time of the first run beyond that of the second.
-    """
+    """Make a run twice over a few steps, so that all is compiled; the seconds of the first beyond the second."""
     length = float(t[-1]) - t0
     short = math.copysign(min(abs(length), WARM_STEPS * step), length)
     times = t0 + (t - t0) * (short / length)

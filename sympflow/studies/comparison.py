@@ -26,17 +26,8 @@ from sympflow.metrics.reference import reference as compute_reference
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies import attempts
-from sympflow.studies.attempts import (
-    Attempt,
-    Candidate,
-    Metric,
-    Row,
-    candidates,
-    interleaved,
-    shown_compile_time,
-    tolerance_of,
-)
-from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table
+from sympflow.studies.attempts import CELLS, Attempt, Candidate, Metric, Row, candidates, interleaved, tolerance_of
+from sympflow.studies.reports import Column, Report, described, seconds, text_table
 from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
@@ -212,11 +203,7 @@ def _instants(reference: object, t0: float, t1: float, n: int, dt: float) -> np.
 
 
 def _given(
-    reference: Reference | Solution | ArrayLike,
-    system: HamiltonianSystem,
-    t0: float,
-    y0: np.ndarray,
-    t: np.ndarray,
+    reference: Reference | Solution | ArrayLike, system: HamiltonianSystem, t0: float, y0: np.ndarray, t: np.ndarray
 ) -> Reference:
     """The reference that was given, if it is one and fits."""
     if isinstance(reference, Reference | Solution):
@@ -304,22 +291,18 @@ def _match(
     for one in runs:
         if anchor is None or one is anchor or one.row.status == "not applicable":
             continue
-        if not tunable(one.candidate.integrator):
+        integrator = one.candidate.integrator
+        if integrator.trained or not (isinstance(integrator, FixedStep) or tolerance_of(integrator) is not None):
             one.note(f"Not matched: {one.candidate.label} has no step to tune.")
             continue
         say(f"{system.name}: matching {one.candidate.label}")
-        integrator, reached = matched(one.candidate.integrator, system, figure, target, what == "energy_error")
+        integrator, reached = matched(integrator, system, figure, target, what == "energy_error")
         one.candidate = replace(one.candidate, integrator=integrator)
         row = Row(_identify(system), one.candidate.method, one.candidate.label)
         one.row = replace(row, compile_time=one.row.compile_time)
         one.run(run)
         if not abs(math.log(reached / target)) < 0.1:
             one.note(f"Matched only to {reached:.2g} where {anchor.candidate.label} has {target:.2g}.")
-
-
-def tunable(integrator: Integrator) -> bool:
-    """Tell whether the method has a step or a tolerance that may be changed; a trained flow has none."""
-    return not integrator.trained and (isinstance(integrator, FixedStep) or tolerance_of(integrator) is not None)
 
 
 def tuned(integrator: Integrator, system: HamiltonianSystem, factor: float) -> Integrator:
@@ -340,19 +323,7 @@ def matched(
     target: float,
     grows: bool,
 ) -> tuple[Integrator, float]:
-    """Tune the integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure.
-
-    Parameters
-    ----------
-    measure : callable
-        A positive figure of a run; inf if the run fails, which asks for smaller steps.
-    grows : bool
-        True if the figure grows with the step (an error), False if it falls (a cost).
-
-    Notes
-    -----
-    The secant method on the logarithms, safeguarded by the nearest points found on either side.
-    """
+    """Tune an integrator until `measure` is within 5 % of `target`; return the nearest found, and its figure."""
     x, slope = 0.0, (2.0 if grows else -1.0)
     below: tuple[float, float] | None = None  # (x, f) with too small a step, and with too large a one
     above: tuple[float, float] | None = None
@@ -407,17 +378,16 @@ class Comparison(Report):
 
     columns: ClassVar[tuple[str, ...]] = (
         *("system", "method", "label", "status", "reason", "dt", "tolerance", "backend", "run_time", "run_time_spread"),
+        *("compile_time", "force_evaluations", "hessian_evaluations", "error", "energy_error", "balance_error"),
         *(
-            "compile_time",
-            "force_evaluations",
-            "hessian_evaluations",
-            "error",
-            "energy_error",
-            "balance_error",
             "energy_drift",
             "energy_drift_error",
+            "volume_error",
+            "symplecticity_defect",
+            "conformal_defect",
+            "time_reversal_error",
         ),
-        *("volume_error", "symplecticity_defect", "conformal_defect", "time_reversal_error", "training_time"),
+        "training_time",
     )
 
     system: HamiltonianSystem
@@ -484,10 +454,7 @@ class Comparison(Report):
 
 
 def combined_table(comparisons: Sequence[Comparison], width: int | None = None) -> str:
-    """The rows of several comparisons as one table, with the settings above and the reasons below.
-
-    Where `width` characters do not hold it, there is a table for each system with the methods as columns.
-    """
+    """The rows of several comparisons as one table; the methods as columns where `width` does not hold it."""
     rows = [row for c in comparisons for row in c.rows]
     several = len(comparisons) > 1
     names = [c.title for c in comparisons for _ in c.rows]
@@ -518,25 +485,8 @@ def _upright(columns: Sequence[Column]) -> str:
 
 
 def _columns(rows: Sequence[Row]) -> list[Column]:
-    return [
-        Column("method", [row.label for row in rows], left=True),
-        Column("step", [_step(row) for row in rows]),
-        Column("backend", [row.backend or "" for row in rows], left=True),
-        Column("run time", [_run_time(row) for row in rows]),
-        Column("forces", [f"{row.force_evaluations:,}" if row.force_evaluations else "" for row in rows]),
-        Column("Hessians", [f"{row.hessian_evaluations:,}" if row.hessian_evaluations else "" for row in rows]),
-        Column("error", [number(row.error) for row in rows]),
-        Column("energy error", [number(row.energy_error) for row in rows]),
-        Column("energy balance", [number(row.balance_error) for row in rows]),
-        Column("drift per unit t", [_with_error(row.energy_drift, row.energy_drift_error) for row in rows]),
-        Column("volume error", [number(row.volume_error) for row in rows]),
-        Column("sympl. defect", [number(row.symplecticity_defect) for row in rows]),
-        Column("conf. defect", [number(row.conformal_defect) for row in rows]),
-        Column("reversal", [number(row.time_reversal_error) for row in rows]),
-        Column("training", [seconds(row.training_time) for row in rows]),
-        Column("compiled in", [shown_compile_time(row) for row in rows]),
-        Column("status", ["" if row.status == "ok" else row.status for row in rows], left=True),
-    ]
+    titles = [title for title in CELLS if title not in ("batch", "rtol", "±", "steps", "leaves domain at t")]
+    return attempts.columns(rows, titles, {"step": _step, "run time": _run_time})
 
 
 def _settings(c: Comparison) -> str:
@@ -550,14 +500,11 @@ def _settings(c: Comparison) -> str:
 
 
 def _step(row: Row) -> str:
-    return plain(row.dt) if row.dt is not None else f"rtol {row.tolerance:.0e}" if row.tolerance is not None else ""
+    rtol = CELLS["rtol"](row)
+    return CELLS["step"](row) or (f"rtol {rtol}" if rtol else "")
 
 
 def _run_time(row: Row) -> str:
     if not row.run_time or row.run_time_spread is None:
         return ""
     return f"{seconds(row.run_time)} ± {100 * row.run_time_spread / row.run_time:2.0f} %"
-
-
-def _with_error(value: float | None, error: float | None) -> str:
-    return "" if value is None else f"{number(value)} ± {number(error, 1)}"

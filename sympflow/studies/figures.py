@@ -16,17 +16,7 @@ from sympflow.hamiltonian.scales import smallest_size
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.registry import build
 from sympflow.metrics.crossings import Plane, crossings, stroboscopic, whole_periods
-from sympflow.show.style import (
-    TEXT,
-    dress,
-    filled,
-    frame,
-    labelled,
-    legend_above,
-    method_styles,
-    new_figure,
-    save,
-)
+from sympflow.show.style import TEXT, dress, filled, frame, labelled, legend_above, method_styles, new_figure, save
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies.attempts import Attempt, Row, any_step
@@ -74,17 +64,7 @@ class Compared(Protocol):
 
 
 def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
-    """One figure of a comparison: "overview", "energy", "volume", "error" or "portrait".
-
-    The overview of a comparison that measured none of its panels is the portrait.
-
-    Raises
-    ------
-    ValueError
-        For an unknown kind, or one whose metric was not asked for.
-    ImportError
-        Without matplotlib.
-    """
+    """One figure of a comparison, of the kinds in `KINDS`; a ValueError if it was not measured."""
     check_one_of("kind", kind, KINDS)
     if kind == "overview":
         return portrait(comparison) if _drawable(comparison) == ("portrait",) else overview([comparison])
@@ -104,13 +84,7 @@ def comparison_figure(comparison: Compared, kind: str = "overview") -> Figure:
 def save_comparison(
     comparison: Compared, path: str | os.PathLike[str], kind: str = "overview", prefix: str = ""
 ) -> list[Path]:
-    """Save one figure to a file (.png, .pdf or .svg); into a folder the overview saves every kind that was measured.
-
-    Returns
-    -------
-    list of Path
-        The files written.
-    """
+    """Save one figure to a file; into a folder the overview saves every kind that was measured. The files written."""
     path = Path(path)
     if path.suffix.lower() in FIGURE_FILES:
         return [save(comparison_figure(comparison, kind), path)]
@@ -121,10 +95,7 @@ def save_comparison(
 
 
 def overview(comparisons: Sequence[Compared]) -> Figure:
-    """One row for each system: error against run time, energy error over time, volume error over time.
-
-    Panels of metrics that were not asked for are left out.
-    """
+    """One row for each system: error against run time, energy and volume errors over time, as far as asked for."""
     kinds = [k for k in _PANELS if any(k in _panels(c) for c in comparisons)]
     if not kinds:
         raise ValueError("`comparisons` hold nothing to draw: ask compare() for 'error', 'energy' or 'volume'.")
@@ -279,13 +250,7 @@ def _annotate(ax: Axes, points: Sequence[tuple[float, float, str]], styles: dict
         _, dx, dy, align, low = min(choices, key=lambda choice: choice[0])
         placed.append((low, low + size))
         ax.annotate(
-            label,
-            (x, y),
-            xytext=(dx, dy),
-            textcoords="offset points",
-            ha=align,
-            fontsize=8,
-            color=styles[label][0],
+            label, (x, y), xytext=(dx, dy), textcoords="offset points", ha=align, fontsize=8, color=styles[label][0]
         )
 
 
@@ -308,11 +273,7 @@ def _overlap(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.nda
 
 
 def portrait(comparison: Compared) -> Figure:
-    """Phase space, a panel for each method with the reference behind in grey.
-
-    One degree of freedom: the orbit in the (q, p) plane. Two: the Poincaré section q₁ = 0 with q₁ increasing along the
-    run, on each method's own map. More: q₁ against q₂. Of a driven system the states after each period, q₁ against p₁.
-    """
+    """Phase space, a panel for each method with the reference in grey: (q, p), the section q₁ = 0, or q₁ against q₂."""
     system = comparison.system
     runs = [run for run in comparison.runs if run.sol is not None]
     rows = -(-len(runs) // 5)
@@ -330,16 +291,9 @@ def portrait(comparison: Compared) -> Figure:
     for k, (ax, run) in enumerate(zip(axes.flat, runs, strict=False)):
         points = _phase_points(comparison, run.sols[0].integrator)
         ax.plot(*truth.T, ".", color="#C8C8C8", ms=8 if system.ndof == 2 else 2.5, mew=0, zorder=1, rasterized=True)
-        ax.plot(
-            *points.T,
-            ".",
-            color=styles[run.row.label][0],
-            ms=2.2 if len(points) > 100 else 4,
-            mew=0,
-            zorder=2,
-            rasterized=True,
-        )
-        ax.set_title(filled(run.row.label, 2.2, 9), fontsize=9, color=styles[run.row.label][0])
+        colour, size = styles[run.row.label][0], 2.2 if len(points) > 100 else 4
+        ax.plot(*points.T, ".", color=colour, ms=size, mew=0, zorder=2, rasterized=True)
+        ax.set_title(filled(run.row.label, 2.2, 9), fontsize=9, color=colour)
         lowest = k + columns >= len(runs)  # nothing below it, or an empty place
         dress(ax, x_label if lowest else "", y_label if k % columns == 0 else "")
         ax.tick_params(labelbottom=lowest)
@@ -384,15 +338,7 @@ def _reference_points(comparison: Compared) -> np.ndarray:
 
 
 def precision_figure(rows: Sequence[Row], heading: str, measure: str = "energy_error") -> Figure:
-    """Cost against error, log–log: run time on the left, evaluations on the right; a row for each batch size.
-
-    Points whose error the reference cannot resolve are hollow. Trained flows have no evaluations of the force.
-
-    Raises
-    ------
-    ValueError
-        For another measure than "energy_error", "balance_error" or "error".
-    """
+    """Cost against error, log–log: run time and evaluations; a row for each batch size."""
     check_one_of("measure", measure, MEASURES)
     sizes = sorted({row.trajectories for row in rows})
     figure = new_figure(9.6, 0.8 + 3.9 * len(sizes))
@@ -490,15 +436,7 @@ def _shown(row: Row) -> float:
 def stability_map(
     all_rows: Sequence[Row], limits: Mapping[str, Sequence[tuple[float, float]]], missing: Sequence[str]
 ) -> Figure:
-    """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing.
-
-    Parameters
-    ----------
-    limits : mapping
-        For each label the points (longest stable step, stiffness) of its line.
-    missing : sequence of str
-        Sentences on the methods without a limit, for the foot of the figure.
-    """
+    """A panel for each method: step against stiffness, coloured by energy error; × where it says nothing."""
     from matplotlib.colors import LogNorm
 
     labels = list(dict.fromkeys(r.label for r in all_rows if r.energy_error is not None and r.dt is not None))
@@ -546,16 +484,8 @@ def section_figure(
     """Points (n, 2) of a section, each trajectory in a shade of its own."""
     figure = new_figure(4.6, 4.4)
     ax = figure.add_subplot()
-    ax.scatter(
-        points[:, 0],
-        points[:, 1],
-        c=trajectory,
-        cmap="viridis",
-        s=3.0,
-        linewidths=0,
-        vmax=max(1.15 * (n_trajectories - 1), 1),
-        rasterized=True,
-    )
+    shades: dict[str, Any] = {"c": trajectory, "cmap": "viridis", "vmax": max(1.15 * (n_trajectories - 1), 1)}
+    ax.scatter(points[:, 0], points[:, 1], s=3.0, linewidths=0, rasterized=True, **shades)
     frame(ax, points, 0.05)
     ax.set_title(filled(heading, 4.0, 9), fontsize=9, color=TEXT)
     dress(ax, *axes)

@@ -27,8 +27,8 @@ from sympflow.show.style import saved
 from sympflow.solution import Solution
 from sympflow.solver import solve
 from sympflow.studies import attempts
-from sympflow.studies.attempts import Attempt, Candidate, Row, candidates, interleaved, shown_compile_time, tolerance_of
-from sympflow.studies.reports import Column, Report, described, number, plain, seconds, text_table
+from sympflow.studies.attempts import CELLS, Attempt, Candidate, Row, candidates, counted, interleaved, tolerance_of
+from sympflow.studies.reports import Column, Report, described, seconds, text_table
 from sympflow.systems.given import GivenSystem, given_system
 
 if TYPE_CHECKING:
@@ -196,10 +196,7 @@ class Conditions:
         return measure_of(self.system)
 
     def run(self, integrator: Any, t_span: tuple[float, float] | None = None, t: np.ndarray | None = None) -> Solution:
-        """The solution from all initial states, or of a method that takes them one by one from a few.
-
-        Over another interval if that is given.
-        """
+        """The solution from all initial states, or of a method that takes them one by one from a few."""
         few = integrator.one_by_one and self.trajectories > SAMPLE
         y0 = self.y0[:SAMPLE] if few else self.y0
         times = self.t if t is None else t
@@ -215,16 +212,21 @@ def _measure(
 ) -> tuple[list[Row], Reference | None]:
     """All points for one set of initial states."""
     say("reference")
-    truth, problem = _reference(conditions)
+    truth, problem = None, ""
+    try:
+        truth = compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t)
+    except (ValueError, RuntimeError) as why:
+        problem = str(why)
     resolved = MARGIN * (0.0 if truth is None or truth.accuracy is None else truth.accuracy)
     floor = FLOOR if conditions.measure in _KEPT else max(FLOOR, resolved)
     points: list[Attempt] = []
     for candidate, integrators in swept:
         say(candidate.label)
         error = math.inf
-        compile_time = _compiled(replace(candidate, integrator=integrators[-1]), conditions)
+        last = Attempt(replace(candidate, integrator=integrators[-1]), Row("", "", ""))
+        last.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
         for integrator in integrators:
-            point = _first(replace(candidate, integrator=integrator), conditions, compile_time)
+            point = _first(replace(candidate, integrator=integrator), conditions, last.row.compile_time)
             points.append(point)
             if truth is None:
                 point.note(f"No error: {problem}")
@@ -247,17 +249,10 @@ def _measure(
     return [point.row for point in points], truth
 
 
-def _compiled(candidate: Candidate, conditions: Conditions) -> float | None:
-    """Compile all that the points of a method run; the seconds that it took, None if it does not run."""
-    point = Attempt(candidate, Row(conditions.system.name, candidate.method, candidate.label))
-    point.warm_up(conditions.run, conditions.t, conditions.t_span[0], conditions.system.dt)
-    return point.row.compile_time
-
-
 def _first(candidate: Candidate, conditions: Conditions, compile_time: float | None) -> Attempt:
     """The first run of a point."""
-    row = Row(conditions.system.name, candidate.method, candidate.label, trajectories=conditions.trajectories)
-    point = Attempt(candidate, replace(row, compile_time=compile_time))
+    more: dict[str, Any] = {"trajectories": conditions.trajectories, "compile_time": compile_time}
+    point = Attempt(candidate, Row(conditions.system.name, candidate.method, candidate.label, **more))
     point.run(conditions.run)
     if (sol := point.sol) is None:
         return point
@@ -282,16 +277,7 @@ def _scale(point: Attempt, few: int, all_of_them: int) -> None:
     point.note(f"Timed on {few} trajectories, which the method takes one by one.")
 
 
-def _reference(conditions: Conditions) -> tuple[Reference | None, str]:
-    """The reference; None and the reason where there is none."""
-    try:
-        return compute_reference(conditions.system, conditions.t_span, conditions.y0, conditions.t), ""
-    except (ValueError, RuntimeError) as problem:
-        return None, str(problem)
-
-
-SETTINGS = ("dt", "tolerance")
-"""Settings of a method: the largest that reaches an error is the cheapest."""
+SETTINGS = ("dt", "tolerance")  # settings of a method: the largest that reaches an error is the cheapest
 
 
 # read off the points --------------------------------------------------------------------------------------------------
@@ -324,11 +310,7 @@ def _figure(point: Row, measure: str) -> float:
 
 
 def cost_at(points: Sequence[Row], error: float, cost: str = "run_time", measure: str = "energy_error") -> float:
-    """Return the cost of one method for an error: between two of its points by interpolation of the logarithms.
-
-    The cheapest point that is more accurate is taken where that costs less; inf if no point is accurate enough. A step
-    or a tolerance is the largest that reaches the error.
-    """
+    """The cost of one method for an error, by interpolation of the logarithms; inf if no point is accurate enough."""
     known = [(getattr(p, measure), getattr(p, cost)) for p in points]
     known = sorted((e, c) for e, c in known if e and c and math.isfinite(e))
     best = max if cost in SETTINGS else min
@@ -397,51 +379,32 @@ class WorkPrecision(Report):
         ]
         notes = dict.fromkeys(f"  {row.label}: {row.reason}" for row in self.rows if row.reason)
         below = ["\n".join(["Notes", *notes])] if notes else []
-        return "\n\n".join(["\n".join(heading), *blocks, "Every point\n\n" + self._points(), *below])
+        titles = ("method", "batch", "step", "rtol", "backend", "run time", "±", "forces", "Hessians")
+        errors = ("error", "energy error", "energy balance", "status")
+        points = text_table(attempts.columns(self.rows, titles + errors))
+        return "\n\n".join(["\n".join(heading), *blocks, f"Every point\n\n{points}", *below])
 
     def _at(self, size: int, levels: tuple[float, ...]) -> str:
         rows = [row for row in self.rows if row.trajectories == size]
         labels = list(dict.fromkeys(row.label for row in rows))
         columns = [Column("method", labels, left=True)]
         for level in levels:
-            for cost, show in (("force_evaluations", _count), ("run_time", seconds)):
+            for cost, show in (("force_evaluations", counted), ("run_time", seconds)):
                 found = [cost_at([r for r in rows if r.label == label], level, cost, self.measure) for label in labels]
                 head = f"{level:.0e}" if cost == "run_time" else "forces"
                 columns.append(Column(head, [show(x) if math.isfinite(x) else "–" for x in found]))
             columns.append(Column("step", [self._setting([r for r in rows if r.label == n], level) for n in labels]))
         first = {row.label: row for row in reversed(rows)}
-        first = {label: first[label] for label in labels}
         trained = {row.label: row for row in rows if row.training_time is not None}
-        columns.append(Column("training", [seconds(trained[n].training_time) if n in trained else "" for n in labels]))
-        paid = [_paid(trained[n].break_even) if n in trained else "" for n in labels]
-        columns.append(Column("paid after t =", paid))
-        columns.append(Column("compiled in", [shown_compile_time(r) for r in first.values()]))
-        return text_table(columns)
+        for title in ("training", "paid after t ="):
+            cell = CELLS.get(title, _paid)
+            columns.append(Column(title, [cell(trained[n]) if n in trained else "" for n in labels]))
+        return text_table([*columns, *attempts.columns([first[n] for n in labels], ["compiled in"])])
 
     def _setting(self, rows: list[Row], level: float) -> str:
         """The step with which a method reaches a level, or its tolerance."""
         step, rtol = (cost_at(rows, level, setting, self.measure) for setting in SETTINGS)
         return f"rtol {rtol:.0e}" if rtol < math.inf else f"{step:.2g}" if step < math.inf else ""
-
-    def _points(self) -> str:
-        rows = self.rows
-        return text_table(
-            [
-                Column("method", [r.label for r in rows], left=True),
-                Column("batch", [f"{r.trajectories:,}" for r in rows]),
-                Column("step", [plain(r.dt) for r in rows]),
-                Column("rtol", ["" if r.tolerance is None else f"{r.tolerance:.0e}" for r in rows]),
-                Column("backend", [r.backend or "" for r in rows], left=True),
-                Column("run time", [seconds(r.run_time) for r in rows]),
-                Column("±", [seconds(r.run_time_spread) for r in rows]),
-                Column("forces", [_count(r.force_evaluations) for r in rows]),
-                Column("Hessians", [_count(r.hessian_evaluations or None) for r in rows]),
-                Column("error", [number(r.error) for r in rows]),
-                Column("energy error", [number(r.energy_error) for r in rows]),
-                Column("energy balance", [number(r.balance_error) for r in rows]),
-                Column("status", ["" if r.status == "ok" else r.status for r in rows], left=True),
-            ]
-        )
 
     def settings(self) -> dict[str, Any]:
         return {
@@ -478,9 +441,6 @@ def _size(n: int) -> str:
     return "one trajectory" if n == 1 else f"a batch of {n:,}"
 
 
-def _count(x: float | None) -> str:
-    return "" if not x else f"{x:,.0f}"
-
-
-def _paid(x: float | None) -> str:
+def _paid(row: Row) -> str:
+    x = row.break_even
     return "" if x is None else "never" if x == math.inf else f"{x:.2g}"

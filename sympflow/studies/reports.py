@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 class Report(Shown):
     """The result of a study. A subclass gives its rows, settings, table and figure."""
 
-    columns: ClassVar[tuple[str, ...]]
-    """The fields of the rows that files hold, in this order."""
+    columns: ClassVar[tuple[str, ...]]  # the fields of the rows that files hold, in this order
 
     if TYPE_CHECKING:  # a field of some reports, a property of others
 

@@ -37,15 +37,7 @@ from sympflow.systems.textbook import (
     spring_pendulum,
 )
 from sympflow.systems.user_files import from_toml
-from sympflow.systems.waves import (
-    fput_beta,
-    grid,
-    nonlinear_schroedinger,
-    phi4,
-    sine_gordon,
-    toda_chain,
-    wave_equation,
-)
+from sympflow.systems.waves import fput_beta, grid, nonlinear_schroedinger, phi4, sine_gordon, toda_chain, wave_equation
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -53,7 +45,7 @@ if TYPE_CHECKING:
 GROUP = "sympflow.systems"
 """The entry-point group in which a distribution announces its systems: `name = "package.module:factory"`."""
 
-SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
+SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {  # the built-in scenes by the name that the command line uses
     "harmonic-oscillator": harmonic_oscillator,
     "henon-heiles": henon_heiles,
     "henon-heiles-escape": henon_heiles_escape,
@@ -88,7 +80,6 @@ SYSTEMS: dict[str, Callable[..., HamiltonianSystem]] = {
     "toda-chain": toda_chain,
     "fput-beta": fput_beta,
 }
-"""The built-in scenes by the name that the command line uses."""
 
 _registered: dict[str, Callable[..., HamiltonianSystem]] = {}
 

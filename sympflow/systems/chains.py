@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -51,15 +52,9 @@ def fput(omega: float = 50.0, m: int = 3) -> HamiltonianSystem:
     y0 = np.zeros(4 * m)
     y0[[0, m, 2 * m, 3 * m]] = 1.0, 1 / omega, 1.0, 1.0
     high = np.repeat([1.7, 1.7 / omega, 1.7, 1.7], m)
-    return HamiltonianSystem.from_sympy(
-        f"({kinetic})/2 + omega**2*({stiff})/2 + ({' + '.join(soft)})/4",
-        params={"omega": omega},
-        name="fput",
-        domain=Box(-high, high),
-        y0=y0,
-        t_span=(0.0, 200.0),
-        dt=0.05 / omega,
-    )
+    H = f"({kinetic})/2 + omega**2*({stiff})/2 + ({' + '.join(soft)})/4"
+    scene: dict[str, Any] = {"domain": Box(-high, high), "y0": y0, "t_span": (0.0, 200.0), "dt": 0.05 / omega}
+    return HamiltonianSystem.from_sympy(H, params={"omega": omega}, name="fput", **scene)
 
 
 def oscillatory_energies(system: HamiltonianSystem, y: Array) -> Array:
@@ -109,11 +104,7 @@ def toda_lattice(n: int = 3) -> HamiltonianSystem:
     y0 = np.zeros(2 * n)
     y0[n], y0[n + 1 :] = 1.0, -1 / (n - 1)
     return HamiltonianSystem.from_sympy(
-        f"({kinetic})/2 + {springs} - {n}",
-        name="toda_lattice",
-        domain=Ball(np.zeros(2 * n), 2.0),
-        y0=y0,
-        dt=0.05,
+        f"({kinetic})/2 + {springs} - {n}", name="toda_lattice", domain=Ball(np.zeros(2 * n), 2.0), y0=y0, dt=0.05
     )
 
 
@@ -129,24 +120,20 @@ def lax_eigenvalues(y: Array) -> np.ndarray:
     return np.linalg.eigvalsh(p[..., None] / 2 * np.eye(n) + to_next + to_next.swapaxes(-1, -2))
 
 
-EPSILON = 119.8
-"""Depth of the potential in kelvin (times Boltzmann's constant)."""
+EPSILON = 119.8  # depth of the potential in kelvin (times Boltzmann's constant)
 
-SIGMA = 0.341
-"""Distance at which the potential is zero, in nanometres."""
+SIGMA = 0.341  # distance at which the potential is zero, in nanometres
 
 MASS = 66.34e-27 / 1.380658e-23
 """The mass of an atom, in K·ns²/nm²: kilograms over Boltzmann's constant, 1 nm/ns being 1 m/s."""
 
-POSITIONS = np.array(
+POSITIONS = np.array(  # in nanometres: one atom in the middle, six around it
     [[0.0, 0.0], [0.02, 0.39], [0.34, 0.17], [0.36, -0.21], [-0.02, -0.40], [-0.35, -0.16], [-0.31, 0.21]]
 )
-"""In nanometres: one atom in the middle, six around it."""
 
-VELOCITIES = np.array(
+VELOCITIES = np.array(  # in nanometres per nanosecond
     [[-30.0, -20.0], [50.0, -90.0], [-70.0, -60.0], [90.0, 40.0], [80.0, 90.0], [-40.0, 100.0], [-80.0, -60.0]]
 )
-"""In nanometres per nanosecond."""
 
 
 def lennard_jones() -> HamiltonianSystem:
@@ -170,14 +157,7 @@ def lennard_jones() -> HamiltonianSystem:
     """
     y0 = np.concatenate([POSITIONS.ravel(), MASS * VELOCITIES.ravel()])
     rest = np.concatenate([POSITIONS.ravel(), np.zeros(14)])
-    return HamiltonianSystem.pairs(
-        "4*epsilon*((sigma/r)**12 - (sigma/r)**6)",
-        masses=np.full(7, MASS),
-        dim=2,
-        params={"epsilon": EPSILON, "sigma": SIGMA},
-        name="lennard_jones",
-        domain=Tube([rest, rest], np.repeat([0.15, 3.5], 14)),
-        y0=y0,
-        t_span=(0.0, 0.2),
-        dt=4e-5,
-    )
+    V, params = "4*epsilon*((sigma/r)**12 - (sigma/r)**6)", {"epsilon": EPSILON, "sigma": SIGMA}
+    domain = Tube([rest, rest], np.repeat([0.15, 3.5], 14))
+    scene: dict[str, Any] = {"name": "lennard_jones", "domain": domain, "y0": y0, "t_span": (0.0, 0.2), "dt": 4e-5}
+    return HamiltonianSystem.pairs(V, masses=np.full(7, MASS), dim=2, params=params, **scene)

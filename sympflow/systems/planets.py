@@ -12,10 +12,9 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 PLANETS = ("Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
 UNITS = "AU", "day", "solar mass"
 
-SUN_OVER_PLANET = np.array(
+SUN_OVER_PLANET = np.array(  # the Sun's mass over that of each planet with its moons, DE405
     [6_023_600.0, 408_523.71, 328_900.561400, 3_098_708.0, 1047.3486, 3497.898, 22_902.98, 19_412.24]
 )
-"""The Sun's mass over that of each planet with its moons, DE405."""
 
 TABLE = np.array(
     [  # a in AU, e, inclination, mean longitude, longitude of the perihelion, longitude of the node in degrees

@@ -19,14 +19,13 @@ from sympflow.hamiltonian.lattice_states import LatticeStates
 from sympflow.hamiltonian.scene import UNNAMED
 from sympflow.hamiltonian.system import HamiltonianSystem
 
-DOMAINS: dict[str, tuple[str, ...]] = {
+DOMAINS: dict[str, tuple[str, ...]] = {  # the kinds of domains in a TOML file, and the keys of each
     "Ball": ("center", "radius"),
     "Box": ("low", "high"),
     "EnergySublevel": ("energy", "box", "above", "angular_momentum"),
     "Tube": ("orbit", "radius", "groups"),
 }
-"""The kinds of domains in a TOML file, and the keys of each."""
-KEYS: dict[str, tuple[Any, str]] = {
+KEYS: dict[str, tuple[Any, str]] = {  # the keys of a TOML file: the type of each, and that in words
     "hamiltonian": (str, "a formula in quotes, such as 'p**2/2 - cos(q)'"),
     "params": (dict, "a table of numbers, such as { omega = 2.0 }"),
     "time": (str, "the name of the time in the formula, such as 't'"),
@@ -39,7 +38,6 @@ KEYS: dict[str, tuple[Any, str]] = {
     "energy_scale": (float, "a number"),
     "domain": (dict, "a table with a kind, such as { kind = 'Box', low = [-1, -1], high = [1, 1] }"),
 }
-"""The keys of a TOML file: the type of each, and that in words."""
 
 
 def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSystem:
@@ -82,11 +80,7 @@ def from_toml(path: str | os.PathLike[str], **params: float) -> HamiltonianSyste
 
 
 def factory(path: str | os.PathLike[str], name: str | None = None) -> Callable[..., HamiltonianSystem]:
-    """The function that makes the system of a file; its parameters are those of the system, with their defaults.
-
-    A .py file is run, as `python file.py` would, but for its ``__main__`` part; the name is that of a HamiltonianSystem
-    in it, or of a function that returns one, and may be left out where there is one only.
-    """
+    """The function that makes the system of a file, of a name in it if it is one of Python, which is run for it."""
     file = Path(path)
     if file.suffix == ".toml":
         return _of_toml(file, name)

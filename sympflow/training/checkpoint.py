@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from sympflow.arguments import put_file
 from sympflow.storage.identity import digest
 
 if TYPE_CHECKING:
@@ -18,18 +19,7 @@ if TYPE_CHECKING:
     from sympflow.hamiltonian.system import HamiltonianSystem
 
 FORMAT = 1
-FIELDS = {
-    "format",
-    "config",
-    "architecture",
-    "system",
-    "step",
-    "flow",
-    "best",
-    "optimizer",
-    "history",
-    "seconds",
-}
+FIELDS = {"format", "config", "architecture", "system", "step", "flow", "best", "optimizer", "history", "seconds"}
 
 
 def identity(flow: FlowMap, system: HamiltonianSystem, config: dict[str, Any]) -> dict[str, Any]:
@@ -76,18 +66,10 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 def write(path: str | os.PathLike[str], state: dict[str, Any]) -> None:
     """Write `state` to a new file beside `path`, then put it in place in one step."""
-    path = Path(path)
+    path, content = Path(path), io.BytesIO()
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            torch.save({"format": FORMAT, **state}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    torch.save({"format": FORMAT, **state}, content)
+    put_file(path, content.getvalue())
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:

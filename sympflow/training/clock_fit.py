@@ -1,14 +1,8 @@
-"""The training of a flow's clock: the times that the exact solution takes to where a scheme comes, by least squares.
-
-A splitting scheme on a logarithmic Hamiltonian comes in a step s from x to a state near the orbit through x, and holds
-a time for it. The label is the time at which the exact solution in the physical time is nearest to that state; the
-clock is linear in its numbers.
-"""
+"""The training of a flow's clock: the times that the exact solution takes to where a scheme comes, by least squares."""
 
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,9 +13,6 @@ from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.fingerprint import Identity
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import default_shift, lifted, projected, time_scale, time_transformed
-from sympflow.integrators.flows import LogSympFlow
-from sympflow.metrics.energy import max_energy_error
-from sympflow.solver import solve
 from sympflow.training.fits import ClockedFit
 from sympflow.training.points import Stream, states, step_errors
 
@@ -63,13 +54,6 @@ def train_clock(system: HamiltonianSystem, fit: ClockedFit, domain: Domain) -> C
     flow.figures["training_seconds"] = round(time.perf_counter() - started, 3)
     flow.figures["training_cpu_seconds"] = round(time.process_time() - cpu, 3)
     return flow
-
-
-def energy_errors(flow: ClockedFlow, system: HamiltonianSystem, y0: np.ndarray, t_end: float, outputs: int) -> Any:
-    """The largest relative energy error of each run in the physical time, over equidistant outputs: (N,)."""
-    times = np.linspace(0.0, t_end, outputs + 1)
-    integrator = LogSympFlow(flow=flow, shift=flow.recipe["transforms"]["shift"])
-    return max_energy_error(solve(system, integrator, (0.0, t_end), y0, t_eval=times, on_domain_exit="ignore"))
 
 
 def _lateness(

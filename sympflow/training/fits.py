@@ -255,6 +255,10 @@ class Fit(_Options):
         described: Any = {f.name: f.default for f in fields(self) if f.name in self.of_flow()}
         return replace(self, **described)
 
+    def resolved(self, solver: Solver, kind: str) -> Self:
+        """The same with numbers for what is left open, of a flow of that kind."""
+        return self
+
     def flow(self, system: HamiltonianSystem, domain: Domain, earlier: FlowMap | None = None) -> Any:
         """The untrained flow; `earlier` is one that was trained before, whose numbers it may take over."""
         raise NotImplementedError
@@ -375,8 +379,7 @@ class PrimedFit(_LossFit):
         """The weights of the losses."""
         return self._named("labels" if self.loss is None else self.loss)
 
-    @property
-    def resolved(self) -> PrimedFit:
+    def resolved(self, solver: Solver | None = None, kind: str = "primed") -> PrimedFit:
         """The same with numbers for all weights."""
         return replace(self, loss="labels" if self.loss is None else self.loss, **self.weights)
 
@@ -479,8 +482,7 @@ class LossFit(_LossFit):
     kind: ClassVar[str] = "losses"
     OPEN: ClassVar[dict[str, int]] = {"steps": 200}
 
-    def resolved(self, solver: Solver, kind: str) -> LossFit:
-        """The same with numbers for what is left open, of a flow of that kind."""
+    def resolved(self, solver: Solver, kind: str) -> Self:
         if self.loss is not None:
             weights = self._named(self.loss)
         else:

@@ -275,6 +275,15 @@ def put_weights(parameters: Sequence[Tensor], x: Tensor) -> None:
         w.copy_(part.view_as(w))
 
 
+def check_parameters(flow: FlowMap, keeps: str) -> None:
+    """Raise ValueError where a flow has too many parameters for a dense matrix."""
+    if flow.n_parameters > MAX_PARAMETERS:
+        raise ValueError(
+            f"`optimizer` {keeps} and takes at most {MAX_PARAMETERS} parameters; the flow has {flow.n_parameters}: use "
+            "'lbfgs' or 'adam'."
+        )
+
+
 class GaussNewtonSteps:
     """Levenberg–Marquardt on the residuals of a flow, one accepted step at a time; it trains networks best.
 
@@ -285,11 +294,7 @@ class GaussNewtonSteps:
     needs_residuals: ClassVar[bool] = True
 
     def __init__(self, flow: FlowMap) -> None:
-        if flow.n_parameters > MAX_PARAMETERS:
-            raise ValueError(
-                f"`optimizer` 'gauss-newton' keeps a dense Jacobian and takes at most {MAX_PARAMETERS} parameters; the "
-                f"flow has {flow.n_parameters}: use 'lbfgs' or 'adam'."
-            )
+        check_parameters(flow, "'gauss-newton' keeps a dense Jacobian")
         self.parameters = list(flow.parameters())
         self.damping = Damping(FIRST_DAMPING, LEAST_DAMPING_OF_WEIGHTS)
         self.scale: Tensor | None = None  # D²
@@ -298,14 +303,8 @@ class GaussNewtonSteps:
         self.finished: str | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        return {
-            "damping": self.damping.value,
-            "growth": self.damping.growth,
-            "scale": self.scale,
-            "costs": self.costs,
-            "draw": self.draw,
-            "finished": self.finished,
-        }
+        told = {name: getattr(self, name) for name in ("scale", "costs", "draw", "finished")}
+        return {"damping": self.damping.value, "growth": self.damping.growth, **told}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         n, scale = sum(w.numel() for w in self.parameters), state["scale"]

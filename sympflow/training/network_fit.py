@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,10 +16,9 @@ from sympflow.flow.weights import check_memory
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.kernels.network_tangents import NetworkTangents
 from sympflow.training.fits import Adam, Resolved, Solver
 from sympflow.training.losses import Loss, Objective
-from sympflow.training.optimizers import MEMORY, Optimizer, optimizer
+from sympflow.training.optimizers import MEMORY, optimizer
 from sympflow.training.points import (
     BLOCK,
     Labelled,
@@ -41,43 +39,25 @@ VALIDATION_SHARE = 0.1  # of the time left, that a validation may take
 BACKWARD = 2.0  # times what a point takes in a validation, that it takes in a step at least
 
 
-@dataclass
 class LossRun(Run):
     """The state of such a fit, and what acts on it."""
 
     scaling: Scaling
-    fit: Resolved
-    loss: Loss
-    source: PointSource
-    held_out: Points
-    reference: tuple[Tensor, ...]
-    optimizer: Optimizer
-    tangents: NetworkTangents | None = None
-    step: int = 0
-    best: dict[str, Tensor] = field(default_factory=dict)
-    ended: bool = field(default=False, init=False)
-    reason: str | None = field(default=None, init=False)
-    step_seconds: float = field(default=0.0, init=False)
+    step = 0
+    ended = False
+    reason: str | None = None
+    step_seconds = 0.0
 
     UNIT: ClassVar[str] = "steps"
 
-    @classmethod
-    def start(
-        cls,
-        flow: FlowMap,
-        system: HamiltonianSystem,
-        domain: Domain,
-        scaling: Scaling,
-        fit: Resolved,
-        solver: Resolved,
-        deadline: Deadline | None = None,
-    ) -> LossRun:
-        """A run with fresh points, of a fit and a solver in which no choice is left open."""
-        method = optimizer(flow, solver)
+    def prepare(self, deadline: Deadline) -> None:
+        """Draw fresh points."""
+        flow, system, domain, fit, solver = self.flow, self.system, self.domain, self.fit, self.solver
+        self.best: dict[str, Tensor] = {}
+        self.optimizer = optimizer(flow, solver)
         _check_memory(flow, fit, solver)
         data: Labelled | None = fit.data
-        deadline = Session().deadline if deadline is None else deadline
-        loss = Loss(system, scaling, fit.residual_weight, fit.matching_weight, fit.label_weight)
+        self.loss = Loss(system, self.scaling, fit.residual_weight, fit.matching_weight, fit.label_weight)
         labels = unseen = None
         if fit.label_weight:
             if data is None:
@@ -86,9 +66,9 @@ class LossRun(Run):
                 labels, unseen = parted(data, fit.seed)
         common = (fit.matching_times, fit.seed, flow.dtype, flow.device)
         block = 1 if solver.refresh is None else BLOCK
-        source = PointSource(domain, flow.dt, fit.points, *common, block=block, labels=labels, system=system)
+        self.source = PointSource(domain, flow.dt, fit.points, *common, block=block, labels=labels, system=system)
         streams = (Stream.VALIDATION, Stream.VALIDATION)
-        held_out = PointSource(
+        self.held_out = PointSource(
             domain, flow.dt, fit.validation_points, *common, streams=streams, block=1, labels=unseen, system=system
         )(0)
         start = states(domain, fit.reference_states, fit.seed, Stream.REFERENCE)
@@ -96,9 +76,8 @@ class LossRun(Run):
         end = _end_of_step(system, start, flow.dt, deadline.part(LABEL_SHARE), t0)
         exists = np.isfinite(end).all(-1)
         known = (start, end) if t0 is None else (start, end, t0)
-        reference = tuple(torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in known)
-        tangents = flow.tangents() if method.needs_residuals else None
-        return cls(flow, system, domain, scaling, fit, solver, loss, source, held_out, reference, method, tangents)
+        self.reference = tuple(torch.as_tensor(a[exists], dtype=flow.dtype, device=flow.device) for a in known)
+        self.tangents = flow.tangents() if self.optimizer.needs_residuals else None
 
     @property
     def done(self) -> int:
@@ -121,7 +100,7 @@ class LossRun(Run):
             began = session.passed
             with torch.no_grad():
                 self.loss.terms(self.flow, self.held_out)
-            each = (session.passed - began) / len(self.held_out.t)
+            each = (session.passed - began) / len(self.held_out.residual[0])
             self.step_seconds = BACKWARD * each * max(self.fit.points - PROBE, 0)
         if not math.isfinite(self.history[0]["loss"]):
             raise FloatingPointError(
@@ -238,7 +217,7 @@ class LossRun(Run):
 
     def _affordable(self, deadline: Deadline) -> Points:
         """The held-out points, or fewer where a validation of all takes more than its share of the time."""
-        points, n = self.held_out, len(self.held_out.t)
+        points, n = self.held_out, len(self.held_out.residual[0])
         if deadline.end == math.inf or n <= PROBE:
             return points
         m, session = PROBE, deadline.session
@@ -278,11 +257,10 @@ def _check_memory(flow: FlowMap, fit: Resolved, solver: Solver) -> None:
 
 def _first(points: Points, n: int) -> Points:
     """The first n points, and of the other losses as large a share."""
-    m = max(2, points.matching_x.shape[1] * n // len(points.t))
+    t, x, *t0 = points.matching
+    m = max(2, x.shape[1] * n // len(points.residual[0]))
     labels = None if points.labels is None else tuple(a[:n] for a in points.labels)
-    t0 = None if points.t0 is None else points.t0[:n]
-    matching = points.matching_t, points.matching_x[:, :m]
-    return Points(points.t[:n], points.x[:n], *matching, labels, t0, points.matching_t0)
+    return Points(tuple(a[:n] for a in points.residual), (t, x[:, :m], *t0), labels)
 
 
 def _end_of_step(
@@ -309,8 +287,7 @@ def _labels(
     unseen = max(1, fit.validation_points // fit.label_times)
     sets = []
     for n, stream in ((fit.points, Stream.LABELS), (unseen, Stream.VALIDATION)):
-        t0 = start_times(system, dt, n, fit.seed, stream)
-        labels = Labels.needed(system, states(domain, n, fit.seed, stream), t, deadline, t0)
+        labels = Labels.drawn(system, domain, n, fit.seed, stream, t, deadline)
         x = np.broadcast_to(labels.x, labels.y.shape).reshape(-1, labels.x.shape[1])
         begun = () if labels.t0 is None else (np.tile(labels.t0, len(t)),)
         sets.append((np.repeat(t, len(labels.x)), x, labels.y.reshape(x.shape), *begun))

@@ -1,7 +1,4 @@
-"""The optimizers of losses: one small class each, chosen by `optimizer`.
-
-Gauss–Newton, which needs residuals, is in `least_squares`.
-"""
+"""The optimizers of losses: one small class each; Gauss–Newton, which needs residuals, is in `least_squares`."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from torch import Tensor
 from sympflow.flow.flow_map import FlowMap
 from sympflow.training import fits
 from sympflow.training.fits import Solver
-from sympflow.training.least_squares import MAX_PARAMETERS, GaussNewtonSteps, put_weights, weight_vector
+from sympflow.training.least_squares import GaussNewtonSteps, check_parameters, put_weights, weight_vector
 from sympflow.training.losses import Objective
 from sympflow.training.session import OutOfTime
 
@@ -111,21 +108,14 @@ class LBFGSSteps(_TorchSteps):
 class BFGSSteps:
     """BFGS with Oren and Luenberger's self-scaling, limited to growth of the inverse Hessian B: 20 iterations a step.
 
-    A B that has learnt the curvature far from the minimum is soon forgotten, so that on small networks it gets orders
-    of magnitude further than limited-memory BFGS [1]_. The line search is SciPy's, for the strong Wolfe conditions.
-
-    .. [1] J. F. Urbán, P. Stefanou, J. A. Pons, J. Comput. Phys. 523 (2025) 113656.
+    On small networks far better than limited-memory BFGS: Urbán, Stefanou, Pons, J. Comput. Phys. 523 (2025) 113656.
     """
 
     finished: str | None = None
     needs_residuals: ClassVar[bool] = False
 
     def __init__(self, flow: FlowMap) -> None:
-        if flow.n_parameters > MAX_PARAMETERS:
-            raise ValueError(
-                f"`optimizer` 'bfgs' keeps a dense matrix and takes at most {MAX_PARAMETERS} parameters; the flow has "
-                f"{flow.n_parameters}: use 'lbfgs' or 'adam'."
-            )
+        check_parameters(flow, "'bfgs' keeps a dense matrix")
         self.parameters = list(flow.parameters())
         self.B: Tensor | None = None
 

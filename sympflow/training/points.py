@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -47,31 +48,15 @@ class Stream(IntEnum):
     RUNS = 8
 
 
-@dataclass(frozen=True)
-class Points:
-    """Collocation points: t (N,), x (N, 2d) of the residual, few times (m, 1) with many states each of the matching.
+class Points(NamedTuple):
+    """Points of the losses: times, states, of labels where the flow takes these, and of a driven system times t0.
 
-    Labels are times, states and where the exact flow takes them; of a driven system all have times t0 of the states.
+    Those of the residual are t (N,) and x (N, 2d); of the matching few times (m, 1), with many states each (m, n, 2d).
     """
 
-    t: Tensor
-    x: Tensor
-    matching_t: Tensor
-    matching_x: Tensor
+    residual: tuple[Tensor, ...]
+    matching: tuple[Tensor, ...]
     labels: tuple[Tensor, ...] | None = None
-    t0: Tensor | None = None
-    matching_t0: Tensor | None = None
-
-    @property
-    def residual(self) -> tuple[Tensor, ...]:
-        """t, x, and t0 where there is one."""
-        return (self.t, self.x) if self.t0 is None else (self.t, self.x, self.t0)
-
-    @property
-    def matching(self) -> tuple[Tensor, ...]:
-        """t and x of the matching loss, and t0 where there is one."""
-        given = self.matching_t, self.matching_x
-        return given if self.matching_t0 is None else (*given, self.matching_t0)
 
 
 def stream_seed(seed: int, stream: Stream, block: int = 0) -> int:
@@ -115,50 +100,50 @@ def start_times(
     return low + (high - low) * rng.random(n)
 
 
+@dataclass
 class PointSource:
     """Draws the points of a step, uniform in Ω and one time from each of equal cells; driven, at random times t0."""
 
-    def __init__(
-        self,
-        domain: Domain,
-        dt: float,
-        points: int,
-        matching_times: int,
-        seed: int,
-        dtype: torch.dtype,
-        device: torch.device,
-        streams: tuple[Stream, Stream] = (Stream.RESIDUAL, Stream.MATCHING),
-        block: int = BLOCK,
-        labels: tuple[np.ndarray, ...] | None = None,
-        system: HamiltonianSystem | None = None,
-    ) -> None:
-        self._system = system
-        self.domain, self.dt, self.seed, self.streams = domain, dt, seed, streams
-        self.points, self.times = points, matching_times
-        self.block_length = block
-        self._like = {"dtype": dtype, "device": device}
-        self._labels = None if labels is None else tuple(torch.as_tensor(a, **self._like) for a in labels)  # type: ignore[arg-type]
-        self._block = -1
-        self._arrays: tuple[Tensor, ...] = ()
+    domain: Domain
+    dt: float
+    points: int
+    times: int
+    seed: int
+    dtype: torch.dtype
+    device: torch.device
+    streams: tuple[Stream, Stream] = (Stream.RESIDUAL, Stream.MATCHING)
+    block: int = BLOCK
+    labels: tuple[Any, ...] | None = None
+    system: HamiltonianSystem | None = None
+
+    def __post_init__(self) -> None:
+        self._drawn: tuple[int, list[tuple[Tensor, ...]]] = -1, []
+        if self.labels is not None:
+            self.labels = self._tensors(self.labels)
+
+    def _tensors(self, arrays: Iterable[Any]) -> tuple[Tensor, ...]:
+        return tuple(torch.as_tensor(a, dtype=self.dtype, device=self.device) for a in arrays)
 
     def __call__(self, index: int) -> Points:
         """The points of the `index`-th draw."""
-        block, i = divmod(index, self.block_length)
-        if block != self._block:
-            self._draw(block)
-        t, x, matching_t, matching_x, *starts = (a[i] for a in self._arrays)
-        return Points(t, x, matching_t, matching_x, self._labelled(index), *starts)
+        block, i = divmod(index, self.block)
+        if block != self._drawn[0]:
+            self._drawn = block, self._draw(block)
+        residual, matching = (tuple(a[i] for a in arrays) for arrays in self._drawn[1])
+        return Points(residual, matching, self._labelled(index))
 
     def _labelled(self, index: int) -> Any:
         """All labels, or as many as there are points, drawn anew for each index."""
-        if self._labels is None or len(self._labels[0]) <= self.points:
-            return self._labels
+        labels = self.labels
+        if labels is None or len(labels[0]) <= self.points:
+            return labels
         rng = np.random.default_rng([stream_seed(self.seed, Stream.LABELS), index])
-        rows = torch.as_tensor(rng.permutation(len(self._labels[0]))[: self.points], device=self._labels[0].device)
-        return tuple(a[rows] for a in self._labels)
+        rows = torch.as_tensor(rng.permutation(len(labels[0]))[: self.points], device=self.device)
+        return tuple(a[rows] for a in labels)
 
-    def _draw(self, block: int) -> None:
-        m, k = self.times, self.block_length
+    def _draw(self, block: int) -> list[tuple[Tensor, ...]]:
+        """The times, states and t0 of the residual and the matching, for each of the draws of a block."""
+        m, k = self.times, self.block
         n = self.points // m
         x = states(self.domain, k * self.points, self.seed, self.streams[0], block).reshape(k, self.points, -1)
         xm = states(self.domain, k * m * n, self.seed, self.streams[1], block).reshape(k, m, n, -1)
@@ -166,14 +151,11 @@ class PointSource:
         rng = np.random.default_rng([stream_seed(self.seed, self.streams[0], block), 1])
         t = self.dt * (np.arange(self.points) + rng.random((k, self.points))) / self.points
         tm = self.dt * (np.arange(m) + rng.random((k, m))) / m
-        drawn = [t, x, tm[..., None], xm]
-        for stream, shape in zip(self.streams, ((k, self.points), (k, m, 1)), strict=True):
-            if self._system is None:
-                break
-            t0 = start_times(self._system, self.dt, math.prod(shape), self.seed, stream, block)
-            drawn += [] if t0 is None else [np.reshape(t0, shape)]
-        self._arrays = tuple(torch.as_tensor(a, **self._like) for a in drawn)  # type: ignore[arg-type]
-        self._block = block
+        drawn = [[t, x], [tm[..., None], xm]]
+        for stream, arrays in zip(self.streams, drawn if self.system is not None else (), strict=False):
+            t0 = start_times(self.system, self.dt, arrays[0].size, self.seed, stream, block)  # type: ignore[arg-type]
+            arrays.extend([] if t0 is None else [t0.reshape(arrays[0].shape)])
+        return [self._tensors(arrays) for arrays in drawn]
 
 
 # labels ---------------------------------------------------------------------------------------------------------
@@ -235,17 +217,21 @@ class Labels:
         return cls(np.asarray(t), y[0][:, :width], ends[..., :width], t0, work)
 
     @classmethod
-    def needed(
+    def drawn(
         cls,
         system: HamiltonianSystem,
-        x: np.ndarray,
+        domain: Domain,
+        n: int,
+        seed: int,
+        stream: Stream,
         t: np.ndarray,
-        deadline: Deadline | None = None,
-        t0: np.ndarray | None = None,
+        deadline: Deadline,
+        needed: bool = True,
     ) -> Labels:
-        """`of`, for a fit, which cannot do without."""
-        labels = cls.of(system, x, t, deadline, t0)
-        if not len(labels.x):
+        """Labels of n states of a domain, driven at random times, which a fit cannot do without if they are needed."""
+        t0 = start_times(system, float(t[-1]), n, seed, stream)
+        labels = cls.of(system, states(domain, n, seed, stream), t, deadline, t0)
+        if needed and not len(labels.x):
             raise ValueError("`domain` holds no states whose solution exists up to `dt`: shrink one of them.")
         return labels
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from sympflow.flow.scaling import Scaling
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
-from sympflow.training.fits import Resolved
+from sympflow.training.fits import GaussNewton, Resolved
 from sympflow.training.least_squares import STOPPED, Minimum, Problem
 from sympflow.training.points import USELESS, drive_times
 from sympflow.training.session import Deadline, Path, Session
@@ -36,22 +36,32 @@ class Advance:
     keep: bool
 
 
-@dataclass
 class Run(ABC):
-    """The state of a run, and the loop that acts on it."""
-
-    flow: FlowMap
-    system: HamiltonianSystem
-    domain: Domain
-    scaling: Scaling | None
-    fit: Resolved
-    solver: Resolved
-    history: list[dict[str, float]] = field(default_factory=list, kw_only=True)
-    seconds: float = field(default=0.0, kw_only=True)
-    closing: float = field(default=0.0, kw_only=True)
-    unfitted: tuple[tuple[float, float], ...] = field(default=(), kw_only=True)
+    """The state of a run, and the loop that acts on it; no choice is left open in its fit and its solver."""
 
     UNIT: ClassVar[str]
+
+    def __init__(
+        self,
+        flow: FlowMap,
+        system: HamiltonianSystem,
+        domain: Domain,
+        scaling: Scaling | None,
+        fit: Resolved,
+        solver: Resolved = GaussNewton(),  # noqa: B008
+        deadline: Deadline | None = None,
+    ) -> None:
+        self.flow, self.system, self.domain, self.scaling = flow, system, domain, scaling
+        self.solver = solver.but(**fit.OPEN)
+        self.fit = fit.resolved(self.solver, flow.kind)
+        self.history: list[dict[str, float]] = []
+        self.seconds = self.closing = 0.0
+        self.unfitted: tuple[tuple[float, float], ...] = ()
+        self.prepare(Session().deadline if deadline is None else deadline)
+
+    @abstractmethod
+    def prepare(self, deadline: Deadline) -> None:
+        """Make what the run needs beside, as its labels."""
 
     @property
     def record(self) -> dict[str, Any]:
@@ -212,16 +222,20 @@ class Run(ABC):
         self.seconds, self.history = state["seconds"], state["history"]
 
 
-@dataclass
 class Unstarted(Run):
     """A run for which there was no time: what it was to start from took longer. The flow stays as it is."""
 
-    reached: str
-
     UNIT: ClassVar[str] = "steps"
 
-    def begin(self, session: Session) -> None:
+    def __init__(self, *given: Any, reached: str) -> None:
+        super().__init__(*given)
+        self.reached = reached
+
+    def prepare(self, deadline: Deadline) -> None:
         self.history = list(self.flow.history)
+
+    def begin(self, session: Session) -> None:
+        pass
 
     def end(self, session: Session) -> str | None:
         return INTERRUPTED if session.interruption.asked else NO_LABELS
@@ -248,17 +262,19 @@ def descended(common: tuple[Problem, int, Deadline, bool], theta: np.ndarray) ->
     return fit.own().minimize(theta, iterations, deadline, thorough)
 
 
-@dataclass
 class SearchRun(Run):
     """Many starts, each followed to a minimum, and a flow that is made of the best of them."""
 
-    minima: list[Minimum] = field(default_factory=list, kw_only=True)
-    coming: Generator[Minimum] | None = field(default=None, init=False, repr=False)
+    coming: Generator[Minimum] | None = None
     """The minima of a round of starts, as the pool finds them."""
 
     UNIT: ClassVar[str] = "starts"
     SEARCH_SHARE: ClassVar[float] = 0.5  # of a time budget
     ROUND: ClassVar[int] = 200  # starts that are drawn at once: a time budget may be given any number
+
+    def __init__(self, *given: Any) -> None:
+        self.minima: list[Minimum] = []
+        super().__init__(*given)
 
     @abstractmethod
     def searched(self) -> Problem:

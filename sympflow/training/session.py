@@ -105,36 +105,22 @@ class Session:
         Where the pool is this thread alone, `threads` share the work. While others work Ctrl-C raises KeyboardInterrupt
         here; after that, or where workers do not answer soon after the deadline, this thread does the rest.
         """
-        ended = self.interruption.asked or deadline.left <= 0
+        interruption = self.interruption
+        ended = interruption.asked or deadline.left <= 0
         n_threads = min(available_cores(), len(items)) if threads else 1
         if self.pool_is_busy or ended or len(items) < 2 or (self.pool.alone and n_threads < 2):
             for item in items:
                 yield function(common, item)
             return
-        if not self.pool.alone:
-            yield from self._shared(self.pool, function, common, items, deadline)
-            return
-        executor = ThreadPoolExecutor(n_threads)
-        try:
-            yield from self._shared(WorkerPool(executor), function, common, items, deadline)
-        finally:
-            executor.shutdown(wait=False, cancel_futures=True)
-
-    def _shared(
-        self,
-        pool: WorkerPool,
-        function: Callable[[Any, Any], Any],
-        common: Any,
-        items: Sequence[Any],
-        deadline: Deadline,
-    ) -> Generator[Any]:
+        executor = ThreadPoolExecutor(n_threads) if self.pool.alone else None
+        pool = self.pool if executor is None else WorkerPool(executor)
         patience = None if deadline.end == math.inf else deadline.left + GRACE
-        answers, interruption = pool.map(function, common, items, patience), self.interruption
+        answers, left = pool.map(function, common, items, patience), len(items)
         self.pool_is_busy = True
         try:
-            for left in reversed(range(len(items))):
+            while left:
                 armed = interruption.armed
-                interruption.armed = armed and pool is not self.pool
+                interruption.armed = armed and executor is not None
                 try:
                     answer = next(answers)
                 except TimeoutError:
@@ -146,14 +132,16 @@ class Session:
                     ) from error
                 finally:
                     interruption.armed = armed
+                left -= 1
                 self.pool_is_busy = left > 0
                 yield answer
-            else:
-                return
+            self.pool_is_busy = False
+            for item in items[len(items) - left :]:
+                yield function(common, item)
         finally:
             self.pool_is_busy = False
-        for item in items[-left - 1 :]:
-            yield function(common, item)
+            if executor is not None:
+                executor.shutdown(wait=False, cancel_futures=True)
 
     def bar(self, total: int, label: str, start: int = 0) -> Silent:
         """The display of so many steps, as a context."""

@@ -1,11 +1,7 @@
 """The fit of a split flow: its weights, filters and angles, fitted to the exact flow of a system by Gauss–Newton.
 
-First the maps frozen at Δt, a dozen numbers, from many random starts. Then numbers are followed from equal steps at a
-small t up to Δt, each fit starting where the last ended (or down from the best at Δt, if those are much better);
-polynomials in t are put through them, and these are fitted to labels at all times together.
-
-Derivatives of a step by a number of its table are central differences of the compiled step, exact to 1e-10, which
-Gauss–Newton steps do not see.
+First the maps frozen at Δt, from many random starts. Then numbers are followed from equal steps at a small t up to Δt,
+or down from the best there; polynomials in t are put through them, and fitted to labels at all times together.
 """
 
 from __future__ import annotations
@@ -21,13 +17,10 @@ from scipy.linalg import block_diag
 
 from sympflow.flow.coefficients import Column
 from sympflow.flow.split import SplitFlow
-from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.parts import ExactParts, SubFlow
-from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.kernels.parts_loops import PartsLoops, parts_loops
-from sympflow.training.fits import GaussNewton, Resolved
 from sympflow.training.least_squares import Minimum, Problem, Stop, levenberg_marquardt, put_weights
-from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors, stream_seed
+from sympflow.training.points import Labels, Stream, shares_missed, step_errors, stream_seed
 from sympflow.training.runs import LABEL_SHARE, SearchRun
 from sympflow.training.session import Deadline, Session
 
@@ -39,30 +32,13 @@ PULL = 0.3  # towards equal steps, as a share of the error: it chooses among coe
 ROUGHNESS = 1e-6  # how reluctantly polynomials are made to vary with t
 
 
-@dataclass
 class SplitRun(SearchRun):
-    """The state of a fit of a split flow, and what acts on it."""
+    """The state of a fit of a split flow that is bound to its system, and what acts on it."""
 
     flow: SplitFlow
-    fit: Resolved
-    solver: Resolved
-    problem: SplitProblem
 
-    @classmethod
-    def start(
-        cls,
-        flow: SplitFlow,
-        system: HamiltonianSystem,
-        domain: Domain,
-        fit: Resolved,
-        solver: GaussNewton = GaussNewton(),  # noqa: B008
-        deadline: Deadline | None = None,
-    ) -> SplitRun:
-        """A run of a flow that is bound to its system."""
-        deadline = Session().deadline if deadline is None else deadline
-        solver = solver.but(**fit.OPEN)
-        problem = SplitProblem(flow, system, domain, fit, solver, deadline)
-        return cls(flow, system, domain, None, fit, solver, problem)
+    def prepare(self, deadline: Deadline) -> None:
+        self.problem = SplitProblem(self, deadline)
 
     def searched(self) -> AtEnd:
         return AtEnd(self.problem)
@@ -138,27 +114,20 @@ def _phases(share: np.ndarray) -> np.ndarray:
 class SplitProblem:
     """Labels in modes, and the flow's coefficients as numbers: those of the first half of the palindrome."""
 
-    def __init__(
-        self,
-        flow: SplitFlow,
-        system: HamiltonianSystem,
-        domain: Domain,
-        fit: Resolved,
-        solver: Resolved,
-        deadline: Deadline,
-    ) -> None:
-        self.flow, self.fit, self.solver = flow, fit, solver
+    def __init__(self, run: SplitRun, deadline: Deadline) -> None:
+        flow, system, domain, fit = run.flow, run.system, run.domain, run.fit
+        self.flow, self.fit, self.solver = flow, fit, run.solver
         ends = np.cumsum([(c.n + 1) // 2 for c in self.columns])
         self.slices = [slice(int(end) - (c.n + 1) // 2, int(end)) for c, end in zip(self.columns, ends, strict=True)]
         self.n = int(ends[-1]) if len(ends) else 0
         t = flow.dt * _phases(np.arange(1, fit.label_times + 1) / fit.label_times)
-        x = states(domain, fit.points, fit.seed, Stream.RESIDUAL)
-        labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE))
+        drawn = system, domain, fit.points, fit.seed, Stream.RESIDUAL, t, deadline.part(LABEL_SHARE)
+        labels = Labels.drawn(*drawn)
         self.t, self.z, self.labels = t, self._modes(labels.x), [self._modes(y) for y in labels.y]
         self.unit = self._unit(float(np.std(system.hamiltonian(labels.x))))
-        x = states(domain, fit.reference_states, fit.seed, Stream.REFERENCE)
-        between = _phases((np.arange(2 * fit.label_times) + 1) / (2 * fit.label_times))
-        self.held_out = Labels.of(system, x, flow.dt * between, deadline.part(LABEL_SHARE))
+        t = flow.dt * _phases((np.arange(2 * fit.label_times) + 1) / (2 * fit.label_times))
+        unseen = system, domain, fit.reference_states, fit.seed, Stream.REFERENCE, t
+        self.held_out = Labels.drawn(*unseen, deadline.part(LABEL_SHARE), needed=False)
 
     @property
     def parts(self) -> ExactParts:

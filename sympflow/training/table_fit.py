@@ -1,17 +1,8 @@
 """The fit of a primed flow: the numbers of its splitting table, fitted to the exact flow of a system by Gauss–Newton.
 
-In three stages. First the table frozen at Δt, a dozen or two numbers, from many random starts, each followed for a
-few iterations: the cost has many local minima. Then the best of these to the end of their narrow valleys, at last with
-the weight of the energy, with which these are harder to find. Then the polynomials in t, from the best of these tables,
-to labels at several times in (0, Δt].
-
-Other losses (the residual of the flow, Hamiltonian matching) join in the last stage. Without labels there is that stage
-alone, from each start.
-
-Where long runs count, those of a lattice for instance, the best few tables are fitted to these in the end. The best of
-them is the table at Δt, and the polynomials are fitted to the labels before it, if there are as many times as powers.
-
-Every piece of it has a deadline, which is asked within each evaluation.
+First the table frozen at Δt, a dozen or two numbers, from many random starts, for the cost has many local minima. Then
+the best of these to the end of their narrow valleys, at last with the weight of the energy. Then the polynomials in t,
+from the best tables, to labels at several times in (0, Δt], and other losses. Without labels there is that stage alone.
 """
 
 from __future__ import annotations
@@ -20,7 +11,7 @@ import copy
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,9 +22,8 @@ from sympflow.flow.coefficients import Coefficients
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.scaling import Scaling
 from sympflow.flow.weights import check_memory, doubles
-from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
-from sympflow.training.fits import GaussNewton, PrimedFit, Resolved
+from sympflow.training.fits import Resolved
 from sympflow.training.least_squares import Blocks, Check, Minimum, Problem, put_weights
 from sympflow.training.losses import Loss, Objective
 from sympflow.training.points import (
@@ -43,7 +33,6 @@ from sympflow.training.points import (
     Stream,
     box_without,
     shares_missed,
-    start_times,
     states,
     step_errors,
     stream_seed,
@@ -76,73 +65,47 @@ RESIDUALS = 10  # at least, at Δt, for each number of the table; half as many f
 # the run ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass
 class TableRun(SearchRun):
-    """The state of such a fit, and what acts on it."""
+    """The state of such a fit, and what acts on it: to labels made on the spot, or the `data` of the fit."""
 
     flow: PrimedFlow
     scaling: Scaling
-    fit: Resolved
-    solver: Resolved
-    step: TableStep
-    frozen: TableFit | None
-    weighted: TableFit | None
-    whole: Problem
-    held_out: Labels
-    tried: PrimedFlow | None = None
-    runs: RunsFit | None = None
-    kept_start: bool = field(default=False, init=False)
-    at_start: np.ndarray = field(init=False)
-    at_end: np.ndarray = field(init=False)
+    kept_start = False
 
     SEARCH_SHARE: ClassVar[float] = 0.4
 
-    def __post_init__(self) -> None:
-        self.table = Table(self.flow)
-        self.given = self.table.parameters()
+    def __init__(self, *given: Any, tried: PrimedFlow | None = None, made_runs: MadeRuns | None = None) -> None:
+        self.tried, self._made_runs = tried, made_runs
+        super().__init__(*given)
 
-    @classmethod
-    def start(
-        cls,
-        flow: PrimedFlow,
-        system: HamiltonianSystem,
-        domain: Domain,
-        scaling: Scaling,
-        fit: PrimedFit,
-        solver: GaussNewton = GaussNewton(),  # noqa: B008
-        tried: PrimedFlow | None = None,
-        deadline: Deadline | None = None,
-        made_runs: MadeRuns | None = None,
-    ) -> TableRun:
-        """A run for labels made on the spot, or the `data` of the fit; `made_runs` gives the `runs` of a flow."""
-        deadline = Session().deadline if deadline is None else deadline
+    def prepare(self, deadline: Deadline) -> None:
+        flow, system, domain, scaling, options = self.flow, self.system, self.domain, self.scaling, self.fit
+        self.table = table = Table(flow)
+        self.given = table.parameters()
         fractions = FRACTIONAL_TIMES
-        options: Resolved = fit.resolved
-        solver = solver.but(**fit.OPEN)
         data: Any = options.data
-        step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled=True)
-        table = Table(flow)
+        self.step = step = TableStep(system, flow.sequence, flow.tables.level, flow.monomials, compiled=True)
         unit = np.array(scaling.x)
         if options.residual_weight or options.matching_weight or data is not None:
             system.check_autonomous(
                 "and what is not its own labels tells no time at which a step begins", "leave out `loss` and `data`"
             )
         parts: list[tuple[float, Problem]] = []
-        frozen = weighted = None
+        self.frozen: TableFit | None = None
+        self.weighted: TableFit | None = None
         if options.label_weight and data is None:
             numbers = table.frozen(flow.dt)[1].shape[-1]
             enough = math.ceil(RESIDUALS * numbers / (2 * system.ndof))
             points = options.points or max(enough, min(MOST_POINTS, max(FEWEST_POINTS, COORDINATES // system.ndof)))
             _check_memory(points, options, step.n_coefficients, system.ndof)
-            x = states(domain, points, options.seed, Stream.RESIDUAL)
             t = flow.dt * np.arange(1, options.label_times + 1) / options.label_times
             began = deadline.session.passed
-            t0 = start_times(system, flow.dt, points, options.seed, Stream.RESIDUAL)
-            labels = Labels.needed(system, x, t, deadline.part(LABEL_SHARE), t0)
+            drawn = system, domain, points, options.seed, Stream.RESIDUAL, t, deadline.part(LABEL_SHARE)
+            labels = Labels.drawn(*drawn)
             if (deadline.session.passed - began) / len(t) * fractions > HELD_OUT_SHARE * deadline.left:
                 fractions = min(fractions, len(t))
             slope = energy_slope(system, labels, options.energy_weight)
-            frozen, weighted = _with_and_without(step, labels.at(-1), table.frozen(flow.dt), unit, slope)
+            self._fit_frozen(labels.at(-1), slope)
             weight = np.where(t < t[-1], 1.0, options.frozen_weight)
             labels = labels.first(fewer := max(FITTED_POINTS, enough // 2))
             slope = None if slope is None else slope[:, :fewer]
@@ -158,7 +121,7 @@ class TableRun(SearchRun):
             if 2 * system.ndof * at_end.sum() >= 2 * table.n:
                 labels = Labels(data[0][at_end][-1:], data[1][at_end], data[2][at_end][None])
                 slope = energy_slope(system, labels, options.energy_weight)
-                frozen, weighted = _with_and_without(step, labels, table.frozen(flow.dt), unit, slope)
+                self._fit_frozen(labels, slope)
         if options.residual_weight or options.matching_weight or data is not None:
             system.check_autonomous(
                 "and losses at points compare a table at no time of it", "fit it to labels, loss='labels'"
@@ -166,19 +129,22 @@ class TableRun(SearchRun):
             rest = options.label_weight if data is not None else 0.0
             loss = Loss(system, scaling, options.residual_weight, options.matching_weight, rest)
             shape = (flow.dt, options.loss_points, options.matching_times, options.seed, flow.dtype, flow.device)
-            points_at = replace(PointSource(domain, *shape, block=1)(0), labels=_tensors(data) if rest else None)
+            points_at = PointSource(domain, *shape, block=1)(0)._replace(labels=_tensors(data) if rest else None)
             parts.append((1.0, LossProblem(table, Objective(loss, flow, points_at))))
-        x = states(domain, options.reference_states, options.seed, Stream.REFERENCE)
-        t = flow.dt * (np.arange(fractions) + 0.5) / fractions
-        t0 = start_times(system, flow.dt, len(x), options.seed, Stream.REFERENCE)
-        held_out = Labels.of(system, x, np.append(t, flow.dt), deadline.part(LABEL_SHARE), t0)
-        whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
-        runs = None if made_runs is None else made_runs(flow)
-        run = cls(flow, system, domain, scaling, options, solver, step, frozen, weighted, whole, held_out, tried, runs)
+        t = np.append(flow.dt * (np.arange(fractions) + 0.5) / fractions, flow.dt)
+        unseen = system, domain, options.reference_states, options.seed, Stream.REFERENCE, t
+        self.held_out = Labels.drawn(*unseen, deadline.part(LABEL_SHARE), needed=False)
+        self.whole = parts[0][1] if len(parts) == 1 else StackedFit(*parts)  # one weight changes nothing
+        self.runs = None if self._made_runs is None else self._made_runs(flow)
         began = deadline.session.passed
-        run.at_start = run.differences()
-        run.closing = LAST_EVALUATIONS * (deadline.session.passed - began)
-        return run
+        self.at_start = self.differences()
+        self.closing = LAST_EVALUATIONS * (deadline.session.passed - began)
+
+    def _fit_frozen(self, labels: Labels, slope: np.ndarray | None) -> None:
+        """Fits of a frozen table without a weight of the energy, by which valleys are found, and with it."""
+        given = self.step, labels, *self.table.frozen(self.flow.dt), np.array(self.scaling.x), np.ones(1)
+        self.frozen = TableFit(*given)
+        self.weighted = None if slope is None else TableFit(*given, slope[-1:])
 
     def begin(self, session: Session) -> None:
         super().begin(session)
@@ -379,14 +345,6 @@ def energy_slope(system: HamiltonianSystem, labels: Labels, weight: float) -> np
     if labels.work is not None:
         slope = np.concatenate([slope, np.ones((*slope.shape[:-1], 1))], axis=-1)
     return math.sqrt(weight) / spread * slope
-
-
-def _with_and_without(
-    step: TableStep, labels: Labels, table: tuple[np.ndarray, np.ndarray], unit: np.ndarray, slope: np.ndarray | None
-) -> tuple[TableFit, TableFit | None]:
-    """The fit of a frozen table without a weight of the energy, by which valleys are found, and the one with it."""
-    first = TableFit(step, labels, *table, unit, np.ones(1))
-    return first, None if slope is None else TableFit(step, labels, *table, unit, np.ones(1), slope[-1:])
 
 
 def _distinct(minima: list[Minimum]) -> list[Minimum]:

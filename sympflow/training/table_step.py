@@ -1,7 +1,4 @@
-"""A splitting step and its derivatives with respect to the numbers of its table.
-
-The step needs the forces of a system and their Jacobians: F = −∇V, G = ∇²V v and C = −∇(½ v·∇²V v), with v = M⁻¹∇V; or
-after F the −∇q^m of each monomial. Arrays are feature-major: q and F, G, C are (d, P), Jacobians (d, d, P).
+"""A splitting step and its derivatives by the numbers of its table; arrays are feature-major: q (d, P).
 
 A driven system is the autonomous one of positions (q, t, s) and momenta (p, 1, E), with V(q, t + s), M⁻¹ extended by 1
 for the velocity of t in drifts, by 0 in v and for s, which stays 0, and the forces (−∂V/∂q, 0, −∂V/∂t). So the

@@ -97,8 +97,9 @@ def test_drift_wants_blocks_and_outputs():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("method", ["verlet", "kahan_li8", "rk45", "dop853"])
-@pytest.mark.parametrize("t_eval", [None, [10.0, 20.0]], ids=["every step", "few outputs"])
+@pytest.mark.parametrize(
+    ("method", "t_eval"), [("verlet", None), ("kahan_li8", [10.0, 20.0]), ("rk45", [10.0, 20.0]), ("dop853", None)]
+)
 def test_the_drift_of_a_blow_up_is_infinite_alone_and_in_a_batch(method, t_eval):
     system = systems.henon_heiles()
     lost = [0.0, 0.0, 0.0, 0.7]

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from sympflow import (
-    HamiltonianSystem,
-    get,
-    loop_area_error,
-    solve,
-    symplecticity_defect,
-    systems,
-    volume_error,
-)
+from sympflow import HamiltonianSystem, get, loop_area_error, solve, symplecticity_defect, systems, volume_error
 from sympflow.flow.shipped import shipped
 from sympflow.integrators.base import FixedStep
 from sympflow.metrics.symplectic import loop_area, natural_scale, step_tangents

@@ -134,7 +134,7 @@ def errors_of(psi):
 def test_the_fits_derivatives(options):
     """Residuals and Jacobian by the flow's parameters, against the flow itself."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, dt=0.8, **options).requires_grad_(False)
-    run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
+    run = TableRun(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), FEW)
     table = Table(flow)
     theta = table.parameters() + 0.02 * np.random.default_rng(0).normal(size=flow.n_parameters)
     r = check_derivatives(run.whole, theta, 1e-9)
@@ -335,7 +335,7 @@ def test_residuals_of_a_loss_are_those_of_the_flow():
     """The whole fit against Loss: the sum of squares is the loss, and the Jacobian its derivative."""
     flow = SympFlow.primed(PENDULUM, 2, degree=3, processor=1)
     config = PrimedFit(loss="residual+matching", residual_weight=2.0, matching_weight=3.0, loss_points=20)
-    run = TableRun.start(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
+    run = TableRun(flow, PENDULUM, PENDULUM.domain, Scaling.unit(1), config)
     theta = Table(flow).parameters() + np.random.default_rng(0).normal(0, 0.02, flow.n_parameters)
     r = check_derivatives(run.whole, theta, 1e-8)
     Table(flow).assign(theta)

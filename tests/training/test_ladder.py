@@ -5,6 +5,7 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import replace
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -32,7 +33,7 @@ from sympflow.training import pretrained
 from sympflow.training.clock_fit import clock_errors
 from sympflow.training.fits import GaussNewton, PrimedFit
 from sympflow.training.shipped import recipe
-from sympflow.training.shipped.judges import ByCertificate, one_step_errors, primed_cost
+from sympflow.training.shipped.judges import by_certificate, cost_of, one_step_errors
 from sympflow.training.shipped.recipe import SCENES, Recipe, along_the_orbit, scene_named
 
 HH, PENDULUM, OSCILLATOR = systems.henon_heiles(), systems.pendulum(), systems.harmonic_oscillator()
@@ -204,7 +205,7 @@ def test_listing_loads_no_weights():
 def test_a_file_is_the_recipe_of_its_flow(tmp_path, monkeypatch, capsys):
     """The command makes flows again with the same weights, and measures them."""
     monkeypatch.setattr(pretrained, "package_folder", lambda: tmp_path)
-    monkeypatch.setattr(Recipe, "judge", ByCertificate(50.0))
+    monkeypatch.setattr(Recipe, "judge", property(lambda _: partial(by_certificate, t_end=50.0)))
     fit, solver = PrimedFit(0.5, processor=1, points=40, reference_states=10), GaussNewton(steps=20, restarts=2)
     flows = [
         sympflow.train(PENDULUM, replace(fit, stages=stages, first=first), solver=solver, progress=False)
@@ -237,7 +238,7 @@ def test_a_file_is_the_recipe_of_its_flow(tmp_path, monkeypatch, capsys):
 
 def test_the_figures_are_those_of_the_certificate():
     flow = SympFlow.primed(HH, 2, dt=0.5).requires_grad_(False)
-    ByCertificate(100.0)(flow, HH)
+    by_certificate(flow, HH, 100.0)
     sample = HH.domain.sample(400, 77)
     errors = max_energy_error(solve(HH, flow, (0.0, 100.0), y0=sample, on_domain_exit="ignore"))
     # another sample of states: quantiles agree to the noise of 100 draws
@@ -306,7 +307,15 @@ def test_shipped_flows_are_maps_for_all_times(flow):
     assert flow.energy_error < 0.1
 
 
-@pytest.mark.parametrize("listed", shipped_flows(), ids=lambda f: f.name)
+FIRST = {(f.name.partition("-")[0], f.kind): f.name for f in reversed(shipped_flows())}
+"""The cheapest flow of each kind and scene."""
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [pytest.param(f, marks=() if f.name in FIRST.values() else pytest.mark.slow) for f in shipped_flows()],
+    ids=lambda f: f.name,
+)
 def test_every_flow_is_a_map_for_all_times(listed):
     """Networks and stiff ones included; measured on a few states, not read."""
     system = scene_named(listed.name.partition("-")[0])
@@ -358,7 +367,7 @@ def test_what_costs_more_is_more_accurate(name):
     cheaper = [(f, g) for f in rungs for g in rungs if g.cost <= f.cost and g.energy_error < f.energy_error]
     assert not [(f.name, g.name) for f, g in cheaper if f.name not in of_state]  # no rung is dominated by another
     assert not [(f.name, g.name) for f, g in cheaper if g.one_step_error / g.dt < f.one_step_error / f.dt]
-    assert all(f.cost == pytest.approx(primed_cost(f.load()), rel=1e-3) for f in rungs)
+    assert all(f.cost == pytest.approx(cost_of(f.load()), rel=1e-3) for f in rungs)
 
 
 def test_no_torch_to_choose_a_classical_method():

@@ -25,7 +25,7 @@ def objective(flow, system, weights, n=37):
     x, y = (torch.tensor(0.3 * rng.normal(size=(n, 2 * system.ndof))) for _ in range(2))
     t = torch.tensor(rng.random(n)) * flow.dt
     t0 = () if system.autonomous else (torch.tensor(6.0 * rng.random(n)),)
-    points = Points(t, x, t[:1], x[None], (t, x, y, *t0), *t0)
+    points = Points((t, x, *t0), (t[:1], x[None]), (t, x, y, *t0))
     scaling = SCALING if system.ndof == 2 else Scaling((0.3,), (0.5,), 0.7)
     return Objective(Loss(system, scaling, *weights), flow, points, tangents=flow.tangents())
 

@@ -66,9 +66,10 @@ def test_losses_are_the_papers():
     """Against the definitions, written out with autodiff, on a random flow."""
     system, flow, sample = henon_heiles(), SympFlow(2, seed=4), points(ndof=2)
     L1, L2, _ = Loss(system, Scaling.unit(2)).terms(flow, sample)
-    y, dy = torch.func.jvp(lambda t: flow.psi(t, sample.x), (sample.t,), (torch.ones_like(sample.t),))
+    t, x = sample.residual
+    y, dy = torch.func.jvp(lambda t: flow.psi(t, x), (t,), (torch.ones_like(t),))
     torch.testing.assert_close(L1, (dy - system.vector_field(y)).square().sum(-1).mean())
-    difference = flow.hamiltonian(sample.matching_t, sample.matching_x) - system.hamiltonian(sample.matching_x)
+    difference = flow.hamiltonian(*sample.matching) - system.hamiltonian(sample.matching[1])
     torch.testing.assert_close(L2, difference.var(1, correction=0).mean())
 
 
@@ -89,7 +90,7 @@ def test_losses_do_not_depend_on_units():
         scaling = Scaling((1.0,), (w,), 1 / w)
         flow = SympFlow(1, dt=1 / w, scale=scaling, seed=3)
         unit = torch.tensor([1.0, w], dtype=torch.float64)
-        scaled = Points(sample.t / w, sample.x * unit, sample.matching_t / w, sample.matching_x * unit)
+        scaled = Points(*((t / w, x * unit) for t, x in (sample.residual, sample.matching)))
         losses.append(torch.stack(Loss(harmonic_oscillator(w), scaling).terms(flow, scaled)[:2]))
     torch.testing.assert_close(losses[0], losses[1], rtol=1e-10, atol=0)
 
@@ -113,16 +114,16 @@ def test_points_are_a_function_of_seed_and_step():
         return PointSource(domain, 0.5, 40, 4, seed, torch.float64, CPU, block=4)
 
     one, other = source(0), source(0)
-    assert torch.equal(one(9).x, other(9).x)
+    t, x = one(9).residual
+    assert torch.equal(x, other(9).residual[1])
     one(3)
-    assert torch.equal(one(9).t, other(9).t)
-    assert not torch.equal(one(8).x, one(9).x)
-    assert not torch.equal(source(1)(9).x, one(9).x)
+    assert torch.equal(one(9).residual[0], t)
+    for another in (one(8), source(1)(9)):
+        assert not torch.equal(another.residual[1], x)
     sample = one(9)
-    assert domain.contains(sample.x).all()
-    assert sample.matching_t.shape == (4, 1)
-    assert sample.matching_x.shape == (4, 10, 4)
-    assert 0 <= sample.t.min() < sample.t.max() <= 0.5
+    assert domain.contains(x).all()
+    assert [a.shape for a in sample.matching] == [(4, 1), (4, 10, 4)]
+    assert 0 <= t.min() < t.max() <= 0.5
     assert not np.array_equal(states(domain, 3, 0, Stream.RESIDUAL), states(domain, 3, 0, Stream.VALIDATION))
 
 

@@ -56,7 +56,7 @@ def test_fits_are_the_same_in_another_process():
     """Their products are rounded by the order of arrays in memory, which a pickle must not change."""
     few = {"points": 20, "label_times": 3, "reference_states": 5, "loss_points": 10, "matching_times": 2}
     table = PrimedFit(loss="labels+residual", **few)
-    run = TableRun.start(FLOW, PENDULUM, PENDULUM.domain, scaling_of(PENDULUM.domain, FLOW.dt, 0), table)
+    run = TableRun(FLOW, PENDULUM, PENDULUM.domain, scaling_of(PENDULUM.domain, FLOW.dt, 0), table)
     theta = run.table.continued(run.frozen.coefficients(run.start_of(1))[0])
     fits = [(run.frozen, run.start_of(1)), (run.weighted, run.start_of(0)), (run.whole, theta)]
     for fit, x in fits:
@@ -72,7 +72,7 @@ def test_split_fits_are_the_same_in_another_process():
     spring = systems.spring_pendulum(1e3, coordinates="polar")
     flow = SympFlow.split(spring, dt=0.05, stages=1, terms=2)
     fit, solver = SplitFit(points=5, label_times=2, reference_states=3), GaussNewton(steps=2, restarts=2)
-    run = SplitRun.start(flow.bound(spring), spring, spring.domain, fit, solver)
+    run = SplitRun(flow.bound(spring), spring, spring.domain, None, fit, solver)
     fit, u = run.searched(), run.start_of(1)
     other = pickle.loads(pickle.dumps(fit.own()))
     mine, theirs = (f.minimize(u, 2, Session().deadline) for f in (fit, other))

@@ -173,7 +173,7 @@ def test_a_domain_without_solutions_has_no_trial(monkeypatch):
     def start(*_, **__):
         raise ValueError("`domain` holds no states whose solution exists up to `dt`")
 
-    monkeypatch.setattr(TableRun, "start", start)
+    monkeypatch.setattr(TableRun, "prepare", start)
     assert trials.trial(default_primed(HH), HH, HH.domain).error == np.inf
     assert trials.chosen_trial(HH, HH.domain).start == default_primed(HH)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,19 +15,18 @@ from sympflow.flow.clocked import ClockedFlow
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.primed import PrimedFlow
 from sympflow.flow.split import SplitFlow
-from sympflow.flow.sympflow import SympFlow
 from sympflow.hamiltonian.exact_flow import reference_step
 from sympflow.hamiltonian.system import HamiltonianSystem
+from sympflow.integrators.flows import LogSympFlow
 from sympflow.metrics.energy import max_energy_error
 from sympflow.metrics.energy_balance import energy_balance_error
 from sympflow.solver import solve
-from sympflow.training.clock_fit import energy_errors
 from sympflow.training.points import Labels, Stream, start_times
 
 FRACTIONAL_TIMES = 50
 HELD_OUT = 1000  # states of the certificate
 OUTPUTS = 1000  # at which an energy error is looked at, where it is not the certificate that does
-CLOCK_SEED = 1_000_003  # of the held-out states of flows without a certificate
+RUNS_SEED = 1_000_003  # of the held-out states of flows without a certificate
 
 
 # cost ---------------------------------------------------------------------------------------------------------------
@@ -35,32 +34,25 @@ CLOCK_SEED = 1_000_003  # of the held-out states of flows without a certificate
 OF_A_GRADIENT, OF_A_CURVATURE, OF_A_MONOMIAL, OF_A_PARAMETER = 0.3, 0.4, 0.05, 0.4  # forces
 OF_A_LOGARITHM = 2.0  # forces: a kick and a drift of the logarithmic Hamiltonian, a division in each
 
-Cost = Callable[[Any], float]
-"""Force evaluations in a unit of time, by count: a figure that no other load on the machine disturbs."""
 
+def cost_of(flow: Any) -> float:
+    """Force evaluations in a unit of time, by count: a figure that no other load on the machine disturbs.
 
-def primed_cost(flow: PrimedFlow) -> float:
-    """Forces, with 0.3 for a force gradient, 0.4 for a curvature term and 0.05 for a monomial, as was measured."""
-    kernel = flow.kernel_scheme()
-    beside = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations
-    beside += OF_A_MONOMIAL * len(kernel.monomials) * kernel.force_evaluations
-    return (kernel.force_evaluations + beside) / flow.dt
-
-
-def split_cost(flow: SplitFlow) -> float:
-    """As of a primed flow; exact linear flows count nothing."""
-    one, two = (flow.evaluations(n, 0, 0, "compiled") for n in (1, 2))
-    more = {name: two[name] - one[name] for name in one}
-    return (more["force_evaluations"] + OF_A_GRADIENT * more["hessian_evaluations"]) / flow.dt
-
-
-def network_cost(flow: FlowMap) -> float:
-    """The parameters of a network count as many forces as make up for its multiplications."""
+    With 0.3 for a force gradient, 0.4 for a curvature term and 0.05 for a monomial, as was measured; exact linear flows
+    count nothing, and the parameters of a network as many forces as make up for its multiplications.
+    """
+    if isinstance(flow, ClockedFlow):
+        return OF_A_LOGARITHM * flow.scheme.force_evaluations / flow.figures["step"]
+    if isinstance(flow, PrimedFlow):
+        kernel = flow.kernel_scheme()
+        beside = OF_A_GRADIENT * kernel.hessian_evaluations + OF_A_CURVATURE * kernel.curvature_evaluations
+        beside += OF_A_MONOMIAL * len(kernel.monomials) * kernel.force_evaluations
+        return (kernel.force_evaluations + beside) / flow.dt
+    if isinstance(flow, SplitFlow):
+        one, two = (flow.evaluations(n, 0, 0, "compiled") for n in (1, 2))
+        more = {name: two[name] - one[name] for name in one}
+        return (more["force_evaluations"] + OF_A_GRADIENT * more["hessian_evaluations"]) / flow.dt
     return OF_A_PARAMETER * flow.n_parameters / flow.dt
-
-
-def clocked_cost(flow: ClockedFlow) -> float:
-    return OF_A_LOGARITHM * flow.scheme.force_evaluations / flow.figures["step"]
 
 
 # errors -------------------------------------------------------------------------------------------------------------
@@ -114,90 +106,65 @@ def one_step_errors(
 
 # judges -------------------------------------------------------------------------------------------------------------
 
-
-class Judge(Protocol):
-    """A measurement of a trained flow."""
-
-    def __call__(self, flow: Any, system: HamiltonianSystem) -> None:
-        """Put the figures by which flows are chosen, and a certificate, into the flow."""
+Judge = Callable[[Any, HamiltonianSystem], None]
+"""A measurement of a trained flow, which puts the figures by which flows are chosen, and a certificate, into it."""
 
 
-@dataclass(frozen=True)
-class ByCertificate:
-    """The certificate over T = t_end, and from it the figures by which flows are chosen."""
+def by_certificate(
+    flow: Any,
+    system: HamiltonianSystem,
+    t_end: float = 1000.0,
+    states: int = 2000,
+    times: int = 33,
+    held_out: int = HELD_OUT,
+) -> None:
+    """The certificate over T = t_end, and from it the figures."""
+    certificate = flow.certificate(system, states=states, times=times, held_out=held_out, t_end=t_end)
+    flow.figures |= {
+        "one_step_error_median": certificate.one_step_error.median,
+        "one_step_error_max": certificate.one_step_error.largest,
+        "energy_error_median": certificate.relative_energy_error.median,
+        "energy_error_95": certificate.relative_limit,
+        "t_end": t_end,
+        "cost": round(cost_of(flow), 3),
+    }
 
-    t_end: float = 1000.0
-    cost: Cost = primed_cost
-    states: int = 2000
-    times: int = 33
-    held_out: int = HELD_OUT
 
-    def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
-        certificate = flow.certificate(
-            system, states=self.states, times=self.times, held_out=self.held_out, t_end=self.t_end
-        )
-        flow.figures |= {
-            "one_step_error_median": certificate.one_step_error.median,
-            "one_step_error_max": certificate.one_step_error.largest,
-            "energy_error_median": certificate.relative_energy_error.median,
-            "energy_error_95": certificate.relative_limit,
-            "t_end": self.t_end,
-            "cost": round(self.cost(flow), 3),
-        }
+def of_domain(system: HamiltonianSystem) -> np.ndarray:
+    """Held-out states of flows without a certificate."""
+    assert system.domain is not None
+    return system.domain.sample(HELD_OUT, RUNS_SEED)
+
+
+def balance_errors(sol: Any) -> Any:
+    """The largest relative errors of the energy balance of runs of a driven system."""
+    return energy_balance_error(sol, relative=True).max(-1)
 
 
 @dataclass(frozen=True)
 class ByRuns:
-    """Energy errors of runs from given states over T = t_end, at steps and between them; a certificate beside."""
+    """Errors of runs in the physical time over T = t_end, at steps and between them; a certificate if it is asked."""
 
-    held_out: Callable[[HamiltonianSystem], np.ndarray]
-    t_end: float
-    t_certified: float
-    cost: Cost = primed_cost
-
-    def __call__(self, flow: SympFlow, system: HamiltonianSystem) -> None:
-        flow.certificate(system, t_end=self.t_certified)
-        errors = max_energy_error(_run(flow, system, self.held_out(system), self.t_end))
-        flow.figures |= _of_runs(errors, self.t_end) | {"cost": round(self.cost(flow), 8)}
-
-
-@dataclass(frozen=True)
-class ByBalance:
-    """Relative errors of the energy balance of runs of a driven system over T = t_end; it has no certificate."""
-
+    errors: Callable[[Any], Any] = max_energy_error
+    states: Callable[[HamiltonianSystem], np.ndarray] = of_domain
     t_end: float = 1000.0
-    cost: Cost = primed_cost
-
-    def errors(self, flow: Any, system: HamiltonianSystem, y0: np.ndarray) -> np.ndarray:
-        return energy_balance_error(_run(flow, system, y0, self.t_end), relative=True).max(-1)
+    t_certified: float | None = None
 
     def __call__(self, flow: Any, system: HamiltonianSystem) -> None:
-        assert system.domain is not None
-        errors = self.errors(flow, system, system.domain.sample(HELD_OUT, CLOCK_SEED))
-        flow.figures |= _of_runs(errors, self.t_end) | {"cost": round(self.cost(flow), 3)}
-
-
-@dataclass(frozen=True)
-class ByClock(ByBalance):
-    """Energy errors of runs in the physical time, of a flow in another time; it has no certificate."""
-
-    cost: Cost = clocked_cost
-
-    def errors(self, flow: Any, system: HamiltonianSystem, y0: np.ndarray) -> np.ndarray:
-        return energy_errors(flow, system, y0, self.t_end, OUTPUTS)
-
-
-def _run(flow: Any, system: HamiltonianSystem, y0: np.ndarray, t_end: float) -> Any:
-    times = np.linspace(0.0, t_end, OUTPUTS + 1)
-    return solve(system, flow, (0.0, t_end), y0, t_eval=times, on_domain_exit="ignore")
-
-
-def _of_runs(errors: Any, t_end: float) -> dict[str, float]:
-    return {
-        "energy_error_median": float(np.quantile(errors, 0.5, method="higher")),
-        "energy_error_95": upper_limit(np.asarray(errors)),
-        "t_end": t_end,
-    }
+        if self.t_certified is not None:
+            flow.certificate(system, t_end=self.t_certified)
+        method: Any = flow
+        if isinstance(flow, ClockedFlow):
+            method = LogSympFlow(flow=flow, shift=flow.recipe["transforms"]["shift"])
+        times = np.linspace(0.0, self.t_end, OUTPUTS + 1)
+        sol = solve(system, method, (0.0, self.t_end), self.states(system), t_eval=times, on_domain_exit="ignore")
+        errors = np.asarray(self.errors(sol))
+        flow.figures |= {
+            "energy_error_median": float(np.quantile(errors, 0.5, method="higher")),
+            "energy_error_95": upper_limit(errors),
+            "t_end": self.t_end,
+            "cost": round(cost_of(flow), 8),
+        }
 
 
 @dataclass(frozen=True)
@@ -206,7 +173,6 @@ class AsPublished:
 
     initial: Callable[[], np.ndarray]
     omega: float = 1.0
-    cost: Cost = network_cost
 
     def measured(self, flow: FlowMap, system: HamiltonianSystem, steps: int = 1000) -> dict[str, Any]:
         """`measure` from the initial states."""
@@ -217,41 +183,36 @@ class AsPublished:
         at_end, between = one_step_errors(flow, system, self.initial(), omega=self.omega)
         flow.figures |= {"error_at_dt": at_end, "fractional_error": between}
         if flow.kind == "sympflow":
-            ByCertificate(cost=self.cost)(flow, system)  # type: ignore[arg-type]
+            by_certificate(flow, system)
 
 
 PHASES = (*(k / 20 for k in range(1, 20)), 0.97, 0.98, 0.99, 0.995)  # of a step, for figures between steps
 STIFF_STATES, STIFF_SEED = 20, 20_261_121  # of the energy figure, from a seed that no training uses
 
 
-@dataclass(frozen=True)
-class OfStiff:
+def of_stiff(flow: SplitFlow, system: HamiltonianSystem) -> None:
     """Largest energy errors of y0 and of held-out states over the interval, and a certificate of few states."""
-
-    cost: Cost = split_cost
-
-    def __call__(self, flow: SplitFlow, system: HamiltonianSystem) -> None:
-        bound = flow.bound(system)
-        on_grid = solve(system, bound, on_domain_exit="ignore")
-        n = round((system.t_span[1] - system.t_span[0]) / flow.dt) - 1
-        t = np.unique(np.linspace(0, n, 500).round())[:, None] + np.array(PHASES)
-        between = solve(system, bound, on_domain_exit="ignore", t_eval=t.ravel() * flow.dt + system.t_span[0])
-        domain = bound.domain_for(system)
-        assert domain is not None
-        x = domain.sample(STIFF_STATES, STIFF_SEED)
-        steps = np.arange(0.0, system.t_span[1] + flow.dt / 2, flow.dt)[::10]
-        many = solve(system, bound, y0=x, t_eval=steps[steps <= system.t_span[1]], on_domain_exit="ignore")
-        H = np.asarray(many.energy())
-        drift = np.abs(H - H[..., :1]).max(-1)
-        scale = np.abs(H[..., 0]) if system.energy_scale is None else system.energy_scale
-        bound.figures |= {
-            "orbit_energy_error": float(np.abs(on_grid.energy_error()).max()),
-            "between_steps": float(np.abs(between.energy() / system.hamiltonian(system.y0) - 1).max()),
-            "energy_error": float(drift.mean()),
-            "energy_error_max": float(drift.max()),
-            "energy_error_95": float(np.quantile(drift / scale, 0.95, method="higher")),
-            "t_end": system.t_span[1],
-            "cost": round(self.cost(bound), 3),
-        }
-        # fewer states than the default: one costs dear
-        bound.certificate(system, t_end=system.t_span[1], states=500, times=17, held_out=20)
+    bound = flow.bound(system)
+    on_grid = solve(system, bound, on_domain_exit="ignore")
+    n = round((system.t_span[1] - system.t_span[0]) / flow.dt) - 1
+    t = np.unique(np.linspace(0, n, 500).round())[:, None] + np.array(PHASES)
+    between = solve(system, bound, on_domain_exit="ignore", t_eval=t.ravel() * flow.dt + system.t_span[0])
+    domain = bound.domain_for(system)
+    assert domain is not None
+    x = domain.sample(STIFF_STATES, STIFF_SEED)
+    steps = np.arange(0.0, system.t_span[1] + flow.dt / 2, flow.dt)[::10]
+    many = solve(system, bound, y0=x, t_eval=steps[steps <= system.t_span[1]], on_domain_exit="ignore")
+    H = np.asarray(many.energy())
+    drift = np.abs(H - H[..., :1]).max(-1)
+    scale = np.abs(H[..., 0]) if system.energy_scale is None else system.energy_scale
+    bound.figures |= {
+        "orbit_energy_error": float(np.abs(on_grid.energy_error()).max()),
+        "between_steps": float(np.abs(between.energy() / system.hamiltonian(system.y0) - 1).max()),
+        "energy_error": float(drift.mean()),
+        "energy_error_max": float(drift.max()),
+        "energy_error_95": float(np.quantile(drift / scale, 0.95, method="higher")),
+        "t_end": system.t_span[1],
+        "cost": round(cost_of(bound), 3),
+    }
+    # fewer states than the default: one costs dear
+    bound.certificate(system, t_end=system.t_span[1], states=500, times=17, held_out=20)

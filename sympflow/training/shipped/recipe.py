@@ -25,30 +25,11 @@ from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.hamiltonian.time_transformation import time_transformed
 from sympflow.solver import solve
 from sympflow.systems import SYSTEMS, duffing, fput, harmonic_oscillator, phi4, sine_gordon, spring_pendulum
+from sympflow.training import fits
 from sympflow.training.clock_fit import train_clock
-from sympflow.training.fits import (
-    SOLVERS,
-    WEIGHTS,
-    ClockedFit,
-    Fit,
-    GaussNewton,
-    LossFit,
-    NetworkFit,
-    PrimedFit,
-    Solver,
-    SplitFit,
-)
+from sympflow.training.fits import ClockedFit, Fit, GaussNewton, LossFit, NetworkFit, PrimedFit, Solver, SplitFit
 from sympflow.training.session import Session
-from sympflow.training.shipped.judges import (
-    AsPublished,
-    ByBalance,
-    ByCertificate,
-    ByClock,
-    ByRuns,
-    Judge,
-    OfStiff,
-    network_cost,
-)
+from sympflow.training.shipped.judges import AsPublished, ByRuns, Judge, balance_errors, by_certificate, of_stiff
 from sympflow.training.trainer import fit_flow
 from sympflow.workers import WorkerPool
 
@@ -133,13 +114,13 @@ class Recipe:
     def _stage(self, told: dict[str, Any], k: int) -> tuple[Fit, Solver]:
         cls, shape = self._shape()
         cls = LossFit if k and cls is NetworkFit else cls
-        left_out = {"data", "loss", *(WEIGHTS if cls is PrimedFit else ())}
+        left_out = {"data", "loss", *(fits.WEIGHTS if cls is PrimedFit else ())}
         options = {n: told[n] for n in cls.names() if told.get(n) is not None and n not in left_out}
         if cls is PrimedFit:
             options = {"energy_weight": 0.0, **options}  # as before there was one
         if not k:
             options |= shape
-        solver = SOLVERS.get(told["optimizer"], GaussNewton)
+        solver = fits.SOLVERS.get(told["optimizer"], GaussNewton)
         return cls(**options), solver(**{n: told[n] for n in solver.names() if told.get(n) is not None})
 
     def _shape(self) -> tuple[type[Fit], dict[str, Any]]:
@@ -181,19 +162,19 @@ class Recipe:
         flow, certificate = self.flow, self.flow.certified
         scene = self.name.partition("-")[0]
         if isinstance(flow, ClockedFlow):
-            return ByClock()
+            return ByRuns()
         if isinstance(flow, SplitFlow):
-            return OfStiff()
+            return of_stiff
         if not isinstance(flow, PrimedFlow):
-            return AsPublished(*INITIAL[scene]) if scene in INITIAL else ByCertificate(cost=network_cost)
+            return AsPublished(*INITIAL[scene]) if scene in INITIAL else by_certificate
         if scene == "outer_solar_system":
-            return ByRuns(along_the_orbit, 1e5 * YEAR, 100 * YEAR)
+            return ByRuns(states=along_the_orbit, t_end=1e5 * YEAR, t_certified=100 * YEAR)
         if flow.shape.timed:
-            return ByBalance()
+            return ByRuns(balance_errors)
         if certificate is None:
-            return ByCertificate()
-        sizes = {name: getattr(certificate, name) for name in ("states", "times", "held_out")}
-        return ByCertificate(certificate.t_end, **sizes)
+            return by_certificate
+        sizes = {name: getattr(certificate, name) for name in ("t_end", "states", "times", "held_out")}
+        return partial(by_certificate, **sizes)
 
     def fitted(self, progress: bool | None = None) -> FlowMap:
         """The flow made again, not judged yet."""
