@@ -339,17 +339,17 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     if integrator.trained:
         return
     seen = LOOKED_AT * (not few) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
-    fixed = isinstance(integrator, FixedStep) and not known
+    fixed = integrator if isinstance(integrator, FixedStep) and not known else None
     if not system.keeps_energy:
-        if fixed and n and n_steps >= FEW_STEPS and (told := _too_fast(outcome, integrator, problem)):
+        if fixed and n and n_steps >= FEW_STEPS and (told := _too_fast(outcome, fixed, problem)):
             warn(told, RuntimeWarning)
         return
     if not n or not seen or system.between_impulses is not system:
         return
     off = _energy_off(outcome, problem, seen, dt is None)
     told = "the energy of the run " + ("overflows" if off == math.inf else f"is off by {100 * off:.2g} %")
-    if off <= TOO_LONG and fixed and integrator.in_another_time and n_steps <= MOST_AGAIN:
-        off = _end_off(outcome, integrator, problem)
+    if off <= TOO_LONG and fixed and fixed.in_another_time and n_steps <= MOST_AGAIN:
+        off = _end_off(outcome, fixed, problem)
         told = f"with half of it the run ends {100 * off:.2g} % of its size away"
     if off > TOO_LONG:
         what, remedy = "`rtol` is too large", "Take rtol=1e-8, or a method of fixed steps with tol=1e-6"

@@ -40,9 +40,7 @@ def landings(
             "pulse. Solve in shorter intervals, or by a fixed `dt` that divides all pieces between jumps."
         )
     elif dt is not None:
-        t = np.array(times)
-        x = (t - t0) / dt
-        within = t[np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(t)) / dt)]
+        within = _within(times, t0, dt)
         ends = [t for t in (t0, t1) if at_ends and _jumps_into(system, t, t0, t1, dt)]
         times = sorted([*ends, *times], reverse=t1 < t0)
         if len(within):
@@ -57,13 +55,24 @@ def landings(
                 f"at one, at t = {times[0]:.6g}: it is of first order there. Use one that takes none, such as "
                 "'leapfrog', 'kahan_li8' or 'gauss_legendre6'."
             )
-    kinks = kinks and dt is not None and (integrator.order or 0) > 2
-    for bent in (True,) * kinks + (False,) * bool(said) if able and not integrator.forces_beyond(system) else ():
-        met = system.jump_times(min(t0, t1), max(t0, t1), step, True).tolist() if bent else times
-        # all times are known, of which the first ones may be listed
+    if not able or integrator.forces_beyond(system):
+        return said, []
+    cuts = [(times, False)] if said else []
+    if kinks and dt is not None and (integrator.order or 0) > 2:
+        bends = system.jump_times(min(t0, t1), max(t0, t1), step, True)
+        if len(_within(bends, t0, dt)):
+            cuts.insert(0, (sorted({*bends.tolist(), *times}), True))
+    for met, bent in cuts:  # all times are known, of which the first ones may be listed
         if 0 < len(met) <= MOST_LANDINGS and not len(system.jump_times(max(met), max(t0, t1), step, bent)):
             return "", met
     return said, []
+
+
+def _within(times: Any, t0: float, dt: float) -> np.ndarray:
+    """The times (n,) that are no ends of steps from t0."""
+    t = np.array(times)
+    x = (t - t0) / dt
+    return t[np.abs(x - np.round(x)) > np.maximum(1e-9, 8 * EPS * np.maximum(abs(t0), np.abs(t)) / dt)]
 
 
 def _jumps_into(system: HamiltonianSystem, t: float, t0: float, t1: float, dt: float) -> bool:
