@@ -227,6 +227,14 @@ def test_impulses_without_a_meaning_are_refused_where_a_run_meets_them(H, words)
     assert solve(system, "leapfrog", (0, 0.5), backend="array").success
 
 
+def test_outputs_between_impulses_move_with_their_times():
+    system = made(p**2 / 2 + q**2 / 2 - q * sp.DiracDelta(t - 1) / 4, time="t", y0=[1.0, 0.0])
+    start, end = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (0.0, 2.0))
+    solve(system, "kahan_li8", (start, end), dt=0.01).y[0, -1].backward()  # q = cos(t1 − t0) + sin(t1 − 1)/4
+    assert float(start.grad) == pytest.approx(math.sin(2), abs=1e-10)
+    assert float(end.grad) == pytest.approx(math.cos(1) / 4 - math.sin(2), abs=1e-10)
+
+
 # jumps in states -----------------------------------------------------------------------------------
 
 NEAR_LJ = "Piecewise((4*(r**-12 - r**-6) + s, r < 2.5), (0, True))"
