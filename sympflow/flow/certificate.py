@@ -18,11 +18,9 @@ QUANTILE, CONFIDENCE = 0.95, 0.99  # of the energy errors, and that its limit is
 
 
 def upper_limit(values: np.ndarray, quantile: float = QUANTILE, confidence: float = CONFIDENCE) -> float:
-    """Return an upper confidence limit of a quantile of |values|, of any distribution: an order statistic [1]_.
+    """Return an upper confidence limit of a quantile of |values|, an order statistic; NaN counts as infinite.
 
-    Of fewer than 90 values it is the largest. What is not finite counts as infinite.
-
-    .. [1] W. J. Conover, Practical Nonparametric Statistics, 3rd ed., 1999, section 3.2.
+    It holds for any distribution (Conover, Practical Nonparametric Statistics, 1999, 3.2).
     """
     from scipy.stats import binom
 

@@ -26,12 +26,7 @@ FIRST_STEP, SHRINK = 0.2, 0.65  # how far these are, in standard deviations of Î
 
 
 def certify(
-    flow: Any,
-    system: HamiltonianSystem,
-    domain: Domain,
-    weights: str,
-    size: Mapping[str, int],
-    t_end: float,
+    flow: Any, system: HamiltonianSystem, domain: Domain, weights: str, size: Mapping[str, int], t_end: float
 ) -> Certificate:
     """Find the certificate of a flow on a domain: `FlowMap.certificate`; `weights` is their checksum."""
     states, times, held_out, seed = (size[name] for name in ("states", "times", "held_out", "seed"))

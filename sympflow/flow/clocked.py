@@ -50,9 +50,6 @@ class ClockPotential(Potential):
         advance = sum((c * t ** (3 + 2 * k) * B**k for k, c in enumerate(self.numbers)), 0 * B)
         return torch.cat([torch.zeros_like(x[:-1]), advance[None]])
 
-    def to_dict(self) -> dict[str, Any]:
-        return {"type": "clock"}
-
 
 @dataclass(frozen=True)
 class Share:
@@ -121,7 +118,7 @@ class ClockedFlow(SystemFlow):
         """Return the c_k that the clock has now, the last one first."""
         return self._numbers.current(lambda: tuple(doubles(self.clock.numbers)[::-1].tolist()))
 
-    def _compiled_for(self, system: HamiltonianSystem) -> ClockedFlowKernel:
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> ClockedFlowKernel:
         from sympflow.flow.loops import ClockedFlowKernel
 
         return ClockedFlowKernel(self.scheme, system, self.advance)

@@ -45,13 +45,9 @@ TOLERANCE = 1e-10
 class CollocationLayer(OwnLayer):
     """One step χ_{t/m} of a Gauss method."""
 
-    kind = "collocation"
-
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._step(t / self.flow.steps, q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._step(-t / self.flow.steps, q, p)
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        h = (-t if back else t) / self.flow.steps
+        return self.flow.ended(y, self.flow.stages_of(y, h)[0], h)
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         flow, y, h = self.flow, torch.cat([q, p]).T, -t / self.flow.steps
@@ -59,20 +55,8 @@ class CollocationLayer(OwnLayer):
         K, _ = flow.stages_of(y, h)  # of the way back, whose stages are those of the step
         A = torch.as_tensor(flow.tableau[0], dtype=y.dtype, device=y.device)
         mean = (flow.weights * flow.bound_system.hamiltonian(y[:, None, :] + A @ K)).sum(-1)
-        return (*_halves(flow.ended(y, K, h).T), mean / flow.steps)
-
-    def _step(self, h: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        y = torch.cat([q, p]).T
-        return _halves(self.flow.ended(y, self.flow.stages_of(y, h)[0], h).T)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind}
-
-
-def _halves(y: Tensor) -> tuple[Tensor, Tensor]:
-    """The q and p of columns (2d, N)."""
-    q, p = y.chunk(2)
-    return q, p
+        q, p = flow.ended(y, K, h).T.chunk(2)
+        return q, p, mean / flow.steps
 
 
 class CollocatedFlow(SystemFlow):
@@ -174,7 +158,7 @@ class CollocatedFlow(SystemFlow):
         """The states (N, 2d) at the end of that step."""
         return collocation.advanced(self.bound_system, self.tableau, y, K, per_state(h, y))
 
-    def _compiled_for(self, system: HamiltonianSystem) -> CollocatedFlowKernel:
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> CollocatedFlowKernel:
         from sympflow.flow.loops import CollocatedFlowKernel
 
         return CollocatedFlowKernel(system, self.tableau, self.steps)

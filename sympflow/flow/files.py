@@ -102,10 +102,7 @@ def _finite(value: Any) -> Any:
 
 
 def load(
-    path: str | os.PathLike[str],
-    *,
-    system: HamiltonianSystem | None = None,
-    device: torch.device | str | None = None,
+    path: str | os.PathLike[str], *, system: HamiltonianSystem | None = None, device: torch.device | str | None = None
 ) -> Any:
     """Read a flow from a file that `flow.save` wrote.
 

@@ -63,7 +63,7 @@ class Layer(nn.Module):
 
 
 class OwnLayer(Layer):
-    """A layer that takes its numbers and functions from its flow."""
+    """A layer that takes its numbers and functions from its flow, and moves rows of states by `moved`."""
 
     def __init__(self, flow: Any) -> None:
         super().__init__()
@@ -73,6 +73,17 @@ class OwnLayer(Layer):
     @property
     def flow(self) -> Any:
         return self._of[0]
+
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        """φ_t(y), or φ_t⁻¹(y), of rows (N, 2d)."""
+        raise NotImplementedError
+
+    def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
+        q, p = self.moved(t, torch.cat([q, p]).T, back).T.chunk(2)
+        return q, p
+
+    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return self.forward(t, q, p, back=True)
 
 
 class Binding:
@@ -119,11 +130,12 @@ class PotentialLayer(Layer):
     def _moved(self, q: Tensor, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
         return (q, p - g) if self.kind == "kick" else (q + g, p)
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(q, p, self.potential.impulse(t, self._argument(q, p)))
+    def forward(self, t: Time, q: Tensor, p: Tensor, back: bool = False) -> tuple[Tensor, Tensor]:
+        g = self.potential.impulse(t, self._argument(q, p))
+        return self._moved(q, p, -g if back else g)
 
     def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._moved(q, p, -self.potential.impulse(t, self._argument(q, p)))
+        return self.forward(t, q, p, back=True)
 
     def tangent(self, t: Time, q: Tensor, p: Tensor, dq: Tensor, dp: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         g, dg = self.potential.impulse_and_tangent(t, self._argument(q, p), self._argument(dq, dp))

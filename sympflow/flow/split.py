@@ -26,7 +26,7 @@ from sympflow.flow.potentials import Time, by_time
 from sympflow.flow.records import MAX_DEGREE, MAX_LAYERS, MAX_PARAMETERS, Refused, checked_integer
 from sympflow.flow.sympflow import SystemFlow
 from sympflow.flow.tables import Memory, Total
-from sympflow.flow.weights import Kept, check_compilable, doubles
+from sympflow.flow.weights import Kept, doubles
 from sympflow.hamiltonian.expression import Unreadable, read
 from sympflow.hamiltonian.fingerprint import check_for_flows
 from sympflow.hamiltonian.parts import LINEAR, ExactParts, SubFlow, exact_parts, map_evaluations
@@ -42,16 +42,12 @@ FILTERED = ("oscillator", "hyperbolic")
 
 
 class KeptMaps(Memory):
-    """The maps of fixed numbers, the same objects for the same step, and what they cost; `placement` is asked once."""
+    """The maps of fixed numbers, the same objects for the same step, and what they cost."""
 
-    def __init__(
-        self, make: Callable[[np.ndarray], list[SubFlow]], coefficients: list[SubFlow], dt: float, like: Tensor
-    ) -> None:
+    def __init__(self, make: Callable[[np.ndarray], list[SubFlow]], coefficients: list[SubFlow], dt: float) -> None:
         super().__init__(MOST_KEPT)
         self._make, self._dt = make, dt
-        self.kernel: SplitFlowKernel | None = None  # the compiled loops that were made of these last
         self._coefficients = coefficients, [m.inverse() for m in reversed(coefficients)]
-        self.placement = like.dtype, like.device
 
     def maps(self, t: float) -> list[SubFlow]:
         return self.kept(t, lambda: self._make(np.array(t)))
@@ -70,14 +66,11 @@ class SplitLayer(OwnLayer):
 
     def __init__(self, flow: SplitFlow, index: int) -> None:
         super().__init__(flow)
-        self.index, self.part = index, flow.sequence[index]
-        self.kind = "linear" if self.part == LINEAR else flow.kinds[self.part - 1]  # type: ignore[misc]
+        self.index = index
 
-    def forward(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._apply_map(self.flow.maps(t)[self.index], q, p)
-
-    def inverse(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        return self._apply_map(self.flow.maps(t)[self.index].inverse(), q, p)
+    def moved(self, t: Time, y: Tensor, back: bool) -> Tensor:
+        m, parts = self.flow.maps(t)[self.index], self.flow.parts
+        return parts.from_modes(*parts.apply([m.inverse() if back else m], *parts.to_modes(y)))
 
     def pull_back(self, t: Time, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         q, p = self.inverse(t, q, p)
@@ -95,14 +88,6 @@ class SplitLayer(OwnLayer):
             return V
 
         return q, p, by_time(generator, q)[1]
-
-    def _apply_map(self, m: SubFlow, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        parts = self.flow.parts
-        y = parts.from_modes(*parts.apply([m], *parts.to_modes(torch.cat([q, p]).T))).T
-        return y.chunk(2)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"kind": self.kind, "part": self.part}
 
 
 class SplitFlow(SystemFlow):
@@ -225,9 +210,7 @@ class SplitFlow(SystemFlow):
 
     def frozen(self) -> KeptMaps:
         """Return the maps of the numbers that the flow has now."""
-        return self._maps.current(
-            lambda: KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt, self._maps.first())
-        )
+        return self._maps.current(lambda: KeptMaps(self._numpy_maps, self._coefficient_maps(), self.dt))
 
     def _numpy_maps(self, t: np.ndarray) -> list[SubFlow]:
         maps = self._assemble(
@@ -238,9 +221,7 @@ class SplitFlow(SystemFlow):
     def _coefficient_maps(self) -> list[SubFlow]:
         """The maps with the coefficients of the columns, (K, …), in place of their values."""
         return self._assemble(
-            lambda column: doubles(column.table),
-            lambda entries: np.stack(entries, axis=-1),
-            np.eye(1, self.terms)[0],
+            lambda column: doubles(column.table), lambda entries: np.stack(entries, axis=-1), np.eye(1, self.terms)[0]
         )
 
     def _assemble(self, values: Any, stack: Any, unity: Any = None) -> list[SubFlow]:
@@ -278,15 +259,10 @@ class SplitFlow(SystemFlow):
         parts = self.parts
         return parts.from_modes(*parts.apply(maps, *parts.to_modes(y.T))).T
 
-    def _loops_for(self, system: HamiltonianSystem) -> SplitFlowKernel:
-        flow = self.bound(system)
-        frozen = flow.frozen()
-        if frozen.kernel is None or frozen.kernel.parts is not flow.parts:
-            from sympflow.flow.loops import SplitFlowKernel
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> SplitFlowKernel:
+        from sympflow.flow.loops import SplitFlowKernel
 
-            check_compilable(*frozen.placement)
-            frozen.kernel = SplitFlowKernel(frozen, flow.parts, flow.dt)
-        return frozen.kernel
+        return SplitFlowKernel(self.frozen(), self.parts, self.dt)
 
     def evaluations(self, n_steps: int, n_saved: int, n_extra: int, backend: str) -> dict[str, int]:
         return self.frozen().evaluations(n_steps, n_saved, n_extra, backend)

@@ -538,10 +538,19 @@ class SympFlow(FlowMap):
                 _check_storable(layer)
         super().save(path)
 
-    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
+    @property
+    def _kept_kernels(self) -> Kept[Any]:
+        """The compiled loops of the numbers that the flow has now."""
         if self._network is None:
-            self._network = Kept(d for m in self.modules() for d in (m._parameters, m._buffers))
-        return self._network.current(self._compiled)
+            self._network = Kept(self._kept_tensors())
+        return self._network
+
+    def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
+        """The tensors that compiled loops are made of, which they are compared with in every run."""
+        return (d for m in self.modules() for d in (m._parameters, m._buffers))
+
+    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
+        return self._kept_kernels.current(self._compiled)
 
     def _compiled(self) -> MLPFlowKernel:
         from sympflow.kernels.networks import MLPFlowKernel
@@ -616,10 +625,6 @@ class SystemFlow(SympFlow):
         super().__init__(ndof, dt=dt, layers=())
         self._like: dict[str, Any] = {"dtype": checked_dtype(dtype), "device": checked_device(device)}
         self._binding = Binding(None, self.MADE)
-        self._loops: tuple[HamiltonianSystem, Any] | None = None  # compiled, of the system that was asked for last
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_loops": None}  # copies and pickles make their own
 
     def plan(self) -> dict[str, Any]:
         """The numbers that describe the flow, JSON-able."""
@@ -665,13 +670,18 @@ class SystemFlow(SympFlow):
     def bound(self, system: HamiltonianSystem) -> Self:
         return self if self._binding.known else self.bind(system)
 
-    def _loops_for(self, system: HamiltonianSystem) -> Kernel:
-        check_compilable(self.dtype, self.device)
-        if self._loops is None or self._loops[0] is not system:
-            self._loops = system, self._compiled_for(system)
-        return self._loops[1]
+    def _kept_tensors(self) -> Iterable[Mapping[str, Tensor | None]]:
+        return (self._buffers, *(m._parameters for m in self.modules()))  # the bases of columns are no numbers
 
-    def _compiled_for(self, system: HamiltonianSystem) -> Kernel:
+    def _loops_for(self, system: HamiltonianSystem, compensated: bool = False) -> Kernel:
+        flow = self.bound(system)
+        kernels = flow._kept_kernels.current(dict)
+        if compensated not in kernels or kernels[compensated][0] is not system:
+            check_compilable(flow.dtype, flow.device)
+            kernels[compensated] = system, flow._compiled_for(system, compensated)
+        return kernels[compensated][1]
+
+    def _compiled_for(self, system: HamiltonianSystem, compensated: bool) -> Kernel:
         """The compiled loops of the flow on a system."""
         raise NotImplementedError
 

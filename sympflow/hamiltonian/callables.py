@@ -57,14 +57,7 @@ class CallableHamiltonian(Definition):
     _hamiltonian: Any
 
     def __init__(
-        self,
-        ndof: int,
-        potential: Callable[..., Array] | None,
-        hamiltonian: Callable[..., Array] | None,
-        gradient: Callable[..., Any] | None,
-        hessian_vector: Callable[..., Any] | None,
-        check: bool = True,
-        timed: bool = False,
+        self, ndof: int, potential: Any, hamiltonian: Any, gradient: Any, hessian_vector: Any, check: Any, timed: bool
     ) -> None:
         check_flag("check", check)
         if (potential is None) == (hamiltonian is None):
@@ -399,7 +392,8 @@ class CallableHamiltonian(Definition):
         if self._exact(x) is not None:
             return self._derived("hessian", _hessian_of, x, (), t)
         if self._hessian_vector is not None:
-            columns = [self._protected(self._hessian_vector, "hessian_vector", t, x, e) for e in _basis(x)]
+            basis = [e + 0 * x for e in like(np.eye(n), x)]
+            columns = [self._protected(self._hessian_vector, "hessian_vector", t, x, e) for e in basis]
             return stack([_checked(column, x, "hessian_vector", (n,)) for column in columns])
         if self._gradient is not None and not is_tensor(x):
             raise ValueError(
@@ -507,16 +501,6 @@ def _check_numba(potential: Any, gradient: Any, hessian_vector: Any, first: str 
         count = len(inspect.signature(function.py_func).parameters)
         if count != len(arguments.split(",")):
             raise TypeError(f"`{name}` must take ({arguments}) as a Numba function; it takes {count} arguments.")
-
-
-def _basis(x: Array) -> list[Array]:
-    """The unit vectors along the last axis, each of the shape of x."""
-    vectors = []
-    for i in range(x.shape[-1]):
-        e = 0 * x
-        e[..., i] = 1
-        vectors.append(e)
-    return vectors
 
 
 def _gradient_of(f: Callable[[Array], Array], name: str) -> Callable[[Array], Array]:

@@ -99,8 +99,7 @@ def test(functions: Tested, states: np.ndarray, example: Array, n_given: int) ->
             return
         x, V, g = kept
         _check_types(functions, x)
-        _check_repetition(functions, x, V, g)
-        _check_batches(functions, x, V, g)
+        _check_values(functions, x, V, g)
         if functions.gradient is not None:
             _check_gradient(functions, x, V, g)
         if functions.hessian_vector is not None:
@@ -147,28 +146,21 @@ def _check_types(functions: Tested, x: Array) -> None:
             )
 
 
-def _given(functions: Tested, V: np.ndarray, g: np.ndarray) -> list[tuple[str, Callable[[Array], Array], np.ndarray]]:
-    """The names of the value and of the gradient, where it is one to be tested, and their values at single states."""
-    rows = zip(functions.names, (functions.value, functions.gradient), (V, g), strict=False)
-    return [(name, function, values) for name, function, values in rows if function is not None]
-
-
-def _check_repetition(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
-    for name, function, (before, *_) in _given(functions, V, g):
-        again = _numbers(function(x[0]))
+def _check_values(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
+    """Compare the value and the gradient, where it is one to be tested, with themselves, again and in a batch."""
+    n = x.shape[-1]
+    rows = np.arange(n if 2 <= n <= EVERY_COMPONENT else 3) % len(x)  # of a square one a transposed result would fit
+    given = [*zip(functions.names, (functions.value, functions.gradient), (V, g), strict=False)]
+    for name, function, (before, *_) in given:
+        again = before if function is None else _numbers(function(x[0]))
         if not np.allclose(again, before, rtol=1e-6, atol=1e-12 * np.abs(before).max(), equal_nan=True):
             raise ValueError(
                 f"`{name}` gives another value each time: at {_shown(functions, x[0])} {_short(before)}, then "
                 f"{_short(again)}. A Hamiltonian is a function of the state alone; {REMEDY}"
             )
-
-
-def _check_batches(functions: Tested, x: Array, V: np.ndarray, g: np.ndarray) -> None:
-    """In a square batch, d states of d components, a transposed result has the right shape."""
-    n = x.shape[-1]
-    rows = np.arange(n if 2 <= n <= EVERY_COMPONENT else 3) % len(x)
-    for name, function, single in _given(functions, V, g):
-        _check_batch(functions, name, x[rows], single[rows], _numbers(function(x[rows])))
+    for name, function, single in given:
+        if function is not None:
+            _check_batch(functions, name, x[rows], single[rows], _numbers(function(x[rows])))
 
 
 def _check_batch(functions: Tested, name: str, x: Array, single: np.ndarray, batch: np.ndarray) -> None:

@@ -40,14 +40,7 @@ class LatticeHamiltonian(LocalHamiltonian):
     loops = noun = "lattice"
 
     def __init__(
-        self,
-        onsite: str | sp.Expr | None,
-        bond: str | sp.Expr | Mapping[int, str | sp.Expr] | None,
-        shape: Any,
-        boundary: Any,
-        kinetic: str | sp.Expr | None,
-        fields: Any,
-        params: Mapping[str, Any] | None,
+        self, onsite: Any, bond: Any, shape: Any, boundary: Any, kinetic: Any, fields: Any, params: Any
     ) -> None:
         self.shape = checked_shape(shape)
         self.boundary = _checked_boundary(boundary, len(self.shape))

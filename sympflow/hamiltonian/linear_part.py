@@ -549,11 +549,9 @@ class Transform:
         """θ of the waves along an axis, the phase from one site to the next: (n,), in 0 … π."""
         n = self.shape[axis]
         k = np.arange(n)
-        return {
-            "periodic": 2 * np.pi * ((k + 1) // 2) / n,
-            "fixed": np.pi * (k + 1) / (n + 1),
-            "free": np.pi * k / n,
-        }[self.boundary[axis]]
+        return {"periodic": 2 * np.pi * ((k + 1) // 2) / n, "fixed": np.pi * (k + 1) / (n + 1), "free": np.pi * k / n}[
+            self.boundary[axis]
+        ]
 
     def total(self, per_axis: Sequence[np.ndarray]) -> np.ndarray:
         """The sum of values by the waves of each axis, (n, …) each: (*shape, …)."""

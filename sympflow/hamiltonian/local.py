@@ -24,8 +24,6 @@ from sympflow.hamiltonian.definition import Definition, bare_copy
 from sympflow.hamiltonian.expression import complex_part, stated
 from sympflow.hamiltonian.symbolic import SymbolicHamiltonian, generate, printable
 
-__all__ = ["LocalHamiltonian", "check_memory", "checked_params", "named_values", "numbered", "parsed"]
-
 MOST_SPELLED = 128  # degrees of freedom
 MOST_DENSE = 50_000_000  # entries of matrices ∇²V that are made at a time
 VECTORS_OF_A_RUN = 12

@@ -152,8 +152,13 @@ class ExactParts:
                 X, Y = self.linear_flow(X, Y, m.length)
                 continue
             time = (stage_time(t, m.at, h),) if self.timed(m.part) else ()
-            if self.rest[m.part - 1].turns:
-                X, Y = self._turned(m, X, Y)
+            if self.rest[m.part - 1].turns:  # its change alone is transformed, so that transforms add no drift
+                y = self.from_modes(X, Y)
+                change = self.rest[m.part - 1].turned(y, each_mode(m.length)) - y
+                dX, dY = change[..., : self.ndof], change[..., self.ndof :]
+                if self.linear is not None:
+                    dX, dY = self.linear.coordinates(dX), self.linear.slopes(dY)
+                X, Y = X + dX, Y + dY
                 continue
             dX, dY = self.slopes(m.part, X, Y, m.filters, *time)
             length = each_mode(m.length)
@@ -184,15 +189,6 @@ class ExactParts:
             Y = Y - length * linear.slopes(of.gradient(y, *time)[..., :d])
             P = P - each_mode(length) * linear.slopes(of.hessian_vector(y[..., None, :], linear.positions(U), *time))
         return (X, Y), (U, P)
-
-    def _turned(self, m: SubFlow, X: Array, Y: Array) -> tuple[Array, Array]:
-        """The flow of a part that brings its own: its change alone is transformed, so that transforms add no drift."""
-        y = self.from_modes(X, Y)
-        change = self.rest[m.part - 1].turned(y, each_mode(m.length)) - y
-        dX, dY = change[..., : self.ndof], change[..., self.ndof :]
-        if self.linear is None:
-            return X + dX, Y + dY
-        return X + self.linear.coordinates(dX), Y + self.linear.slopes(dY)
 
     def linear_flow(self, X: Array, Y: Array, s: Any) -> tuple[Array, Array]:
         """The linear part over the times s (..., F), or by the shears that `prepared` has put in their place."""

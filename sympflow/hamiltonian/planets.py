@@ -68,12 +68,7 @@ class Frame:
     """
 
     def __init__(
-        self,
-        local: PairsHamiltonian,
-        G: float,
-        y0: np.ndarray,
-        coordinates: str = "jacobi",
-        encounter: float | None = 1.0,
+        self, local: Any, G: float, y0: np.ndarray, coordinates: str = "jacobi", encounter: float | None = 1.0
     ) -> None:
         self.local, self.G, self.coordinates, self.encounter = local, G, coordinates, encounter
         masses = self.masses = local.masses
@@ -337,14 +332,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
     extra: sp.Expr | None = None
 
     def __init__(
-        self,
-        masses: Any,
-        G: float,
-        y0: np.ndarray,
-        coordinates: Any,
-        encounter: Any,
-        extra: Any = None,
-        params: Any = None,
+        self, masses: Any, G: float, y0: Any, coordinates: Any, encounter: Any, extra: Any = None, params: Any = None
     ) -> None:
         if coordinates not in COORDINATES:
             raise ValueError(f"`coordinates` must be 'jacobi' or 'democratic'; got {coordinates!r}.")
@@ -469,12 +457,7 @@ class PlanetsHamiltonian(PairsHamiltonian):
         return self.felt is None and self.extra is None and super().is_few
 
     def written_potential(
-        self,
-        q: Sequence[sp.Expr],
-        softening: sp.Expr,
-        columns: Sequence[Sequence[sp.Expr]],
-        c: Mapping[sp.Symbol, sp.Expr],
-        box: Sequence[sp.Expr] = (),
+        self, q: Sequence[Any], softening: Any, columns: Sequence[Any], c: Mapping[Any, Any], box: Sequence[Any] = ()
     ) -> sp.Expr:
         V = super().written_potential(q, softening, columns, c, box)
         if self.extra is None:

@@ -13,8 +13,6 @@ import sympy as sp
 
 from sympflow.hamiltonian.removable import Min, bose, elliptic_e, elliptic_k
 
-__all__ = ["LatticePoles", "PairsPoles", "Place", "Poles", "SymbolicPoles", "places"]
-
 FACTORED = 8  # letters of a polynomial, at most, that is split into factors
 MOST_SHOWN = 100  # characters of terms
 DIGITS, HALVINGS = 50, 100  # of the arithmetic in which H is judged beside such a place, and of the way to it

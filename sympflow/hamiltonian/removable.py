@@ -12,8 +12,6 @@ import sympy as sp
 from sympy.codegen.cfunctions import expm1, log1p
 from sympy.core.sorting import ordered
 
-__all__ = ["BOUNDED", "Max", "Min", "bose", "expit", "hyp2f1", "logcosh", "sinc", "softplus", "with_own_functions"]
-
 _X = sp.Symbol("x", real=True)
 TERMS = 14  # of the series of sin(x)/x, enough for its first derivatives too
 SERIES_UP_TO = 2.0

@@ -13,8 +13,7 @@ from sympflow.arrays import Array, concatenate, library
 from sympflow.arrays import like as as_like
 from sympflow.hamiltonian.definition import Definition
 from sympflow.hamiltonian.domain import Domain
-from sympflow.hamiltonian.scene import Scene
-from sympflow.hamiltonian.system import HamiltonianSystem, Parameters
+from sympflow.hamiltonian.system import HamiltonianSystem, Parameters, Scene
 from sympflow.lazy import lately_kept
 
 if TYPE_CHECKING:
@@ -111,7 +110,7 @@ def default_shift(system: HamiltonianSystem) -> float:
 @lately_kept
 def _energy(system: HamiltonianSystem, y0: bytes) -> float:
     """H at the system's y0, kept: every run asks for it several times."""
-    return float(system.hamiltonian(np.frombuffer(y0)))
+    return float(system.hamiltonian(np.frombuffer(y0).copy()))
 
 
 def checked_shift(shift: Any) -> float:

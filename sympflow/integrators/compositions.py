@@ -257,8 +257,11 @@ class KineticPotential(Composition):
                     products = system.hessian_vector(q[..., None, :], U.swapaxes(-1, -2), at).swapaxes(-1, -2)
                 change = (c * h)[..., None] * products
                 if substep.three:
-                    G = (substep.three * h**3)[..., None] * _force_gradient_jvp(system, q, U, at)
-                    change = change + G
+                    x, along = q[..., None, :], U.swapaxes(-1, -2)
+                    v = system.velocity(system.force(q, at))[..., None, :]
+                    G = system.third_derivative(x, v + 0 * along, along, at)
+                    G = G - system.hessian_vector(x, system.velocity(system.hessian_vector(x, along, at)), at)
+                    change = change + (substep.three * h**3)[..., None] * G.swapaxes(-1, -2)
                 P = P - change
                 p = p + _kick(system, q, substep, h, self.scheme.monomials, at)
         return np.concatenate([q, p], axis=-1), np.concatenate([U, P], axis=-2)
@@ -306,14 +309,6 @@ def _velocities(system: HamiltonianSystem, p: Array, P: np.ndarray) -> np.ndarra
     if not system.quadratic_kinetic:
         return system.kinetic_hessian(p) @ P
     return system.velocity(P.swapaxes(-1, -2)).swapaxes(-1, -2)
-
-
-def _force_gradient_jvp(system: HamiltonianSystem, q: Array, U: np.ndarray, t: Any = None) -> np.ndarray:
-    """The derivatives along vectors (..., d, k) of the force gradient's ∇²V·M⁻¹F, F = −∇V; of a system by one piece."""
-    x, along = q[..., None, :], U.swapaxes(-1, -2)
-    v = system.velocity(system.force(q, t))[..., None, :]
-    turned = system.hessian_vector(x, system.velocity(system.hessian_vector(x, along, t)), t)
-    return (system.third_derivative(x, v + 0 * along, along, t) - turned).swapaxes(-1, -2)
 
 
 # exact flows of parts ------------------------------------------------------------------------------

@@ -28,16 +28,7 @@ from sympflow.arrays import (
     unfollowed,
 )
 from sympflow.events import EventSearch
-from sympflow.integrators.contract import (
-    ENDED,
-    FINISHED,
-    INTERRUPTED,
-    Failure,
-    Outcome,
-    Problem,
-    finished,
-    interrupted,
-)
+from sympflow.integrators.contract import ENDED, FINISHED, INTERRUPTED, Failure, Outcome, Problem, finished, interrupted
 from sympflow.integrators.grid import Grid, Outputs, distinct
 from sympflow.integrators.interpolants import DenseOutput
 from sympflow.integrators.steppers import Stepper, shorter_steps

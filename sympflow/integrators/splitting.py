@@ -398,7 +398,8 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
     search = problem.events
     lifted, before = None, []
     if search is not None:  # which may go on from an earlier piece of the run
-        lifted, before = EventSearch(_of_projections(search, extension), search.max_interval), search.found
+        projected = (replace(e, g=lambda t, x, g=e.g: g(t, extension.project(x))) for e in search.events)  # type: ignore
+        lifted, before = EventSearch(tuple(projected), search.max_interval), search.found
         lifted.found, lifted.values, lifted.n_dense = [[*zeros] for zeros in before], search.values, search.n_dense
     store = problem.store
     if store is not None:
@@ -430,13 +431,6 @@ def _extended_run(run: Callable[[Problem], Outcome], extension: Composition, pro
     if stopped is not None:
         raise stopped
     return outcome
-
-
-def _of_projections(search: EventSearch, extension: Composition) -> Any:
-    return tuple(
-        replace(event, g=lambda t, x, g=event.g: g(t, extension.project(x)))  # type: ignore[misc]
-        for event in search.events
-    )
 
 
 def _noted(store: RunStore, extension: Composition, x: np.ndarray) -> np.ndarray:

@@ -183,6 +183,7 @@ def compiled_loops(
     system: Any = None,
 ) -> Any:
     """Return the compiled loops that `make` gives, or None where the call needs, or asks for, array operations.
+
     Tensors need these, but where the `system` is given: there those on the CPU are compiled.
     """
     reason = None

@@ -13,8 +13,6 @@ from sympflow.arguments import check_not_followed
 from sympflow.arrays import detached, differentiable, to_numpy, transformed
 from sympflow.kernels.protocol import RunCheckpoint, Task
 
-__all__ = ["MovingTimes", "rolled_out", "stepped"]
-
 
 def rolled_out(
     stepper: Any, y0: Tensor, h: float, n_steps: int, save: np.ndarray, t0: float, carry: RunCheckpoint | None

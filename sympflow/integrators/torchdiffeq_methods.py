@@ -16,16 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from sympflow.arguments import check_dt
-from sympflow.arrays import (
-    Array,
-    differentiable,
-    full_of_nan,
-    is_tensor,
-    readable,
-    stack,
-    to_numpy,
-    transformed,
-)
+from sympflow.arrays import Array, differentiable, full_of_nan, is_tensor, readable, stack, to_numpy, transformed
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.integrators.base import FixedStep, OwnSteps, Recorder
 from sympflow.integrators.contract import (
@@ -253,13 +244,20 @@ def run_in_parts(method: Watched, problem: Problem, joint: Outcome, trace: Trace
     stats: dict[str, Any] = {**counts, "backend": "torchdiffeq"}
     if not done.all():
         stats["failed_at"] = np.where(done, np.nan, reached).reshape(batch)
-    outcome = Outcome(
-        times,
-        stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape),
-        np.where(done, 0, -1).reshape(batch),
-        _message(method, batch, source, done, unfinished, reached) or finished(problem),
-        stats,
-    )
+    said = []
+    if len(failed := np.flatnonzero(~done & ~unfinished)):
+        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
+    if unfinished.any():
+        first = np.argmax(unfinished)
+        said.append(
+            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
+            f"because some of its trajectories fail, ended before {unfinished.sum()} of {n} trajectories: they are "
+            f"kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
+            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
+        )
+    y = stack([run.y[:, j] for run, j in source], axis=1).reshape(len(times), *problem.y0.shape)
+    status = np.where(done, 0, -1).reshape(batch)
+    outcome = Outcome(times, y, status, " ".join(said) or finished(problem), stats)
     if problem.dense_output:
         outcome.sol = Batch([(run.sol, j) for run, j in source], batch, (problem.t0, problem.t1))
     return outcome
@@ -280,29 +278,6 @@ def _divided(problem: Problem, part: np.ndarray, trace: Trace) -> list[np.ndarra
         gaps = np.nan_to_num(rates[order[1:]] / rates[order[:-1]], nan=1.0)
     cut = int(np.argmax(gaps)) + 1 if gaps.max() > 10 else len(part) // 2
     return [np.sort(part[order[:cut]]), np.sort(part[order[cut:]])]
-
-
-def _message(
-    method: Watched,
-    batch: tuple[int, ...],
-    source: list[tuple[Outcome, int]],
-    done: np.ndarray,
-    unfinished: np.ndarray,
-    reached: np.ndarray,
-) -> str:
-    said = []
-    failed = np.flatnonzero(~done & ~unfinished)
-    if len(failed):
-        said.append(f"Trajectory {_index(failed[0], batch)}: {source[failed[0]][0].message}")
-    if unfinished.any():
-        first = np.argmax(unfinished)
-        said.append(
-            f"`max_num_steps` = {method.most_steps} steps, in sum over the batch and the parts that it was run in "
-            f"because some of its trajectories fail, ended before {unfinished.sum()} of {len(done)} trajectories: they "
-            f"are kept up to where they were, trajectory {_index(first, batch)} up to t = {reached[first]:.15g}. Raise "
-            "`max_num_steps`, or solve those that fail in another call, or end `t_span` before they do."
-        )
-    return " ".join(said)
 
 
 def _index(i: Any, batch: tuple[int, ...]) -> str:

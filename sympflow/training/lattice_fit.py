@@ -21,10 +21,10 @@ from sympflow.hamiltonian.lattice import BOUNDARIES
 from sympflow.hamiltonian.lattice_states import DRAWN, LatticeStates
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training.fits import PrimedFit
-from sympflow.training.least_squares import Check
+from sympflow.training.least_squares import Check, Problem
 from sympflow.training.points import Labels, Stream, shares_missed, states, step_errors
 from sympflow.training.starts import frequency
-from sympflow.training.table_fit import RunsFit, Table
+from sympflow.training.table_fit import Table
 
 MOST_FITTED = 16
 """Degrees of freedom up to which a lattice is fitted as it is, and not by a subsystem."""
@@ -145,7 +145,7 @@ PROBE = 1e-6
 """Step of differences, in units of Δt or of the number that is changed, if that is more."""
 
 
-class EnergyRuns(RunsFit):
+class EnergyRuns(Problem):
     """Relative energy errors in runs of a lattice, as a function of the frozen parameters of a flow."""
 
     compiled = True

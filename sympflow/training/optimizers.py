@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -16,25 +16,10 @@ from sympflow.flow.flow_map import FlowMap
 from sympflow.training import fits
 from sympflow.training.fits import Solver
 from sympflow.training.least_squares import GaussNewtonSteps, check_parameters, put_weights, weight_vector
-from sympflow.training.losses import Objective
 from sympflow.training.session import OutOfTime
 
 ITERATIONS = 20  # of quasi-Newton methods, in a step
 MEMORY = 30
-
-
-class Optimizer(Protocol):
-    """A method that lowers an objective of the flow that it was made for."""
-
-    finished: str | None
-    needs_residuals: ClassVar[bool]
-
-    def step(self, index: int, objective: Objective) -> float:
-        """Take a step; the loss before it."""
-
-    def state_dict(self) -> dict[str, Any]: ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
 class _TorchSteps:
@@ -206,6 +191,10 @@ class BFGSSteps:
         value.backward()
         gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in self.parameters]
         return float(value.detach()), torch.cat([g.reshape(-1) for g in gradients])
+
+
+Optimizer = AdamSteps | LBFGSSteps | BFGSSteps | GaussNewtonSteps
+"""A method whose `step` lowers an objective of the flow that it was made for, and returns the loss before it."""
 
 
 def optimizer(flow: FlowMap, solver: Solver) -> Optimizer:

@@ -69,33 +69,22 @@ def states(domain: Domain, n: int, seed: int, stream: Stream, block: int = 0) ->
     return domain.sample(n, stream_seed(seed, stream, block))
 
 
-def drive_times(system: HamiltonianSystem) -> tuple[float, float] | None:
-    """The times of labels where the drive has no period, those of its `t_span`; None for another system."""
-    drive = Drive.of(system)
-    return None if drive is None else drive.times
-
-
-def times_of(system: HamiltonianSystem, dt: float) -> tuple[float, float]:
-    """The interval of the times at which steps of a driven system begin: its period, or else its `t_span` less Δt."""
-    if system.period is not None:
-        return 0.0, system.period
-    low, high = min(system.t_span), max(system.t_span)
-    system.check_times(low, high)
-    if high - low <= dt:
-        raise ValueError(
-            f"`system` {system.name!r} is driven, without a `period` and for t from {low:g} to {high:g}, in which no "
-            f"step of dt = {dt:g} begins and ends: give it the period of the drive, or a longer `t_span`."
-        )
-    return low, high - dt
-
-
 def start_times(
     system: HamiltonianSystem, dt: float, n: int, seed: int, stream: Stream, block: int = 0
 ) -> np.ndarray | None:
-    """Random times (n,) at which steps of a driven system begin; None for another."""
+    """Random times (n,) at which steps of a driven system begin, in its period or its `t_span`; None for another."""
     if Drive.of(system) is None:
         return None
-    low, high = times_of(system, dt)
+    low, high = 0.0, system.period
+    if high is None:
+        low, high = min(system.t_span), max(system.t_span)
+        system.check_times(low, high)
+        if high - low <= dt:
+            raise ValueError(
+                f"`system` {system.name!r} is driven, without a `period` and for t from {low:g} to {high:g}, in which "
+                f"no step of dt = {dt:g} begins and ends: give it the period of the drive, or a longer `t_span`."
+            )
+        high -= dt
     rng = np.random.default_rng([stream_seed(seed, stream, block), int(Stream.TIMES)])
     return low + (high - low) * rng.random(n)
 

@@ -13,13 +13,14 @@ import torch
 
 from sympflow.flow.flow_map import FlowMap
 from sympflow.flow.scaling import Scaling
+from sympflow.flow.sympflow import Drive
 from sympflow.hamiltonian.domain import Domain
 from sympflow.hamiltonian.system import HamiltonianSystem
 from sympflow.training import checkpoint as checkpoints
 from sympflow.training.fits import GaussNewton, Resolved
 from sympflow.training.least_squares import STOPPED, Minimum, Problem
-from sympflow.training.points import USELESS, drive_times
-from sympflow.training.session import Deadline, Path, Session
+from sympflow.training.points import USELESS
+from sympflow.training.session import Deadline, Path, Session, shown
 
 OUT_OF_TIME = "the time budget was used up"
 NO_LABELS = "its labels were not known in their share of the time budget"
@@ -138,7 +139,7 @@ class Run(ABC):
                     self.seconds = before + session.passed
                     bar.advance(self.done, advance.loss)
                     if advance.figures is not None:
-                        bar.validated(self.done, advance.figures)
+                        bar.tries(self.done, shown(advance.figures))
                         if session.callback is not None:
                             session.callback(self.done, dict(advance.figures))
                     if session.checkpoint is not None and advance.keep:
@@ -168,7 +169,8 @@ class Run(ABC):
         flow.zero_grad(set_to_none=True)
         flow.domain = self.domain
         flow.identify(self.system, self.domain)
-        flow.drive_times = drive_times(self.system)
+        drive = Drive.of(self.system)
+        flow.drive_times = None if drive is None else drive.times
         earlier = float(flow.figures.get("training_seconds", 0.0))
         stage = {**self.record, **self.remarks(reason)}
         if self.done and not stage.get("kept_start"):

@@ -186,7 +186,7 @@ class TableRun(SearchRun):
         self.table.assign(best.x)
         self._record(best, self._keep_better(session))
 
-    def _completed_by_runs(self, session: Session, runs: RunsFit, finalists: list[Minimum]) -> bool:
+    def _completed_by_runs(self, session: Session, runs: Any, finalists: list[Minimum]) -> bool:
         """Fit the finalists to long runs and take the best; False, with a warning, where there are none to compare."""
         labels = self.weighted or self.frozen
         assert labels is not None
@@ -381,17 +381,8 @@ class StackedFit(Problem):
         return np.concatenate([w * r for w, r, _ in pieces]), np.concatenate([w * J for w, _, J in pieces])
 
 
-class RunsFit(Problem):
-    """Errors in long runs by the frozen parameters of a table."""
-
-    record: dict[str, Any]
-
-    def parameters(self, theta: np.ndarray) -> np.ndarray:
-        """The flow's parameters that make the table of `theta` at Δt."""
-        raise NotImplementedError
-
-
-MadeRuns = Callable[[PrimedFlow], RunsFit]
+MadeRuns = Callable[[PrimedFlow], Any]
+"""Errors in long runs by the frozen parameters of a flow's table: see `sympflow.training.lattice_fit.EnergyRuns`."""
 
 
 class Restricted(Problem):
@@ -487,11 +478,9 @@ class Table:
         kicks = [i for i, kind in enumerate(flow.sequence) if kind == "kick"]
         n = len(flow.sequence)
         self.n = n + flow.terms * len(kicks)
-        named = [flow.kicks, flow.drifts, flow.gradients, flow.curvatures, *(flow.polynomials or ())]
-        outside = [flow.processor_kicks, flow.processor_drifts, flow.processor_gradients, flow.processor_curvatures]
-        outside += flow.processor_polynomials or ()
-        self.columns = [c for c in (*named, *outside) if c is not None]
-        self._kernel = len([c for c in named if c is not None])
+        named = dict(flow.columns())
+        self.columns = [*named.values()]
+        self._kernel = sum(not name.startswith("processor_") for name in named)
         self._places = [np.zeros((self.n, c.offset.shape[0])) for c in self.columns]
         index = {id(c): place for c, place in zip(self.columns, self._places, strict=True)}
         for i, substep in enumerate(flow.substeps):

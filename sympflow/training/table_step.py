@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -73,7 +73,7 @@ class TableStep:
             self.loops = table_loops(system.form, each, int(level), monomials, system.friction)
 
     @cached_property
-    def _forces(self) -> Forces:
+    def _forces(self) -> Any:
         return forces_of(*self._forces_of)
 
     def _opened(self, y: np.ndarray, t0: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -215,17 +215,7 @@ def _velocity(system: HamiltonianSystem, of_time: float, p: np.ndarray) -> np.nd
 # forces ---------------------------------------------------------------------------------------------------------
 
 
-class Forces(Protocol):
-    """The terms of a kick, as many as the kicks have: F, then G and C, or those of monomials."""
-
-    def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
-        """The terms: (d, P) each."""
-
-    def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
-        """The terms, and their derivatives along directions v (k, d, P), of the same shape."""
-
-
-def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), compiled: bool = False) -> Forces:
+def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), compiled: bool = False) -> Any:
     """The forces of a separable system with T = ½ pᵀM⁻¹p: compiled ones of pairs, else those of its functions."""
     if compiled and system.local is not None and system.local.loops == "pairs":
         from sympflow.kernels.pairs import PairForces
@@ -235,7 +225,10 @@ def forces_of(system: HamiltonianSystem, level: int, monomials: Monomials = (), 
 
 
 class ArrayForces:
-    """The terms by the functions of a system; derivatives of ∇²V along v = M⁻¹∇V, and of C, are differences."""
+    """The terms of a kick by the functions of a system; derivatives of ∇²V along v = M⁻¹∇V, and of C, are differences.
+
+    They are as many as the kicks have: F, then G and C, or those of monomials.
+    """
 
     def __init__(self, system: HamiltonianSystem, level: int, monomials: Monomials = ()) -> None:
         self._given = system, level, monomials
@@ -250,12 +243,14 @@ class ArrayForces:
         return ArrayForces, self._given
 
     def values(self, q: np.ndarray) -> Sequence[np.ndarray]:
+        """The terms: (d, P) each."""
         rows = np.ascontiguousarray(q.T)
         slope = self._gradient(rows)
         G = [self._product(rows, self._velocity(slope)).T] if self._has_gradient else []
         return [-slope.T, *G, *(-term(rows).T for term in self._terms)]
 
     def along(self, q: np.ndarray, v: np.ndarray) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """The terms, and their derivatives along directions v (k, d, P), of the same shape."""
         rows, directions = np.ascontiguousarray(q.T), np.ascontiguousarray(v.swapaxes(-1, -2))  # (k, P, d)
         slope, changes = self._gradient(rows), [-self._product(rows, directions)]
         if self._has_gradient:
