@@ -305,10 +305,11 @@ def test_every_method_whose_steps_are_too_long_is_doubted(method, options, told)
         lambda system, y0: sympflow.poincare_section(system, "verlet", (0, 100), y0, coordinate="p", dt=0.55),
         lambda system, y0: sympflow.escape_times(system, "verlet", (0, 100), y0, outside=5.0, dt=0.55),
         lambda system, y0: sympflow.frequencies(system, "verlet", (0, 100), y0, dt=0.55),
+        lambda system, y0: solve(system, "verlet", (0, 100), y0, params={"k": [1.0, 1.1]}, dt=0.55),
     ],
 )
 def test_orbits_of_which_no_states_are_kept_are_doubted_too(run):
-    system = H("p**2/2 + (q**2 - 1)**2/4", y0=[1.5, 0])
+    system = H("p**2/2 + k*(q**2 - 1)**2/4", y0=[1.5, 0], params={"k": 1.0})
     with pytest.warns(RuntimeWarning, match=r"is too l.* for method .*: the energy of the run is off by"):
         run(system, np.array([[1.5, 0.0], [1.6, 0.0]]))
 

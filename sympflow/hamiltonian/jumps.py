@@ -252,6 +252,7 @@ def _roots(
         coefficients = _values([x, *others], sp.Poly(g, x).all_coeffs())(np.zeros(n), *columns)
         found = [(i, root) for i in range(n) for root in _real_roots(coefficients[:, i])]
         rows, at = np.array([i for i, _ in found], dtype=int), np.array([z for _, z in found], dtype=float)
+        rest = np.zeros(len(at))
     else:
         f = _values([x, *others], [g])
         sizes = np.logspace(-30, 30, 1201)
@@ -267,11 +268,15 @@ def _roots(
         at = _bisected(lambda z: f(z, *fixed)[0], line[k], line[k + 1])
         ulps = f(at * (1 + 64 * EPS), *fixed)[0] - f(at * (1 - 64 * EPS), *fixed)[0]
         told = np.abs(ulps) <= 1e-3 * (np.abs(value[rows, k]) + np.abs(value[rows, k + 1]))
-        rows, at = rows[told], at[told]
+        with np.errstate(all="ignore"):  # what rounding leaves of g, over its slope
+            rest = np.abs(
+                2e-6 * at * f(at, *fixed)[0] / (f(at * (1 + 1e-6), *fixed)[0] - f(at * (1 - 1e-6), *fixed)[0])
+            )
+        rows, at, rest = rows[told], at[told], np.where(np.isfinite(rest), rest, 0.0)[told]
     if x.is_positive:
-        rows, at = rows[at > 0], at[at > 0]
+        rows, at, rest = rows[at > 0], at[at > 0], rest[at > 0]
     at[np.abs(at) < 1e-30] = 0.0  # as near as the line goes
-    off = 16 * EPS * np.abs(at)
+    off = 16 * EPS * np.abs(at) + rest
     if g.is_polynomial(x):
         both = _values([x, *others], [g, sp.diff(g, x)])
         for _ in range(3):
@@ -312,11 +317,11 @@ def _bisected(f: Callable[[np.ndarray], np.ndarray], left: np.ndarray, right: np
 class Zeros:
     """The zeros of a function g of the time alone: of a linear one exactly, of a periodic one by its period."""
 
-    def __init__(self, g: sp.Expr, time: sp.Symbol) -> None:
-        self.g, self.time = g, time
+    def __init__(self, g: sp.Expr, time: sp.Symbol, samples: Mapping[str, Samples] | None = None) -> None:
+        self.g, self.time, self.samples = g, time, samples or {}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Zeros, (self.g, self.time)
+        return Zeros, (self.g, self.time, self.samples)
 
     @cached_property
     def root(self) -> float | None:
@@ -338,7 +343,9 @@ class Zeros:
 
     @cached_property
     def _of_time(self) -> Callable[..., np.ndarray]:
-        return _values([self.time], [self.g])
+        terms, symbols = with_symbols([self.g])
+        values = _values([self.time, *symbols.values()], terms)
+        return lambda t: values(t, *(_sampled_at(a, self.time, self.samples, t) for a in symbols))
 
     @cached_property
     def _slope(self) -> Callable[..., np.ndarray]:
@@ -377,7 +384,7 @@ class Switch:
     """A border at which an expression may jump in the time, with functions that are generated once."""
 
     def __init__(self, border: Border, time: sp.Symbol, samples: Mapping[str, Samples]) -> None:
-        self.zeros, self.time, self.samples = Zeros(border.g, time), time, samples
+        self.zeros, self.time, self.samples = Zeros(border.g, time, samples), time, samples
         terms, symbols = with_symbols([*border.above, *border.below])
         n = len(border.above)
         self._border = Border(border.g, tuple(terms[:n]), tuple(terms[n:]))

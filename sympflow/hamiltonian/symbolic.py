@@ -75,8 +75,8 @@ class Kick:
 def _evaluation(name: str, order: int) -> Callable[..., Array]:
     """Return a method: an expression, its gradient or its Hessian at arrays (..., n), and at times."""
 
-    def evaluate(self: SymbolicHamiltonian, x: Array, *t: Array) -> Array:
-        return self._derivative(name, order)(x, *t)
+    def evaluate(self: SymbolicHamiltonian, x: Array, *t: Array, **numbers: Any) -> Array:
+        return self._derivative(name, order)(x, *t, **numbers)
 
     return evaluate
 
@@ -361,11 +361,11 @@ class SymbolicHamiltonian(Definition):
     kinetic_gradient = _evaluation("T", 1)
     kinetic_hessian = _evaluation("T", 2)
 
-    def gradient(self, y: Array, *t: Array) -> Array:
+    def gradient(self, y: Array, *t: Array, **numbers: Any) -> Array:
         if self.separable:
             q, p = y[..., : self.ndof], y[..., self.ndof :]
-            return concatenate([self.potential_gradient(q, *t), self.kinetic_gradient(p, *t)])
-        return self._derivative("H", 1)(y, *t)
+            return concatenate([self.potential_gradient(q, *t, **numbers), self.kinetic_gradient(p, *t, **numbers)])
+        return self._derivative("H", 1)(y, *t, **numbers)
 
     def evaluated(self, name: str, expressions: list[sp.Expr]) -> Callable[..., Array]:
         """A function of y (..., 2d), and of t, that gives the values (..., n) of expressions, kept under a name."""

@@ -103,7 +103,7 @@ def diagnose(
         check_domain(outcome, integrator, between, action)
         if held and between is system:
             warn_of_loss(outcome, integrator, system, y0)
-    if held and not told and problem.diagnosed and rows is None:
+    if held and not told and problem.diagnosed and not problem.followed:
         warn_of_long_steps(outcome, integrator, problem)
 
 
@@ -341,7 +341,13 @@ def warn_of_long_steps(outcome: Outcome, integrator: Integrator, problem: Proble
     seen = LOOKED_AT * (not few) if system.ndof <= LARGE else min(LOOKED_AT, n_steps // 200)
     fixed = integrator if isinstance(integrator, FixedStep) and not known else None
     if not system.keeps_energy:
-        if fixed and n and n_steps >= FEW_STEPS and (told := _too_fast(outcome, fixed, problem)):
+        if (
+            fixed
+            and n
+            and n_steps >= FEW_STEPS
+            and problem.parameter_values is None
+            and (told := _too_fast(outcome, fixed, problem))
+        ):
             warn(told, RuntimeWarning)
         return
     if not n or not seen or system.between_impulses is not system:
@@ -388,15 +394,20 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
             for part in (problem.y0, outcome.y[every])
         )
         y = np.concatenate([*parts])[:, :LOOKED_AT].astype(float)
+    functions: Any = system
+    if problem.parameter_values is not None:
+        assert system.symbols is not None
+        functions = system.symbols.parametric
+    numbers = {} if functions is system else {"numbers": problem.parameter_values[:, :LOOKED_AT]}
     with np.errstate(all="ignore"):
         try:
-            H = np.asarray(system.hamiltonian(y))
+            H = np.asarray(functions.hamiltonian(y, **numbers))
             if (H.max(0) - H.min(0) <= TOO_LONG * np.abs(H[0])).all():
                 return 0.0
             change = np.abs(H - H[0])
             if not (change > TOO_LONG * np.abs(H[0])).any():
                 return 0.0
-            size = 0.5 * np.abs(y * np.asarray(system.gradient(y))).sum(-1)
+            size = 0.5 * np.abs(y * np.asarray(functions.gradient(y, **numbers))).sum(-1)
             size = size if each else size.max(0)
         except (ArithmeticError, ValueError, TypeError):  # a function that takes no batches
             return 0.0

@@ -56,6 +56,17 @@ def test_methods_of_high_order_keep_it_at_kinks_in_t(drive):
     np.testing.assert_allclose(sol.y, exact.y, atol=1e-9)
 
 
+def test_kinks_of_samples_are_met():
+    times = np.linspace(0, 20, 41)
+    a = CubicSpline(times, np.sin(times))
+    system = made("p**2/2 + q**2/2 - q*Max(a, 0)", time="t", params={"a": a})
+    sol = solve(system, "kahan_li8", (0, 20), [1, 0], dt=0.05)
+    exact = solve_ivp(
+        lambda s, y: [y[1], max(a(s), 0) - y[0]], (0, 20), [1, 0], "DOP853", rtol=1e-12, atol=1e-12, max_step=1e-2
+    )
+    np.testing.assert_allclose(sol.y[:, -1], exact.y[:, -1], atol=1e-8)
+
+
 def test_the_force_of_a_triangle_wave_is_that_of_its_sides():
     q = np.array([5.0, 1.0, -1.0, 2.0, 7.0])
     system = made("p**2/2 + asin(sin(q)) + 10*acos(cos(q))")
