@@ -24,8 +24,13 @@ def upper_limit(values: np.ndarray, quantile: float = QUANTILE, confidence: floa
     """
     from scipy.stats import binom
 
-    ordered = np.sort(np.where(np.isnan(values), math.inf, np.abs(values)))
+    ordered = np.sort(sizes(values))
     return float(ordered[min(int(binom.ppf(confidence, len(ordered), quantile)), len(ordered) - 1)])
+
+
+def sizes(values: np.ndarray) -> np.ndarray:
+    """|values|, and infinity for what is not a number."""
+    return np.where(np.isnan(values), math.inf, np.abs(values))
 
 
 @dataclass(frozen=True)
@@ -39,10 +44,8 @@ class Quantiles:
     @classmethod
     def of(cls, values: np.ndarray) -> Quantiles:
         """Return those of some values; NaN counts as infinite."""
-        values = np.abs(values)
-        values = np.where(np.isnan(values), math.inf, values)
         # never interpolated, which would make NaN of infinities
-        return cls(*(float(np.quantile(values, level, method="higher")) for level in (0.5, 0.95, 1.0)))
+        return cls(*(float(np.quantile(sizes(values), level, method="higher")) for level in (0.5, 0.95, 1.0)))
 
 
 @dataclass(frozen=True)
