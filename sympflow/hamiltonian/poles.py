@@ -323,7 +323,6 @@ _SINGULAR: dict[Any, Callable[..., Sequence[sp.Expr]]] = {
     sp.besselk: lambda n, a: [a],
 }
 """Expressions that vanish where a function is infinite, or ends."""
-
 _ENDING = sp.log, sp.asin, sp.acos, sp.acosh, sp.atanh, sp.LambertW, elliptic_k, elliptic_e
 _ODD = sp.sinh, sp.tanh, sp.asinh, sp.atan, sp.erf, sp.sign
 
