@@ -384,10 +384,10 @@ def _energy_off(outcome: Outcome, problem: Problem, seen: int, each: bool) -> fl
         )
         y = np.concatenate([*parts])[:, :LOOKED_AT].astype(float)
     functions: Any = system
+    numbers: dict[str, Any] = {}
     if problem.parameter_values is not None:
         assert system.symbols is not None
-        functions = system.symbols.parametric
-    numbers = {} if functions is system else {"numbers": problem.parameter_values[:, :LOOKED_AT]}
+        functions, numbers = system.symbols.parametric, {"numbers": problem.parameter_values[:, :LOOKED_AT]}
     with np.errstate(all="ignore"):
         try:
             H = np.asarray(functions.hamiltonian(y, **numbers))
