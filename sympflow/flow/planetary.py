@@ -216,7 +216,7 @@ class KeplerFlow(SystemFlow):
     @classmethod
     def checked_plan(cls, plan: dict[str, Any], ndof: int) -> dict[str, Any]:
         reach = checked_integer(plan.get("reach"), "reach", MOST_REACH)
-        gradients, periods = plan.get("gradients"), plan.get("periods")
+        gradients, periods = plan.get("gradients"), plan.get("periods", ())
         if gradients != 0:
             gradients = checked_integer(gradients, "number of force gradients", 2 * reach)
         known = isinstance(periods, list) and all(isinstance(p, float) and 0 < p < math.inf for p in periods)
