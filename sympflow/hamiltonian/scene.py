@@ -11,19 +11,23 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import floats, real_number
+from sympflow.arguments import advice, floats, real_number
 from sympflow.arrays import Array
 from sympflow.hamiltonian.domain import Domain
 
 UNNAMED = "custom"
 MEANT = {
-    **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`"),
-    **dict.fromkeys(("q0", "p0", "x0"), "the initial state is `y0`, [q, p] in one array"),
-    **dict.fromkeys(("h", "step"), "the step is `dt`"),
-    **dict.fromkeys(("mass", "m"), "masses are in T(p), or `masses` of pairs"),
+    **dict.fromkeys(("dim", "dimension", "dimensions"), "degrees of freedom of a function are `ndof`, of pairs `dim`."),
+    **dict.fromkeys(("mass",), "masses are in T(p), or `masses` of pairs."),
     **dict.fromkeys(
-        ("site", "sites", "n_sites"), "the number of sites of a lattice is `shape`, their potential `onsite`"
+        ("site", "sites", "n_sites"), "the number of sites of a lattice is `shape`, their potential `onsite`."
     ),
+    **dict.fromkeys(
+        ("V", "U"), "a potential is `potential`, a function of q, or is a part of H as text, by from_sympy."
+    ),
+    **dict.fromkeys(("H", "energy"), "H is `hamiltonian`, a function of q and p, or text, by from_sympy."),
+    **dict.fromkeys(("k", "m", "g", "constants"), "values of symbols are `params`, as params={'k': 1.0}."),
+    "names": "the bodies have numbers, from 0, in the order of `masses`.",
 }
 """Remedies for arguments that other packages have."""
 
@@ -84,9 +88,9 @@ class Scene:
             )
         for name in options:
             if name not in known:
-                instead = f": {MEANT[name]}" if name in MEANT else ""
+                remedy = MEANT.get(name) or advice(name, (*known, "params")) or "remove it."
                 raise TypeError(
-                    f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}{instead}."
+                    f"`{name}` is not an argument of this system, nor of its scene, {', '.join(known)}: {remedy}"
                 )
         return cls(**{**defaults, **options})
 

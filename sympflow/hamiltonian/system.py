@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sympflow.arguments import check_flag, check_positive, checked_count, warn
+from sympflow.arguments import check_flag, check_positive, checked_count, told, warn
 from sympflow.arrays import Array, one_lane
 from sympflow.hamiltonian.domain import Domain, domain_of
 from sympflow.hamiltonian.fingerprint import fingerprint
@@ -141,14 +141,20 @@ class HamiltonianSystem(Hamiltonian, Answering):
     """
 
     _OTHER_NAMES: ClassVar[Mapping[str, str]] = {
-        **dict.fromkeys(("solve", "integrate", "run"), "sympflow.solve(system, method, t_span, y0)"),
+        **dict.fromkeys(("solve", "integrate", "run", "simulate"), "sympflow.solve(system, method, t_span, y0)"),
+        **{
+            name: f"sympflow.{name}(system)"
+            for name in ("train", "lyapunov", "ensemble", "compare", "poincare_section")
+        },
+        **dict.fromkeys(("plot", "animate"), "`plot()` of a solution, solve(system, t_span=(0, 100)).plot()"),
         **dict.fromkeys(("H", "energy"), "`hamiltonian(y)` for its values, `expression` for the formula"),
-        **dict.fromkeys(("V", "U"), "`potential(q)`"),
-        **dict.fromkeys(("T", "K"), "`kinetic(p)`"),
+        **dict.fromkeys(("V", "U", "potential_energy"), "`potential(q)`"),
+        **dict.fromkeys(("T", "K", "kinetic_energy"), "`kinetic(p)`"),
         **dict.fromkeys(("dim", "dimension", "n", "d", "dof"), "`ndof`"),
         **dict.fromkeys(("rhs", "f", "fun"), "`vector_field(y)`"),
-        **dict.fromkeys(("grad", "jac"), "`gradient(y)`, or `hessian(y)`"),
-        "parameters": "`params`",
+        **dict.fromkeys(("grad", "jac", "jacobian"), "`gradient(y)`, or `hessian(y)`"),
+        **dict.fromkeys(("parameters", "G", "constants"), "`params`"),
+        **dict.fromkeys(("mass", "masses"), "`local.masses` of bodies, or T of the formula, `expression`"),
     }
 
     _period: float | None = None
@@ -713,6 +719,7 @@ class HamiltonianSystem(Hamiltonian, Answering):
                     has += "; `damping` is not one: make a system for each value"
                 raise ValueError(f"`params` has {name!r}, no parameter of {self.name!r}, {has}.")
 
+    @told
     def with_params(self, **values: float) -> HamiltonianSystem:
         """The same system with other values of some parameters. Most methods reuse the compiled code.
 
